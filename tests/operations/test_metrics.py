@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, poisson
 from worldstate_lab.metrics.intervals import (
-    FigureDraws,
     deal_folds,
     middle,
+    paired_gains,
     poisson_upper,
     random_detection,
     stratified_draws,
@@ -83,11 +83,11 @@ def test_paired_draws_see_a_difference_that_the_spread_of_recordings_hides():
     hard = rng.normal(size=40)
     draws = stratified_draws(["one"] * 40, rng)
     ours, theirs = (
-        FigureDraws({"lead_s": (hard + shift + rng.normal(scale=0.1, size=40))[draws].mean(axis=1)})
+        {"lead_s": (hard + shift + rng.normal(scale=0.1, size=40))[draws].mean(axis=1)}
         for shift in (0.2, 0.0)
     )
-    assert ours.interval("lead_s")[0] < theirs.interval("lead_s")[1]
-    assert ours.gains(theirs)["lead_s"][0] > 0.1
+    assert middle(ours["lead_s"])[0] < middle(theirs["lead_s"])[1]
+    assert paired_gains(ours, theirs)["lead_s"][0] > 0.1
 
 
 def test_the_worst_group_is_one_that_has_a_figure():

@@ -26,10 +26,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("streams", type=Path, nargs="+", metavar="NPZ", help="streams that were listened to")
     add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
-    cameras = "boxes of everybody, of cars above 100 pixels, none; dead from every T0 on; one more car before"
-    add("--camera", choices=("all", "cars", "none", "dies", "mover"), default="all", help=cameras)
-    place = "give the filter the corners and lanes of the junction (default: those of a usual one)"
-    add("--known-place", action="store_true", help=place)
+    cameras = "boxes of everybody, of cars above 100 pixels, none; dead from every T0 on"
+    add("--camera", choices=("all", "cars", "none", "dies"), default="all", help=cameras)
     add(
         "--sides", action=argparse.BooleanOptionalAction, default=True,
         help="learn what either arm sounds like from whoever comes into view (default: on)",
@@ -45,13 +43,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
     from worldstate.adapters.files.model_file import read_model
     from worldstate.adapters.parallel import in_processes
-    from worldstate_lab.passes.pass_outcomes import PassedStream, pass_figures
-    from worldstate_lab.passes.world_exam import passed_stream
+    from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
+    from worldstate_lab.passes.pass_outcomes import pass_figures
 
     check_outputs(arguments, "report")
     model = read_model(arguments.model)
-    given = {"camera": arguments.camera, "seed": arguments.seed, "known_place": arguments.known_place}
-    given["learns"] = arguments.sides
+    given = {"camera": arguments.camera, "seed": arguments.seed, "learns": arguments.sides}
     follow = partial(passed_stream, model=model, **given)
     streams: dict[str, list[PassedStream]] = {}
     with progress_bar("following", len(arguments.streams)) as bar:

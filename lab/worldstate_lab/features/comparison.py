@@ -11,10 +11,10 @@ from worldstate.abduction.cueing.calibration_error import brier_score, expected_
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import IndexArray
+from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc, worst_rate
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
-from worldstate_lab.metrics.intervals import DRAWS, FigureDraws, recording_draws
+from worldstate_lab.metrics.intervals import DRAWS, middle, paired_gains, recording_draws
 
 from .feature_evaluation import Predictions, Protocol, evaluate_pass
 from .feature_report import count_windows, mean_figures, report_groups, window_figures
@@ -113,7 +113,9 @@ def comparison(
         **count_windows(table),
         "per_group": report_groups(table, chosen[row]),
         "rows": {name: rows[name] for name in others},
-        "gains": {name: _gains(rows[row], rows[name], drawn[row].gains(drawn[name])) for name in others},
+        "gains": {
+            name: _gains(rows[row], rows[name], paired_gains(drawn[row], drawn[name])) for name in others
+        },
     }
 
 
@@ -123,13 +125,17 @@ def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]
 
 
 def _row_figures(
-    table: FeatureTable, passes: Sequence[Predictions], draws: FigureDraws, alpha: float
+    table: FeatureTable, passes: Sequence[Predictions], draws: Mapping[str, FloatArray], alpha: float
 ) -> dict[str, Any]:
     figures = mean_figures([window_figures(table, one) for one in passes])
     n = int(table.hazard_free.sum())
     # Probability of as many false positives or more, were the true rate the budget.
     p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
-    return {**figures, "fpr_p_value": p_value, "intervals": draws.intervals()}
+    return {
+        **figures,
+        "fpr_p_value": p_value,
+        "intervals": {name: middle(one) for name, one in draws.items()},
+    }
 
 
 def _gains(
@@ -143,12 +149,12 @@ def _gains(
 
 def draw_figures(
     table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[IndexArray]
-) -> FigureDraws:
+) -> dict[str, FloatArray]:
     """Return the figures on every bootstrap sample of recordings, mean over the passes (seeds)."""
     # The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
     measures = [_figures_on(table, one) for one in passes]
     figures = np.array([[measure(rows) for rows in samples] for measure in measures]).mean(axis=0)
-    return FigureDraws(dict(zip(FIGURES, figures.T, strict=True)))
+    return dict(zip(FIGURES, figures.T, strict=True))
 
 
 def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray], list[float]]:

@@ -12,7 +12,6 @@ Exact intervals of counts and shares are in `worldstate.operations.metrics.appro
 """
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -33,36 +32,6 @@ COVERAGE = 0.95
 FOLDS = 5
 
 Interval = tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FigureDraws:
-    """Figures of one method on every draw of recordings; the same draws for every method.
-
-    Examples
-    --------
-    >>> ours = FigureDraws({"tpr": np.linspace(0.0, 40.0, 41)})
-    >>> low, high = ours.interval("tpr")
-    >>> round(low, 3), round(high, 3)
-    (1.0, 39.0)
-    >>> ours.gains(FigureDraws({"tpr": ours.values["tpr"] - 2.0}))
-    {'tpr': (2.0, 2.0)}
-    """
-
-    values: Mapping[str, FloatArray]  # shape (draws,): For each figure
-
-    def interval(self, figure: str) -> Interval:
-        """Return the middle 95 %."""
-        return middle(self.values[figure])
-
-    def intervals(self) -> dict[str, Interval]:
-        """Return the middle 95 % of every figure."""
-        return {figure: self.interval(figure) for figure in self.values}
-
-    def gains(self, other: "FigureDraws") -> dict[str, Interval]:
-        """Return the middle 95 % of the difference to another method on the same draws."""
-        # Both methods stumble over the same hard recordings: paired, those cancel.
-        return {figure: middle(self.values[figure] - other.values[figure]) for figure in self.values}
 
 
 def stratified_draws(strata: Sequence[Hashable], rng: np.random.Generator, draws: int = DRAWS) -> IndexArray:
@@ -101,6 +70,19 @@ def middle(values: FloatArray, coverage: float = COVERAGE) -> Interval:
     tail = (1.0 - coverage) / 2.0
     low, high = np.quantile(known, [tail, 1.0 - tail]).tolist()
     return low, high
+
+
+def paired_gains(ours: Mapping[str, FloatArray], other: Mapping[str, FloatArray]) -> dict[str, Interval]:
+    """Return the middle 95 % of the difference of every figure to another method on the same draws.
+
+    Examples
+    --------
+    >>> ours = {"tpr": np.linspace(0.0, 40.0, 41)}
+    >>> paired_gains(ours, {"tpr": ours["tpr"] - 2.0})
+    {'tpr': (2.0, 2.0)}
+    """
+    # Both methods stumble over the same hard recordings: paired, those cancel.
+    return {figure: middle(values - other[figure]) for figure, values in ours.items()}
 
 
 def worst_group(values: Mapping[str, float], worse: Literal["low", "high"]) -> tuple[str, float]:

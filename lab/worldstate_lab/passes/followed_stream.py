@@ -1,7 +1,9 @@
-"""A stream as measurements of the filter, and what the filter believed of it at every hop."""
+"""Streams that the whole world-state follows: what is measured of them, and what the filter believed."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -10,16 +12,29 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
 from worldstate.abduction.sequence.street_hearing import StreetListener
+from worldstate.abduction.sequence.street_sides import arrival_pattern, somebody_comes
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.acoustic import asked_again
-from worldstate.adapters.acoustic_sequence import learn_passes
+from worldstate.adapters.acoustic_sequence import learn_passes, street_listener
+from worldstate.adapters.camera.detections import DetectionFilter
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
+from worldstate.adapters.files.acoustic_domain import heard_with
+from worldstate.adapters.files.model_file import Model
+from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.commissioning.sequence_training import StreamTruth, stream_truth
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, CoEvidenceChannel, Measurement
+from worldstate.operations.labelling.street_passes import WatchedRecording, watched_recording
+from worldstate.operations.labelling.street_sound import HeardStreet
 from worldstate.state import Entity, WorldState
+from worldstate.state.context import Context
+
+from .stream_camera import stream_detections, without_passes
 
 
 def measurements(
@@ -85,6 +100,15 @@ class FollowedStream:
         ]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PassedStream:
+    """A stream, its truth, and what the filter believed of it."""
+
+    heard: HeardStream
+    truth: StreamTruth
+    followed: FollowedStream
+
+
 def followed(
     world: WorldFilter, measurements: Iterable[Measurement], street: StreetListener | None = None
 ) -> FollowedStream:
@@ -104,3 +128,61 @@ def followed(
         time_to_visible_s=np.array([[cue.time_to_visible_s or never for cue in hop] for hop in cues]),
         entities=tuple(state.entities for state in states),
     )
+
+
+CameraKind = Literal["all", "cars", "none", "dies"]
+# Everything that drives, however small its box; of OVAD's boxes its authors keep cars above 100 px.
+EVERYBODY = DetectionFilter(frozenset({"car", "truck", "bus", "train", "motorcycle", "bicycle"}), 0.5, 20.0)
+
+
+def passed_stream(
+    path: Path,
+    model: Model,
+    camera: CameraKind = "all",
+    seed: int = 0,
+    alpha: float = 0.02,
+    *,
+    learns: bool = True,
+) -> PassedStream:
+    """Return a stream with what the filter believed at every hop; `seed` draws the camera's misses.
+
+    Unless told not to, the filter learns what either arm sounds like from the vehicles that come into view.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the model has no sequence, as `commission` makes one.
+    """
+    street = street_listener(model.domain, None, None) if learns else None
+    heard, measured = stream_measurements(path, model, camera, seed, street)
+    world = WorldFilter(Context(), model.policies.for_alpha(alpha))
+    return PassedStream(heard, stream_truth(heard), followed(world, measured, street))
+
+
+def stream_measurements(
+    path: Path, model: Model, camera: CameraKind, seed: int, street: StreetListener | None = None
+) -> tuple[HeardStream, Iterator[Measurement]]:
+    """Return a stream with what microphones and camera measure of it, hop by hop."""
+    windows, sequence = parts_of(model)
+    heard, vision = HeardStream.load(path), None
+    if camera != "none":
+        boxes = DetectionFilter() if camera == "cars" else EVERYBODY
+        detections = stream_detections(heard, np.random.default_rng(seed))
+        if camera == "dies":
+            detections = without_passes(detections, heard)
+        vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
+    evidence = stream_evidence(windows, heard)
+    return heard, measurements(heard, windows, sequence, evidence, vision, street)
+
+
+def watched_stream(path: Path, seed: int, model: Model) -> WatchedRecording:
+    """Return the passes of a stream before a camera and what was heard; `seed` draws the camera's misses."""
+    heard, camera = HeardStream.load(path), PinholeCamera()
+    detections = stream_detections(heard, np.random.default_rng(seed), camera)
+    seen = watched_recording(detections, camera, EVERYBODY, float(heard.hops.time_s[-1]))
+    if model.domain is None:
+        return seen
+    windows, sequence = parts_of(model)
+    groups = sequence.posterior(stream_evidence(windows, heard)).groups
+    patterns, heard_by = arrival_pattern(heard.hops.feature), heard_with(model.domain)
+    return replace(seen, heard=HeardStreet(heard.hops.time_s, patterns, somebody_comes(groups), heard_by))

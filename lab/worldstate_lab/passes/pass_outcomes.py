@@ -5,7 +5,7 @@ that was hidden on the vehicle's side at T0 is the one seen at its place a secon
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.sequence_training import StreamTruth
 from worldstate.commissioning.stream_exam import alarm_outcomes, approaches, time_figures
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
@@ -28,19 +27,10 @@ from worldstate.operations.metrics.approach_table import (
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.state import Entity
 
-from .followed_stream import FollowedStream
+from .followed_stream import PassedStream
 
 EXISTS, NEAR_RAD, SEEN_AFTER_S = 0.5, np.radians(10.0), 1.0
-KEPT_S, KEPT_RAD = 3.0, np.radians(20.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PassedStream:
-    """A stream, its truth, and what the filter believed of it."""
-
-    heard: HeardStream
-    truth: StreamTruth
-    followed: FollowedStream
+HIDDEN_S, KEPT_S, KEPT_RAD = 3.0, 3.0, np.radians(20.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,27 +138,30 @@ def _ahead(streams: Sequence[PassedStream]) -> Figures:
     return {"seen_ahead": len(taken), "took_hidden_identity": mean_of(taken)}
 
 
+def _hops_beside(
+    streams: Sequence[PassedStream], first_s: float, end_s: float
+) -> Iterator[tuple[PassedStream, Approach, int, float]]:
+    """Yield the hops so long after the T0 of loud approaches, with the azimuth of the first vehicle then."""
+    for stream in streams:
+        for one in approaches(stream.heard):
+            vehicle = _vehicle(stream.heard, one.entries_s[0])
+            since_s = stream.followed.time_s - one.entries_s[0]
+            within = () if one.quiet else np.flatnonzero((since_s >= first_s) & (since_s < end_s)).tolist()
+            for hop in within:
+                azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
+                if azimuth is not None:
+                    yield stream, one, hop, azimuth
+
+
 def _kept(streams: Sequence[PassedStream]) -> Figures:
     """Return how often an entity stands near a vehicle in the three seconds after T0, and how many do."""
     near = []
-    for stream in streams:
-        for one in approaches(stream.heard):
-            if one.quiet or one.flow != "single":
-                continue
-            vehicle, lead = (
-                _vehicle(stream.heard, one.entries_s[0]),
-                stream.followed.time_s - one.entries_s[0],
-            )
-            for hop in np.flatnonzero((lead >= 0.0) & (lead < KEPT_S)).tolist():
-                azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
-                if azimuth is not None:
-                    there = [e for e in stream.followed.entities[hop] if e.existence_probability >= EXISTS]
-                    near.append(sum(abs(wrap_angle(e.azimuth_rad - azimuth)) <= KEPT_RAD for e in there))
+    for stream, one, hop, azimuth in _hops_beside(streams, 0.0, KEPT_S):
+        if one.flow == "single":
+            there = [e for e in stream.followed.entities[hop] if e.existence_probability >= EXISTS]
+            near.append(sum(abs(wrap_angle(e.azimuth_rad - azimuth)) <= KEPT_RAD for e in there))
     counts = np.array(near)
-    return {
-        "kept_after_t0": mean_of(counts > 0),
-        "entities_after_t0": float(counts[counts > 0].mean()) if (counts > 0).any() else None,
-    }
+    return {"kept_after_t0": mean_of(counts > 0), "entities_after_t0": mean_of(counts[counts > 0])}
 
 
 def _forecast(streams: Sequence[PassedStream]) -> Figures:
@@ -191,18 +184,10 @@ def _forecast(streams: Sequence[PassedStream]) -> Figures:
 def _bearing(streams: Sequence[PassedStream]) -> Figures:
     """Return how far hidden azimuths are off, and the same over their variance, in the 3 s before T0."""
     errors_rad, stds_rad = [], []
-    for stream in streams:
-        for one in approaches(stream.heard):
-            if one.quiet:
-                continue
-            vehicle = _vehicle(stream.heard, one.entries_s[0])
-            lead = stream.followed.time_s - one.entries_s[0]
-            for hop in np.flatnonzero((lead > -3.0) & (lead < -SLACK_S)).tolist():
-                azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
-                for entity in stream.followed.hidden(hop, one.sides[0], EXISTS)[:1]:
-                    if azimuth is not None:
-                        errors_rad.append(wrap_angle(entity.azimuth_rad - azimuth))
-                        stds_rad.append(entity.azimuth_std_rad)
+    for stream, one, hop, azimuth in _hops_beside(streams, np.nextafter(-HIDDEN_S, 0.0), -SLACK_S):
+        for entity in stream.followed.hidden(hop, one.sides[0], EXISTS)[:1]:
+            errors_rad.append(wrap_angle(entity.azimuth_rad - azimuth))
+            stds_rad.append(entity.azimuth_std_rad)
     errors, stds = np.array(errors_rad), np.array(stds_rad)
     found = errors.size > 0
     return {

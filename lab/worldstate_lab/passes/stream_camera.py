@@ -15,8 +15,6 @@ from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind
 
 FRAME_S = 0.1
-# A car in the view of OVAD's camera all the while: 15 m ahead, from 6 m on the left to 6 m on the right.
-MOVER_S, MOVER_AHEAD_M, MOVER_HALF_M = 5.0, 15.0, 6.0
 _STILL_M = 1e-3  # Of a tenth of a second: slower ones keep their heading
 
 
@@ -53,30 +51,6 @@ def without_passes(detections: DetectionLog, heard: HeardStream) -> DetectionLog
     alive = ~((since_s >= 0.0) & (since_s < AFTER_S)).any(axis=1)
     frames = tuple(detections.frames[at] for at in np.flatnonzero(alive).tolist())
     return replace(detections, stamps_ns=detections.stamps_ns[alive], frames=frames)
-
-
-def with_mover(detections: DetectionLog, heard: HeardStream) -> DetectionLog:
-    """Return a log in which a car crosses the view in the five seconds before every T0, unheard.
-
-    It is the look at somebody else that is asked about: is whoever comes told later for it?
-    """
-    camera, site, car = PinholeCamera(), junction_named(heard.site), vehicle_kind("light")
-    frames = list(detections.frames)
-    entries_s = heard.vehicles.entry_s[heard.vehicles.hazard]
-    for entry_s in entries_s[np.isfinite(entries_s)].tolist():
-        first, end = round((entry_s - MOVER_S) / FRAME_S), round(entry_s / FRAME_S)
-        for at in range(max(first, 0), min(end, len(frames))):
-            beside_m = MOVER_HALF_M * (1.0 - 2.0 * (at * FRAME_S - entry_s + MOVER_S) / MOVER_S)
-            box = _box(camera, site, car, MOVER_AHEAD_M, beside_m, -1)
-            if box is not None:
-                frames[at] = _joined(frames[at], np.array(inside(box, camera)), car.label)
-    return replace(detections, frames=tuple(frames))
-
-
-def _joined(frame: DetectionFrame, box: FloatArray, label: str) -> DetectionFrame:
-    return DetectionFrame(
-        np.vstack([frame.boxes_px, box]), np.append(frame.scores, 0.95), (*frame.labels, label)
-    )
 
 
 def _crossing(x: FloatArray, y: FloatArray) -> FloatArray:

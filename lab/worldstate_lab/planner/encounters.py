@@ -18,7 +18,7 @@ from worldstate.operations.metrics.approach_table import Approach
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import vehicle_kind
-from worldstate_lab.passes.world_exam import passed_stream
+from worldstate_lab.passes.followed_stream import passed_stream
 from worldstate_lab.trials.pass_cache import PassCache, content_hash
 
 GONE_M = -1e3

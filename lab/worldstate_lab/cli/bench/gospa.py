@@ -31,8 +31,8 @@ from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.state import WorldState
 from worldstate_lab.methods.oc_sort import OcSort
 from worldstate_lab.metrics.track_measures import gospa_bearing
+from worldstate_lab.passes.followed_stream import stream_measurements
 from worldstate_lab.passes.stream_camera import stream_detections
-from worldstate_lab.passes.world_exam import stream_measurements
 
 EXAMPLE = "example: worldstate-lab bench gospa streams/S??-*.npz --seconds 120"
 

@@ -31,8 +31,8 @@ from worldstate.smoothing.observations import FirstSight
 from worldstate_lab.features.methods import method_of
 from worldstate_lab.metrics.intervals import middle, recording_draws
 from worldstate_lab.paper.identifiability import reach_on_table
+from worldstate_lab.passes.followed_stream import EVERYBODY
 from worldstate_lab.passes.stream_camera import stream_detections
-from worldstate_lab.passes.world_exam import EVERYBODY
 
 EXAMPLE = "example: worldstate-lab bench label-training streams/*-approaches-*.npz"
 

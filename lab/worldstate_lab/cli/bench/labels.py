@@ -29,8 +29,8 @@ from worldstate.operations.labelling.street_figure import draw_passes, draw_trac
 from worldstate.operations.recordings.true_track import TrueTrack
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.smoothing.observations import SmoothedTrack
+from worldstate_lab.passes.followed_stream import EVERYBODY
 from worldstate_lab.passes.stream_camera import stream_detections
-from worldstate_lab.passes.world_exam import EVERYBODY
 
 EXAMPLE = "example: worldstate-lab bench labels streams/*-approaches-*.npz --passes 30"
 

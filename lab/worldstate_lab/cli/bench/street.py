@@ -39,10 +39,15 @@ from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.smoothing.learned_edge import LearnedEdge
 from worldstate.smoothing.learned_street import LearnedStreet, context_of
 from worldstate.state.context import Context
-from worldstate_lab.passes.followed_stream import FollowedStream, followed
+from worldstate_lab.passes.followed_stream import (
+    EVERYBODY,
+    FollowedStream,
+    followed,
+    stream_measurements,
+    watched_stream,
+)
 from worldstate_lab.passes.pass_outcomes import true_azimuth
 from worldstate_lab.passes.stream_camera import stream_detections
-from worldstate_lab.passes.world_exam import EVERYBODY, stream_measurements, watched_stream
 
 EXAMPLE = "example: worldstate-lab bench street --junctions 20"
 
