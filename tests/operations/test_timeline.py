@@ -6,38 +6,40 @@ import numpy as np
 import pytest
 
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.recordings.timeline import EntityTrack, Timeline, draw_timeline, write_timeline
+from worldstate.operations.figure_style import with_gaps
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.timeline import Timeline, draw_timeline, write_timeline
 from worldstate.operations.recordings.true_track import TrueTrack, read_true_tracks
 
 TIME_S = 1.0 + 0.1 * np.arange(40)
 
 
 def track(time_s, azimuth_rad, t0_s):
-    time_s = np.asarray(time_s)
-    return EntityTrack(time_s, np.full(time_s.size, azimuth_rad), np.full(time_s.size, 0.1), time_s < t0_s)
+    return np.array([(now_s, azimuth_rad, 0.1, now_s < t0_s) for now_s in time_s])
 
 
 @pytest.fixture
 def timeline():
     flat = np.linspace(0.0, 1.0, TIME_S.size)
     return Timeline(
-        time_s=TIME_S,
-        statistic=flat,
-        risk=flat,
+        hops=HopTable(
+            {
+                "time_s": TIME_S,
+                "statistic": flat,
+                "risk": flat,
+                "left": flat > 0.7,
+                "right": flat > 2.0,
+                "srp": np.ones((TIME_S.size, 7)),
+            }
+        ),
         threshold=0.7,
         alpha=0.02,
-        advisory={"left": flat > 0.7, "right": flat > 2.0},
         azimuths_rad=np.linspace(-1.5, 1.5, 7),
-        srp=np.ones((TIME_S.size, 7)),
-        srp_age_s=0.5,
         entities=(track(TIME_S[5:20], 0.5, TIME_S[12]), track(TIME_S[25:35], -0.5, np.inf)),
-        sighting_time_s=np.empty(0),
-        sighting_azimuth_rad=np.empty(0),
         t0_s=2.2,
         truth=(
             TrueTrack(TIME_S, 0.02 * np.arange(40), (TIME_S > 2.15) & (TIME_S < 3.65), np.zeros((40, 2))),
         ),
-        title="",
     )
 
 
@@ -58,21 +60,18 @@ def test_each_entity_has_its_own_lines_and_the_hidden_one_reaches_into_view(time
 
 def test_no_line_is_drawn_across_a_gap(timeline):
     apart = np.concatenate([TIME_S[2:6], TIME_S[20:30]])
-    broken = track(apart, 0.2, np.inf).broken()
-    gaps = np.flatnonzero(np.isnan(broken.azimuth_rad))
-    assert gaps.tolist() == [4]
-    assert np.isnan(broken.time_s[4])
-    assert np.isfinite(np.delete(broken.azimuth_rad, 4)).all()
-    whole = track(TIME_S, 0.2, np.inf).broken()
-    assert np.isfinite(whole.azimuth_rad).all()
+    broken = with_gaps(track(apart, 0.2, np.inf))
+    assert np.isnan(broken[4]).all()
+    assert np.isfinite(np.delete(broken, 4, axis=0)).all()
+    assert np.isfinite(with_gaps(track(TIME_S, 0.2, np.inf))).all()
 
 
 def test_the_axis_begins_with_the_first_window_on_a_clock_of_1970_too(timeline):
-    late = replace(timeline, time_s=timeline.time_s + 1.7e9)
+    late = replace(timeline, hops=timeline.hops.replace(time_s=TIME_S + 1.7e9))
     for one, first_s in ((timeline, 0.0), (late, 1.7e9)):
         low, high = draw_timeline(one).axes[0].get_xlim()
         assert low == pytest.approx(first_s, abs=1e-3)
-        assert high == pytest.approx(one.time_s[-1] + 0.1, abs=1e-3)
+        assert high == pytest.approx(one.hops.time_s[-1] + 0.1, abs=1e-3)
 
 
 def test_a_recording_without_entities_is_drawn(timeline, tmp_path):
@@ -83,7 +82,7 @@ def test_a_recording_without_entities_is_drawn(timeline, tmp_path):
 
 
 def test_power_is_drawn_at_the_middle_of_its_window_and_boxes_when_they_were_seen(timeline):
-    boxes = replace(timeline, sighting_time_s=TIME_S[12:14], sighting_azimuth_rad=np.zeros(2))
+    boxes = replace(timeline, sightings=np.stack([TIME_S[12:14], np.zeros(2)], axis=1))
     axes = draw_timeline(boxes).axes[0]
     edges = np.asarray(axes.collections[0].get_coordinates()[0, :, 0])
     assert (edges[1:] + edges[:-1]) / 2 == pytest.approx(TIME_S - 0.5)
@@ -97,7 +96,7 @@ def test_an_advisory_stands_in_the_row_of_its_side(timeline):
     (bar,) = [patch for patch in rows.collections if patch.get_paths()[0].get_extents().height < 1]
     box = bar.get_paths()[0].get_extents()
     assert names[round((box.y0 + box.y1) / 2)] == "advisory left"
-    assert (box.x0, box.x1) == pytest.approx((TIME_S[timeline.advisory["left"]][0], TIME_S[-1] + 0.1))
+    assert (box.x0, box.x1) == pytest.approx((TIME_S[timeline.hops.left][0], TIME_S[-1] + 0.1))
 
 
 def test_the_true_track_and_the_time_in_line_of_sight_are_drawn(timeline):

@@ -1,19 +1,26 @@
-"""One style for all figures: fonts, colours, legends beside the data, and a checked file suffix."""
+"""One style for all figures: fonts, colours, legends beside the data, rows of bars, a checked file suffix."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.extras import check_extra
+from worldstate.ground.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".svg", ".pdf")
+# Hops further apart than this are not joined by a line.
+HOP_S = 0.1
+GAP_S = 1.5 * HOP_S
 # 150 dots an inch: a figure 9 inches wide is 1350 pixels, and still sharp at the 830 of a README page.
 _DPI = 150
 # The palette of Okabe and Ito, told apart with any colour vision; black is left to axes and bounds.
@@ -85,3 +92,45 @@ def legend_beside(axes: "Axes", title: str | None = None) -> None:
     axes.legend(
         once.values(), once.keys(), title=title, loc="upper left", bbox_to_anchor=(1.0, 1.0), alignment="left"
     )
+
+
+def draw_power(
+    axes: "Axes", time_s: FloatArray, azimuths_rad: FloatArray, power: FloatArray, label: str
+) -> None:
+    """Draw power over azimuth, relative to its median, in grey, with a scale above.
+
+    Shapes: time_s (n,), azimuths_rad (a,), power (n, a).
+    """
+    level = power / np.median(power, axis=1, keepdims=True)
+    azimuths_deg = np.degrees(azimuths_rad)
+    mesh = axes.pcolormesh(time_s, azimuths_deg, level.T, shading="nearest", cmap="Greys", rasterized=True)
+    bar = axes.figure.colorbar(mesh, ax=axes, location="top", aspect=60, pad=0.02, fraction=0.05)
+    bar.set_label(label)
+
+
+def draw_bars(
+    axes: "Axes", time_s: ArrayLike, on: ArrayLike, row: int, color: str, height: float = 0.8
+) -> None:
+    """Draw a bar in a row of its own for every stretch of hops; a decision holds until the next one.
+
+    Shapes: time_s, on (n,).
+    """
+    held = np.asarray(time_s, dtype=np.float64)[np.asarray(on, dtype=np.bool_)]
+    if held.size:
+        parts = np.split(held, np.flatnonzero(np.diff(held) > GAP_S) + 1)
+        bars = [(part[0], part[-1] - part[0] + HOP_S) for part in parts]
+        axes.broken_barh(bars, (row - height / 2.0, height), color=color, lw=0)
+
+
+def name_rows(axes: "Axes", names: Sequence[str]) -> None:
+    """Name the rows of bars and marks, the first one lowest."""
+    axes.set(yticks=range(len(names)), yticklabels=names, ylim=(-0.6, len(names) - 0.4))
+    axes.tick_params(axis="y", length=0)
+
+
+def with_gaps(rows: FloatArray, longest_s: float = GAP_S) -> FloatArray:
+    """Put a row of NaN where rows lie further apart in time, so that no line is drawn across.
+
+    Shapes: rows (n, columns), the first column the time, seconds.
+    """
+    return np.insert(rows, np.flatnonzero(np.diff(rows[:, 0]) > longest_s) + 1, np.nan, axis=0)

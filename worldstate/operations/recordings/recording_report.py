@@ -11,13 +11,12 @@ import numpy as np
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.adapters.listen import Source, Step, listen_steps
 from worldstate.adapters.state_log import states_writer
-from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.values import seconds
 
 from .bearing_gating import check_bearings
 from .channel_report import HealthLog, RecordingHealth
 from .hop_table import HopTable
-from .timeline import EntityTrack, Timeline
+from .timeline import Timeline
 from .true_track import read_true_tracks
 from .warning import WarningMeter, WarningSummary
 
@@ -26,8 +25,6 @@ LIKELY = 0.5
 SIDES = ("left", "right")
 # The sides' columns: whether an advisory of that side is on.
 _COLUMNS = ("time_s", "statistic", "risk", *SIDES, "srp", "bearing_age_s", "bearing_rad", "prominence")
-# From the middle of a decision window to its end, with the settings that a `Source` is listened to with.
-_WINDOW_AGE_S = 0.5 * FrontEndSettings().window_hops / FrontEndSettings().hop_rate_hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +62,7 @@ class RecordingReport:
     ...     soundfile.write(path, noise, 48_000)
     ...     report = run_recording(open_source(path))
 
-    >>> report.to_dict()["lead_time_s"], report.timeline.time_s.tolist()
+    >>> report.to_dict()["lead_time_s"], report.timeline.hops.time_s.tolist()
     (None, [1.0, 1.1, 1.2])
     """
 
@@ -183,26 +180,14 @@ class _HopLog:
 
     def timeline(self, hops: HopTable, source: Source, title: str) -> Timeline:
         boxes = [(t, azimuth) for t, row in zip(hops.time_s, self.moving_rad, strict=True) for azimuth in row]
-        sightings = np.array(boxes, dtype=np.float64).reshape(-1, 2)
         return Timeline(
-            time_s=hops.time_s,
-            statistic=hops.statistic,
-            risk=hops.risk,
+            hops=hops,
             threshold=source.policy.gamma,
             alpha=source.policy.alpha,
-            advisory={side: hops.columns[side].astype(bool) for side in SIDES},
             azimuths_rad=self.azimuths_rad,
-            srp=hops.srp,
-            srp_age_s=_WINDOW_AGE_S,
-            entities=tuple(map(_entity_track, self.entities.values())),
-            sighting_time_s=sightings[:, 0],
-            sighting_azimuth_rad=sightings[:, 1],
+            entities=tuple(np.array(rows, dtype=np.float64) for rows in self.entities.values()),
+            sightings=np.array(boxes, dtype=np.float64).reshape(-1, 2),
             t0_s=source.t0_s,
             truth=read_true_tracks(source.audio_path.parent),
             title=title,
         )
-
-
-def _entity_track(rows: list[tuple[float, float, float, bool]]) -> EntityTrack:
-    time_s, azimuth_rad, std_rad, hidden = np.array(rows, dtype=np.float64).T
-    return EntityTrack(time_s, azimuth_rad, std_rad, hidden.astype(bool))

@@ -1,83 +1,65 @@
 """The timeline figure: bearings, advisories by side, and the hazard statistic of one recording."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import (
     BLUE,
     GREEN,
+    HOP_S,
     ORANGE,
     PURPLE,
     RED,
+    draw_bars,
+    draw_power,
     figure_style,
     legend_beside,
+    name_rows,
     save_figure,
+    with_gaps,
 )
 
+from .hop_table import HopTable
 from .true_track import TrueTrack
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# An advisory holds until the next decision.
-_HOP_S = 0.1
-# Hops of one entity further apart than this are not joined by a line.
-_GAP_S = 1.5 * _HOP_S
+# From the middle of a decision window to its end, with the settings that a `Source` is listened to with.
+WINDOW_S = FrontEndSettings().window_hops / FrontEndSettings().hop_rate_hz
 # Longest title in one line above a figure of this width.
 _TITLE_CHARACTERS = 100
 # Rows of the middle panel, from below.
-_CAMERA_ROW, _SIDE_ROWS = 0, {"right": 1, "left": 2}
+_ROWS = ("camera detection", "advisory right", "advisory left")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EntityTrack:
-    """Azimuth of one entity at the hops in which it more likely existed than not."""
-
-    time_s: FloatArray  # Ends of the windows, azimuth, standard deviation
-    azimuth_rad: FloatArray
-    std_rad: FloatArray
-    hidden: BoolArray  # Whether it was behind an occluder
-
-    def broken(self) -> "EntityTrack":
-        """Return the track with a row of NaN in every gap, so that no line is drawn across."""
-        gaps = np.flatnonzero(np.diff(self.time_s) > _GAP_S) + 1
-        numbers = self.time_s, self.azimuth_rad, self.std_rad
-        time_s, azimuth_rad, std_rad = (np.insert(row, gaps, np.nan) for row in numbers)
-        return EntityTrack(time_s, azimuth_rad, std_rad, np.insert(self.hidden, gaps, False))
-
-
-@dataclass(frozen=True, slots=True)
 class Timeline:
-    """What the figure shows, one row a hop.
+    """What the figure shows.
 
     Parameters
     ----------
-    time_s : array (n,)
-        End of each decision window, seconds from the start of the recording.
-    statistic, risk : array (n,)
-        s(t) and the calibrated risk r(t), both in [0, 1].
+    hops : HopTable
+        One row a hop: ``time_s``, the end of its window in seconds from the start of the recording;
+        ``statistic`` and ``risk``, s(t) and r(t) in [0, 1]; ``left`` and ``right``, whether an advisory of
+        that side is on; ``srp``, the steered response power of the window over azimuth.
     threshold : float
         gamma(alpha) on the statistic.
     alpha : float
         The false-positive budget that gamma was set for.
-    advisory : mapping of str to array (n,) of bool
-        The hidden-hazard advisory by the side that it names, ``"left"`` and ``"right"``.
     azimuths_rad : array (a,)
         Search grid, left positive.
-    srp : array (n, a)
-        Steered response power of each window.
-    srp_age_s : float
-        From the middle of the window of `srp` to its end, seconds; the figure draws it that much earlier.
-    entities : tuple of EntityTrack
-        Moving entities, in the order in which they came up.
-    sighting_time_s, sighting_azimuth_rad : array (d,)
-        Moving camera detections.
+    entities : tuple of array (n, 4)
+        Moving entities in the order in which they came up, at the hops in which each more likely existed than
+        not: time, azimuth, standard deviation, and 1 where it was behind an occluder.
+    sightings : array (d, 2)
+        Time and azimuth of moving camera detections.
     t0_s : float or None
         Line-of-sight entry.
     truth : tuple of TrueTrack
@@ -87,32 +69,22 @@ class Timeline:
 
     Examples
     --------
-    >>> n = 20
-    >>> quiet = Timeline(
-    ...     time_s=1.0 + 0.1 * np.arange(n), statistic=np.zeros(n), risk=np.zeros(n), threshold=0.8,
-    ...     alpha=0.02, advisory={"left": np.zeros(n, bool), "right": np.zeros(n, bool)},
-    ...     azimuths_rad=np.linspace(-1, 1, 9), srp=np.ones((n, 9)), srp_age_s=0.5, entities=(),
-    ...     sighting_time_s=np.empty(0), sighting_azimuth_rad=np.empty(0), t0_s=None, truth=(), title="",
-    ... )
-    >>> int(quiet.advisory["left"].sum())
-    0
+    >>> columns = dict.fromkeys(("statistic", "risk", "left", "right"), np.zeros(20))
+    >>> hops = HopTable({"time_s": 1.0 + 0.1 * np.arange(20), "srp": np.ones((20, 9)), **columns})
+    >>> quiet = Timeline(hops, threshold=0.8, alpha=0.02, azimuths_rad=np.linspace(-1.0, 1.0, 9))
+    >>> len(quiet.hops), quiet.t0_s
+    (20, None)
     """
 
-    time_s: FloatArray
-    statistic: FloatArray
-    risk: FloatArray
+    hops: HopTable
     threshold: float
     alpha: float
-    advisory: Mapping[str, BoolArray]
     azimuths_rad: FloatArray
-    srp: FloatArray
-    srp_age_s: float
-    entities: tuple[EntityTrack, ...]
-    sighting_time_s: FloatArray
-    sighting_azimuth_rad: FloatArray
-    t0_s: float | None
-    truth: tuple[TrueTrack, ...]
-    title: str
+    entities: tuple[FloatArray, ...] = ()
+    sightings: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    t0_s: float | None = None
+    truth: tuple[TrueTrack, ...] = ()
+    title: str = ""
 
 
 def write_timeline(timeline: Timeline, path: Path) -> None:
@@ -135,13 +107,9 @@ def write_timeline(timeline: Timeline, path: Path) -> None:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> n = 20
-    >>> quiet = Timeline(
-    ...     time_s=1.0 + 0.1 * np.arange(n), statistic=np.zeros(n), risk=np.zeros(n), threshold=0.8,
-    ...     alpha=0.02, advisory={"left": np.zeros(n, bool), "right": np.zeros(n, bool)},
-    ...     azimuths_rad=np.linspace(-1, 1, 9), srp=np.ones((n, 9)), srp_age_s=0.5, entities=(),
-    ...     sighting_time_s=np.empty(0), sighting_azimuth_rad=np.empty(0), t0_s=None, truth=(), title="",
-    ... )
+    >>> columns = dict.fromkeys(("statistic", "risk", "left", "right"), np.zeros(20))
+    >>> hops = HopTable({"time_s": 1.0 + 0.1 * np.arange(20), "srp": np.ones((20, 9)), **columns})
+    >>> quiet = Timeline(hops, threshold=0.8, alpha=0.02, azimuths_rad=np.linspace(-1.0, 1.0, 9))
     >>> with TemporaryDirectory() as folder:
     ...     write_timeline(quiet, Path(folder) / "quiet.png")
     ...     (Path(folder) / "quiet.png").stat().st_size > 10_000
@@ -169,22 +137,17 @@ def draw_timeline(timeline: Timeline) -> "Figure":
 
 
 def _draw_azimuths(axes: "Axes", timeline: Timeline) -> None:
-    level = timeline.srp / np.median(timeline.srp, axis=1, keepdims=True)
     # A window of one second that ends at t holds the sound around t - 0.5 s: drawn at its end it would lag
     # the camera, whose boxes are of the moment.
-    middle_s = timeline.time_s - timeline.srp_age_s
-    mesh = axes.pcolormesh(
-        middle_s, np.degrees(timeline.azimuths_rad), level.T, shading="nearest", cmap="Greys", rasterized=True
-    )
-    bar = axes.figure.colorbar(mesh, ax=axes, location="top", aspect=60, pad=0.02, fraction=0.05)
-    width_s = 2.0 * timeline.srp_age_s
-    bar.set_label(f"SRP over its median over azimuth, {width_s:g}-s windows, each drawn at its middle")
+    middle_s = timeline.hops.time_s - WINDOW_S / 2.0
+    label = f"SRP over its median over azimuth, {WINDOW_S:g}-s windows, each drawn at its middle"
+    draw_power(axes, middle_s, timeline.azimuths_rad, timeline.hops.srp, label)
     for vehicle in timeline.truth:
         _draw_truth(axes, vehicle)
     for entity in timeline.entities:
-        _draw_entity(axes, entity.broken())
-    seen = np.degrees(timeline.sighting_azimuth_rad)
-    axes.plot(timeline.sighting_time_s, seen, ".", color=PURPLE, label="camera, moving box")
+        _draw_entity(axes, entity)
+    seen_s, seen_rad = timeline.sightings.T
+    axes.plot(seen_s, np.degrees(seen_rad), ".", color=PURPLE, label="camera, moving box")
     axes.set(ylabel="azimuth (deg), left positive", ylim=(-90, 90), yticks=range(-90, 91, 45))
 
 
@@ -195,43 +158,41 @@ def _draw_truth(axes: "Axes", track: TrueTrack) -> None:
         axes.plot(track.time_s, line, style, color=GREEN, linewidth=2.0, label=f"vehicle, truth, {name}")
 
 
-def _draw_entity(axes: "Axes", track: EntityTrack) -> None:
-    azimuth, spread = np.degrees(track.azimuth_rad), np.degrees(track.std_rad)
+def _draw_entity(axes: "Axes", track: FloatArray) -> None:
+    time_s, azimuth_rad, std_rad, behind = with_gaps(track).T
+    azimuth, spread = np.degrees(azimuth_rad), np.degrees(std_rad)
     for hidden, color, label in ((True, RED, "hidden"), (False, BLUE, "in view")):
         # The first hop in view ends the hidden line too: it is one entity.
-        shown = track.hidden == hidden
+        shown = behind == hidden
         joined = shown | (np.roll(shown, 1) & np.isfinite(azimuth) & (np.arange(shown.size) > 0))
         line, low, high = (
             np.where(where, x, np.nan)
             for where, x in ((joined, azimuth), (shown, azimuth - spread), (shown, azimuth + spread))
         )
         if shown.any():
-            axes.fill_between(track.time_s, low, high, color=color, alpha=0.25, lw=0)
-            axes.plot(track.time_s, line, color=color, label=f"entity, {label}, ±1 std")
+            axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
+            axes.plot(time_s, line, color=color, label=f"entity, {label}, ±1 std")
 
 
 def _draw_rows(axes: "Axes", timeline: Timeline) -> None:
     """Draw a bar for every advisory in the row of its side, and a tick for every camera detection."""
     for side, color in (("left", RED), ("right", ORANGE)):
-        for start, stop in _runs(timeline.advisory[side]):
-            begin_s, end_s = timeline.time_s[start], timeline.time_s[stop - 1] + _HOP_S
-            axes.broken_barh([(begin_s, end_s - begin_s)], (_SIDE_ROWS[side] - 0.4, 0.8), color=color, lw=0)
-    camera = np.full(timeline.sighting_time_s.shape, _CAMERA_ROW)
-    axes.plot(timeline.sighting_time_s, camera, "|", color=PURPLE)
-    rows = {"camera detection": _CAMERA_ROW} | {f"advisory {side}": row for side, row in _SIDE_ROWS.items()}
-    axes.set(yticks=list(rows.values()), yticklabels=list(rows), ylim=(-0.6, 2.6))
-    axes.tick_params(axis="y", length=0)
+        row = _ROWS.index(f"advisory {side}")
+        draw_bars(axes, timeline.hops.time_s, timeline.hops.columns[side], row, color)
+    axes.plot(timeline.sightings[:, 0], np.zeros(len(timeline.sightings)), "|", color=PURPLE)
+    name_rows(axes, _ROWS)
 
 
 def _draw_statistic(axes: "Axes", timeline: Timeline) -> None:
-    axes.plot(timeline.time_s, timeline.statistic, color=BLUE, label="hazard statistic $s(t)$")
-    axes.plot(timeline.time_s, timeline.risk, color=RED, label="calibrated risk $r(t)$")
+    time_s = timeline.hops.time_s
+    axes.plot(time_s, timeline.hops.statistic, color=BLUE, label="hazard statistic $s(t)$")
+    axes.plot(time_s, timeline.hops.risk, color=RED, label="calibrated risk $r(t)$")
     label = rf"threshold $\gamma(\alpha={timeline.alpha:g})$ on $s$"
     axes.axhline(timeline.threshold, color=BLUE, linestyle=":", label=label)
     axes.set(xlabel="time (s), end of the decision window", ylabel="statistic, risk", ylim=(-0.02, 1.02))
     # The first window begins a second before its decision: at 0, or where a bag's clock or --start says.
-    first_s, last_s = timeline.time_s[[0, -1]] if timeline.time_s.size else (1.0, 1.0)
-    axes.set_xlim(first_s - 1.0, last_s + _HOP_S)
+    first_s, last_s = time_s[[0, -1]] if time_s.size else (1.0, 1.0)
+    axes.set_xlim(first_s - 1.0, last_s + HOP_S)
 
 
 def _mark_visible(panels: "list[Axes]", timeline: Timeline) -> None:
@@ -247,9 +208,3 @@ def _mark_visible(panels: "list[Axes]", timeline: Timeline) -> None:
     if timeline.t0_s is not None:
         entry = panels[1].axvline(timeline.t0_s, color="black", linewidth=1.2, linestyle="--")
         entry.set_label("line-of-sight entry $T_0$")
-
-
-def _runs(on: BoolArray) -> list[tuple[int, int]]:
-    """First index, and one past the last, of every stretch of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.export.scene import sector_of
 from worldstate.frontend.stream import FrontEnd
@@ -19,8 +20,12 @@ from worldstate.operations.figure_style import (
     PURPLE,
     RED,
     SKY,
+    draw_bars,
+    draw_power,
     figure_file,
     legend_beside,
+    name_rows,
+    with_gaps,
 )
 from worldstate.state import Entity, WorldState
 
@@ -29,7 +34,7 @@ if TYPE_CHECKING:
 
 # Of the sides, told apart from red and blue, which say hidden and in view.
 _SIDE_COLORS = (PURPLE, GREEN, ORANGE, SKY)
-# States further apart are not joined by a line: nobody heard what was between them.
+# States further apart are not joined by a line: nothing was heard between them.
 _GAP_S = 0.25
 # An entity is drawn where it more likely exists than not.
 _LIKELY = 0.5
@@ -67,7 +72,8 @@ def write_state_figure(
         heights = (1.0 if sound is None else 1.4, 0.42, 0.6, 0.6)
         azimuths, rows, existence, risk = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         if sound is not None:
-            _draw_sound(azimuths, sound)
+            label = "power of the sound over its median over azimuth, each window at its middle"
+            draw_power(azimuths, sound.time_s, sound.azimuths_rad, sound.power, label)
         _draw_azimuths(azimuths, states)
         _draw_rows(rows, states)
         _draw_existence(existence, states)
@@ -77,20 +83,6 @@ def write_state_figure(
         time_s = _times(states)
         risk.set(xlabel="time (s), end of the decision window", xlim=(time_s[0] - 0.1, time_s[-1] + 0.1))
         figure.suptitle(title)
-
-
-def _draw_sound(axes: "Axes", sound: SoundPower) -> None:
-    level = sound.power / np.median(sound.power, axis=1, keepdims=True)
-    mesh = axes.pcolormesh(
-        sound.time_s,
-        np.degrees(sound.azimuths_rad),
-        level.T,
-        shading="nearest",
-        cmap="Greys",
-        rasterized=True,
-    )
-    bar = axes.figure.colorbar(mesh, ax=axes, location="top", aspect=60, pad=0.02, fraction=0.05)
-    bar.set_label("power of the sound over its median over azimuth, each window at its middle")
 
 
 def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
@@ -107,7 +99,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
                 tracks.setdefault((one.id, _hidden(one)), []).append(row)
     for (_, hidden), rows in tracks.items():
         color, label = (RED, "hidden") if hidden else (BLUE, "in view")
-        time_s, azimuth, low, high = _with_gaps(np.array(rows)).T
+        time_s, azimuth, low, high = with_gaps(np.array(rows), _GAP_S).T
         axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
         axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
     axes.set(ylabel="azimuth (deg)\nleft positive", ylim=(-95, 95), yticks=range(-90, 91, 45))
@@ -118,39 +110,33 @@ def _nine_of_ten_deg(entity: Entity) -> tuple[float, ...]:
     return tuple(np.degrees([entity.azimuth_rad, low, high]).tolist())
 
 
-def _with_gaps(rows: FloatArray) -> FloatArray:
-    """Put a row of NaN where states are missing, so that no line is drawn across."""
-    return np.insert(rows, np.flatnonzero(np.diff(rows[:, 0]) > _GAP_S) + 1, np.nan, axis=0)
-
-
 def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     """Draw a bar while an advisory is out, and a mark for each look that found something or nothing."""
     names = [f"advisory {side}" for side in _sides(states)]
     for row, side in enumerate(_sides(states)):
-        on = [seconds(s.stamp_ns) for s in states if any(c.direction == side and c.advisory for c in s.cues)]
-        axes.broken_barh([(t, 0.1) for t in on], (row - 0.4, 0.8), color=_SIDE_COLORS[row], lw=0)
+        on = [any(c.direction == side and c.advisory for c in state.cues) for state in states]
+        draw_bars(axes, _times(states), on, row, _SIDE_COLORS[row])
     looks = {
         (one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched
     }  # a look stands in every snapshot until the next one
     for sensor in sorted({sensor for sensor, _, _ in looks}):
         row = len(names)
-        for found, color, mark in ((True, BLUE, "|"), (False, "0.75", "|")):
+        for found, color in ((True, BLUE), (False, "0.75")):
             at_s = [seconds(stamp_ns) for name, stamp_ns, was in looks if name == sensor and was == found]
-            axes.plot(at_s, [row] * len(at_s), mark, color=color, ms=9 if found else 4)
+            axes.plot(at_s, [row] * len(at_s), "|", color=color, ms=9 if found else 4)
         names.append(f"{sensor} (blue: found)")
-    foreign = [seconds(s.stamp_ns) for s in states if type(s.domain).__name__ == "Foreign"]
-    if foreign:
-        axes.broken_barh([(t, 0.1) for t in foreign], (len(names) - 0.3, 0.6), color="0.6", lw=0)
+    foreign = [isinstance(state.domain, Foreign) for state in states]
+    if any(foreign):
+        draw_bars(axes, _times(states), foreign, len(names), "0.6", height=0.6)
         names.append("foreign sound")
-    axes.set(yticks=range(len(names)), yticklabels=names, ylim=(-0.6, len(names) - 0.4))
-    axes.tick_params(axis="y", length=0)
+    name_rows(axes, names)
 
 
 def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
     rows = [
         (seconds(s.stamp_ns), *(_existence(s, side) for side in _sides(states)), _in_view(s)) for s in states
     ]
-    time_s, *columns = _with_gaps(np.array(rows)).T
+    time_s, *columns = with_gaps(np.array(rows), _GAP_S).T
     for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
         axes.plot(time_s, column, color=color, label=f"somebody hidden, {side}")
     axes.plot(time_s, columns[-1], color=BLUE, ls=":", label="the likeliest in view")
@@ -159,20 +145,18 @@ def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
 
 def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
     for row, side in enumerate(_sides(states)):
-        cues = [(s.stamp_ns, next((c for c in s.cues if c.direction == side), None)) for s in states]
-        told = [
-            (
-                seconds(t),
-                np.nan if c is None else c.risk,
-                np.nan if c is None else (c.within or {}).get("3", np.nan),
-            )
-            for t, c in cues
-        ]
-        time_s, risk, within = _with_gaps(np.array(told)).T
+        told = [(seconds(state.stamp_ns), *_risks(state, side)) for state in states]
+        time_s, risk, within = with_gaps(np.array(told), _GAP_S).T
         axes.plot(time_s, risk, color=_SIDE_COLORS[row], label=f"risk, {side}")
         if np.isfinite(within).any():
             axes.plot(time_s, within, color=_SIDE_COLORS[row], ls="--", label=f"in view within 3 s, {side}")
     axes.set(ylabel="risk,\nprobability", ylim=(-0.02, 1.02))
+
+
+def _risks(state: WorldState, side: str) -> tuple[float, float]:
+    """Return a side's risk, and its chance to come into view within 3 s; NaN where there is none."""
+    cue = next((one for one in state.cues if one.direction == side), None)
+    return (np.nan, np.nan) if cue is None else (cue.risk, (cue.within or {}).get("3", np.nan))
 
 
 def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
