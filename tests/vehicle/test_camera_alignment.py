@@ -12,8 +12,7 @@ from worldstate.adapters.listen import ListenSettings, open_source
 from worldstate.adapters.vehicle.car_file import read_car, write_aligned
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.operations.alignment.camera_alignment import align
-from worldstate.operations.alignment.heard_passes import HeardPass, heard_passes
+from worldstate.operations.alignment.camera_alignment import HeardPass, align, heard_passes
 
 STREET_M, PACE_MPS = 10.0, 7.0
 
@@ -95,7 +94,7 @@ def test_the_command_writes_the_car_with_both_added(car, tmp_path, capsys, monke
         soundfile.write(sound, np.random.default_rng(0).normal(0.0, 0.1, (9_000, 3)), 8_000)
     seen = iter(passes(10, 0.2, 3.0))
     monkeypatch.setattr(
-        "worldstate.operations.alignment.heard_passes.heard_passes", lambda source, margin_s: [next(seen)]
+        "worldstate.operations.alignment.camera_alignment.heard_passes", lambda source, margin_s: [next(seen)]
     )
     out = tmp_path / "aligned.json"
     words = [

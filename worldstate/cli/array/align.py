@@ -47,8 +47,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.vehicle.car_file import write_aligned
     from worldstate.cli.common.progress import track
     from worldstate.ground.errors import InvalidArgumentError
-    from worldstate.operations.alignment.camera_alignment import LARGEST_OFFSET_S, align
-    from worldstate.operations.alignment.heard_passes import heard_passes
+    from worldstate.operations.alignment.camera_alignment import LARGEST_OFFSET_S, align, heard_passes
     from worldstate.operations.calibration.calibration_input import find_inputs
 
     check_outputs(arguments, "out")

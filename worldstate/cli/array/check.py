@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.audio.open_sound import open_sound
     from worldstate.frontend.health.sample_clock import rate_from_duration
     from worldstate.frontend.stream import FrontEnd
-    from worldstate.operations.arrays.array_figure import write_array_figure
+    from worldstate.operations.recordings.channel_report import write_array_figure
 
     from .check_report import as_json, as_text
 

@@ -1,1 +1,1 @@
-"""Labels from smoothed passes: who was where while only heard, and when each came into line of sight."""
+"""Labels from smoothed passes: places while only heard, and the time of line of sight."""

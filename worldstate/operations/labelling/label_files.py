@@ -20,7 +20,7 @@ from .pass_labels import PassLabel
 COLUMNS = ("ID", "Class", "Environment", "Recording ID", "File", "End", "T0", "T0 std")
 # A window a second before T0 that is half a second off holds what the next class sounds like.
 SUREST_STD_S = 0.3
-# As in streams: nobody comes for so long, and what was in view is gone for a second.
+# As in streams: no vehicle comes for so long, and what was in view is gone for a second.
 CALM_S, GONE_S, NONE_EVERY_S, TOGETHER_S = 5.0, 2.0, 10.0, 2.5
 
 
@@ -70,7 +70,7 @@ def write_open_label(path: Path, recording: str, passes: Sequence[PassLabel]) ->
 def window_rows(
     passes: Sequence[PassLabel], in_view: BoolArray, time_s: FloatArray, environment: str, file: str
 ) -> list[tuple[object, ...]]:
-    """Return the windows of one recording: of every arm at T0, in view after it, and where nobody comes.
+    """Return the windows of one recording: of every arm at T0, in view after it, and where no vehicle comes.
 
     Shapes: in_view (n,), of the times, time_s (n,).
     """
@@ -90,7 +90,7 @@ def window_rows(
     last = -np.inf
     for end_s in time_s.tolist():
         coming = ((entries >= end_s - 1.0) & (entries <= end_s + CALM_S)).any()
-        # Whoever is about to be seen may be heard already, even where no pass was made of it.
+        # A vehicle about to be seen may be heard already, even where no pass was made of it.
         busy = in_view[(time_s > end_s - 1.0 - GONE_S) & (time_s <= end_s + CALM_S)].any()
         if end_s - last >= NONE_EVERY_S and end_s <= time_s[-1] - CALM_S and not (coming or busy):
             rows.append((*_window("none", environment, file, f"{end_s:.0f}", "s", end_s), "", ""))
@@ -101,7 +101,7 @@ def window_rows(
 def _window(
     label: str, environment: str, file: str, number: str, unit: str, end_s: float
 ) -> tuple[object, ...]:
-    """Return what all windows have in their row; of those of nobody the number is a time."""
+    """Return what all windows have in their row; of those without a vehicle the number is a time."""
     return f"{number}{label}", label, environment, f"{file}:{number}{unit}", file, round(end_s, 2)
 
 

@@ -16,7 +16,7 @@ from .box_tracks import BoxTrack, box_tracks
 from .pass_labels import HOP_S, PassLabel, label_passes
 from .street_sound import HeardStreet
 
-# Nearer to the axis nobody comes out of an arm: who turns there has overtaken, or was two vehicles.
+# No vehicle comes out of an arm nearer to the axis: one that turns there has overtaken, or was two.
 _LEAST_EDGE_RAD = math.radians(5.0)
 # Slower ones turn off or park behind the corner, faster ones were two vehicles.
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 3.0
@@ -48,7 +48,7 @@ class WatchedRecording:
     passes: Sequence[PassLabel]
     duration_s: float
     image_s: float  # Between images
-    heard: HeardStreet | None = None  # Meanwhile, where somebody listened
+    heard: HeardStreet | None = None  # Meanwhile, where there is sound
 
 
 def watched_recording(
@@ -79,7 +79,7 @@ def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterato
 def looks_at(track: BoxTrack, image_s: float) -> tuple[FloatArray, FloatArray]:
     """Return the azimuths at which a vehicle was found, and those where images between had no box of it.
 
-    Before the first box and after the last one nobody knows whether it was in view.
+    Before the first box and after the last one it is not known whether it was in view.
     """
     middle = 0.5 * (track.left_rad + track.right_rad)
     whole = np.isfinite(middle)

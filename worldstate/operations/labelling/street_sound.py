@@ -19,7 +19,7 @@ from worldstate.ground.values import NotUsable, seconds
 
 from .pass_labels import PassLabel
 
-# Before T0; who comes is heard for some three seconds.
+# Before T0; a vehicle is heard for some three seconds.
 _HEARD_S = 3.0
 
 _UNHEARD = "what the arms sound like is not learned: %s"
@@ -28,7 +28,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeardStreet:
-    """How sound arrived at every hop, and how likely it was that somebody came."""
+    """How sound arrived at every hop, and how likely a vehicle was coming."""
 
     time_s: FloatArray  # shape (n,)
     patterns: FloatArray  # shape (n, 12), as `arrival_pattern`

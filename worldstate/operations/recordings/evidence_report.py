@@ -107,7 +107,7 @@ def evidence_report(
 
 
 def common_lines(state: WorldState) -> Iterator[str]:
-    """Yield what all sides share: what was heard, who looked, how the sensors are, what has just happened."""
+    """Yield what all sides share: sound, looks, the state of the sensors, what has just happened."""
     if isinstance(state.domain, Foreign):
         yield f"sound: {state.domain.reason}: the evidence of this hop counts little"
     elif isinstance(state.domain, WarningSignal):
