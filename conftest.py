@@ -11,7 +11,7 @@ from worldstate_lab.cli.main import main as study
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, Recording
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.demo import simulate_approach
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 
 # Two processes on two cores beside other work: how long an example takes says nothing of the code.
 # With the usual 100 examples of every law the suite was above its five minutes. Every clone draws the same

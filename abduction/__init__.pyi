@@ -2,11 +2,11 @@ from .absence import MissRateTable as MissRateTable
 from .co_evidence import Absent as Absent
 from .co_evidence import Present as Present
 from .co_evidence import Unqueried as Unqueried
-from .cueing.adaptive_threshold import AdaptiveBudget as AdaptiveBudget
 from .cueing.calibration_error import ReliabilityCurve as ReliabilityCurve
 from .cueing.calibration_error import brier_score as brier_score
 from .cueing.calibration_error import expected_calibration_error as expected_calibration_error
 from .cueing.calibration_error import reliability_curve as reliability_curve
+from .cueing.cueing_policy import AdaptiveBudget as AdaptiveBudget
 from .cueing.cueing_policy import CueingPolicies as CueingPolicies
 from .cueing.cueing_policy import CueingPolicy as CueingPolicy
 from .cueing.risk_map import RiskMap as RiskMap
@@ -15,7 +15,7 @@ from .cueing.thresholds import conformal_threshold as conformal_threshold
 from .cueing.thresholds import neyman_pearson_threshold as neyman_pearson_threshold
 from .cueing.thresholds import recordings_needed as recordings_needed
 from .evidence import SignatureEvidence as SignatureEvidence
-from .grounding.class_descriptors import Descriptor as Descriptor
+from .grounding.grounded_likelihood import Descriptor as Descriptor
 from .grounding.grounded_likelihood import GroundedAnswer as GroundedAnswer
 from .grounding.grounded_likelihood import GroundedObservation as GroundedObservation
 from .grounding.grounded_likelihood import GroundedSettings as GroundedSettings
@@ -34,4 +34,4 @@ from .signature.ensemble_training import SiteEnsembleClassifier as SiteEnsembleC
 from .signature.published_signature import SignatureModel as SignatureModel
 from .signature.site_estimate import SiteEstimate as SiteEstimate
 from .signature.site_estimate import SiteEstimateSettings as SiteEstimateSettings
-from .signature.site_signature import SiteSignature as SiteSignature
+from .signature.site_estimate import SiteSignature as SiteSignature

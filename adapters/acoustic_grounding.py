@@ -3,13 +3,15 @@
 from dataclasses import dataclass, field
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.grounding.class_descriptors import Descriptor, car, motorcycle
 from worldstate.abduction.grounding.grounded_likelihood import (
+    Descriptor,
     GroundedAnswer,
     GroundedObservation,
     GroundedSettings,
     Observable,
+    car,
     ground,
+    motorcycle,
 )
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.ground.values import NotUsable

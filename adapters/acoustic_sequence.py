@@ -9,8 +9,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
-from worldstate.abduction.sequence.side_patterns import SidePatterns
-from worldstate.abduction.sequence.street_hearing import StreetHearing, StreetListener
+from worldstate.abduction.sequence.street_sides import SidePatterns, StreetHearing, StreetListener
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.files.acoustic_domain import UNFIT, heard_with
 from worldstate.adapters.files.model_file import Model

@@ -9,12 +9,10 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader
-from worldstate.abduction.sequence.side_patterns import SidePatterns
-from worldstate.abduction.sequence.street_hearing import StreetHearing
+from worldstate.abduction.sequence.street_sides import SidePatterns, StreetHearing
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
-from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
-from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, SoundStream, as_sound, open_sound, path_of
 from worldstate.adapters.camera.camera_channel import Watcher, video_degradation
 from worldstate.adapters.camera.detection_formats import read_any_detections

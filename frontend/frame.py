@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.approach.tone_stage import ToneReading
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.geometry import Ambiguity
-from worldstate.frontend.direction.music_stage import MusicReading
-from worldstate.frontend.direction.peaks import Peak
+from worldstate.frontend.direction.bearing import Peak
+from worldstate.frontend.direction.music import MusicReading
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
+from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import (

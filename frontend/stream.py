@@ -7,16 +7,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.approach.looming import EnergyFloor, Looming, fitted_looming
-from worldstate.frontend.approach.tone_stage import ToneStage
+from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.geometry import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.bearing import bearing_of
+from worldstate.frontend.direction.bearing import bearing_of, highest_peaks
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
-from worldstate.frontend.direction.peaks import highest_peaks
 from worldstate.frontend.direction.srp import noise_prominence, normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
+from worldstate.frontend.hop_spectra import Hop, HopCutter
 from worldstate.frontend.levels import SILENCE
-from worldstate.frontend.spectra.hop_cutter import Hop, HopCutter
 from worldstate.frontend.spectra.sound_character import SoundCharacter
 from worldstate.frontend.spectra.stft import bin_frequencies_hz
 from worldstate.ground.blas_threads import one_blas_thread

@@ -22,7 +22,7 @@ from .sequence_inputs import (
     streets_own,
 )
 from .sequence_model import GROUPS, SequenceAlarm, SequenceModel
-from .street_hearing import StreetListener
+from .street_sides import StreetListener
 
 # Before, what is usual in a street is what was heard just now.
 LEAST_HOPS = 10

@@ -24,9 +24,17 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Via
 from worldstate.ground.typing import FloatArray
 
-from .expert import VIEWS, Expert, expert_views, log_softmax, split_reference, total
+from .expert import (
+    SEGMENTS,
+    VIEWS,
+    Expert,
+    expert_views,
+    log_softmax,
+    mirror_features,
+    split_reference,
+    total,
+)
 from .model_domain import ModelDomain
-from .pattern_features import SEGMENTS, mirror_features
 from .published_signature import SignatureModel
 from .site_reference import KINDS, SiteReference, log_levels
 from .window_classes import (

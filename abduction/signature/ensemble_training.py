@@ -13,8 +13,7 @@ from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
 from .ensemble import PRIOR_S, EnsembleModel
-from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_views, split_reference
-from .pattern_features import SEGMENTS, mirror_features
+from .expert import SEGMENTS, SHAPE, SHAPE_CHANGE, Expert, expert_views, mirror_features, split_reference
 from .site_reference import KINDS, SiteReference
 from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, mirrored_classes
 

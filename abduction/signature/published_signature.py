@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.cueing.platt import sigmoid
+from worldstate.abduction.cueing.risk_map import sigmoid
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError

@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.special import betaincinv
 
-from worldstate.abduction.absence import MissRateTable
-from worldstate.abduction.cueing.isotonic_grid import isotonic_grid
+from worldstate.abduction.absence import MissRateTable, isotonic_grid
 from worldstate.adapters.files.atomic import write_text
 from worldstate.adapters.files.text_file import read_record
 from worldstate.ground.checks import finite_array

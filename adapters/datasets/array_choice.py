@@ -8,8 +8,7 @@ import numpy as np
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.array_match import array_difference, microphone_order
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 
 from .ovad import ARRAY_NAME, AUDIO_NAME, LOG_NAME

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from worldstate.abduction.signature.model_domain import EgoMotion, ModelDomain
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
     FEATURE_NFFT,

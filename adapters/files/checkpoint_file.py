@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory
-from worldstate.abduction.sequence.street_hearing import StreetHearing
+from worldstate.abduction.sequence.street_sides import StreetHearing
 from worldstate.abduction.signature.site_estimate import SiteEstimate
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.serialisation import decode, encode

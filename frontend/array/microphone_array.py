@@ -1,4 +1,4 @@
-"""The microphone array: positions, delays, steering vectors and what they allow."""
+"""The microphone array: positions, delays, steering vectors, the channels in use, and two roof arrays."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import Complex128Array, FloatArray
+from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray
 
 from .geometry import SPEED_OF_SOUND_M_S, Ambiguity, ambiguity, direction_vectors, nearest_spacings_m
 
@@ -238,3 +238,96 @@ def roof_array_56() -> MicrophoneArray:
 
 def _to_unit(values: FloatArray) -> FloatArray:
     return np.asarray(2.0 * (values - values.min()) / np.ptp(values) - 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelMask:
+    r"""Microphones that are used.
+
+    A whitened channel that is set to zero adds nothing to a sum over microphones, so that the beams of the
+    whole array serve for any part of it. Only the scale changes: with n of M microphones, beam power is
+    smaller by (n / M)^2 and the sum over pairs by n (n - 1) / (M (M - 1)). Sums are scaled back per hop, so
+    that a window may hold hops with different masks.
+    """
+
+    keep: BoolArray  # shape (M,): False for those left out
+
+    @classmethod
+    def all_of(cls, n_channels: int) -> "ChannelMask":
+        """Return the mask that keeps all microphones."""
+        return cls(np.ones(n_channels, bool))
+
+    @property
+    def n_kept(self) -> int:
+        """Number n of microphones kept."""
+        return int(np.count_nonzero(self.keep))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all microphones are kept."""
+        return bool(self.keep.all())
+
+    @property
+    def power_scale(self) -> float:
+        """(M / n)^2: from the beam power of n microphones to that of M; finite for none."""
+        return float((len(self.keep) / max(self.n_kept, 1)) ** 2)
+
+    @property
+    def pair_scale(self) -> float:
+        """Ratio of the numbers of pairs; finite for fewer than two microphones."""
+        whole, kept = len(self.keep), max(self.n_kept, 2)
+        return whole * (whole - 1) / (kept * (kept - 1))
+
+    def silence(self, spectra: Complex64Array) -> None:
+        """Set the channels left out of spectra (..., M) to zero, in place."""
+        if not self.is_whole:
+            spectra[..., ~self.keep] = 0.0
+
+    def cross(self, matrices: Complex64Array) -> Complex64Array:
+        """Return cross-spectra ``R'_ij = k_i k_j R_ij``, (..., M, M); the same array if all are kept."""
+        if self.is_whole:
+            return matrices
+        return np.asarray(matrices * (self.keep[:, None] & self.keep))
+
+
+# (y, z) in metres, in the order of OVAD's channels; x is zero. Facts released with Schulz et al. 2021, there
+# in axes that grow to the right and up; no digit is rounded.
+# fmt: off
+_LEFT_UP_M = (
+    (0.392, 0.288), (0.289024, 0.328443), (0.303659, 0.217809), (0.212195, 0.258831), (0.392, 0.128308),
+    (0.32561, 0.063668), (0.247117, 0.148328), (0.17439, 0.109539), (0.084146, 0.312283),
+    (0.123229, 0.23465), (0.087, 0.141538), (0.013415, 0.167385), (0.036, 0.06232), (-0.036, 0.06232),
+    (-0.070732, 0.323471), (-0.015156, 0.250456), (-0.14, 0.216514), (-0.082927, 0.139077),
+    (-0.207317, 0.274991), (-0.29878, 0.287422), (-0.291463, 0.176788), (-0.392, 0.210462),
+    (-0.19878, 0.118154), (-0.15, 0.051237), (-0.292683, 0.067397), (-0.392, 0.027077),
+    (-0.247561, -0.046769), (-0.317073, -0.089231), (-0.392, -0.152634), (-0.276829, -0.201108),
+    (-0.392, -0.316308), (-0.303659, -0.320443), (-0.150906, -0.18845), (-0.02439, -0.175003),
+    (-0.206098, -0.273206), (-0.103659, -0.322929), (-0.026359, -0.260182), (0.048996, -0.309255),
+    (0.087801, -0.198622), (0.179901, -0.218845), (0.253048, -0.178723), (0.230488, -0.312985),
+    (0.392, -0.248615), (0.314634, -0.27072), (0.392, -0.049452), (0.320732, -0.116578), (0.252, -0.018349),
+    (0.190667, -0.097859), (0.158537, 0.023385), (0.072, 0.0), (-0.072, 0.0), (-0.162195, -0.069342),
+    (-0.036, -0.06232), (-0.090244, -0.108308), (0.036, -0.06232), (0.102439, -0.104124),
+)
+# fmt: on
+
+
+def ovad_array() -> MicrophoneArray:
+    """Return the array that OVAD was recorded with: 56 microphones in the y-z plane, across the vehicle.
+
+    Its positions were released with Schulz et al., "Hearing What You Cannot See: Acoustic Vehicle Detection
+    Around Corners", 2021. It is the default wherever a recording in OVAD's layout names no array of its own,
+    and what the simulator listens with.
+
+    Returns
+    -------
+    MicrophoneArray
+        In the order of OVAD's channels; the same each time.
+
+    Examples
+    --------
+    >>> array = ovad_array()
+    >>> array.n_microphones, array.aperture_m.round(3).tolist(), round(array.horizontal_moment_m2, 3)
+    (56, [0.0, 0.784, 0.651], 3.027)
+    """
+    y, z = np.array(_LEFT_UP_M).T
+    return MicrophoneArray(np.stack([np.zeros_like(y), y, z], axis=1), "OVAD (Schulz et al. 2021)")

@@ -1,4 +1,4 @@
-r"""Bearing of the strongest source, with a standard deviation that knows other peaks and the noise.
+r"""Peaks of a spatial spectrum, and the bearing of the strongest source with its standard deviation.
 
 A spatial spectrum of a street has several peaks, and the highest is not always the vehicle: walls reflect it,
 and another source may be as loud. What exceeds the median of the spectrum is read as a density over azimuth,
@@ -23,10 +23,119 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from worldstate.ground.typing import FloatArray
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.ground.values import wrap_angle
 
-from .peaks import Peak
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    r"""A local maximum of a spatial spectrum.
+
+    .. math:: \rho = \hat P / \mathrm{median}_\theta P
+
+    Parameters
+    ----------
+    azimuth_rad : float
+        Azimuth at the interpolated maximum, radians, left positive.
+    value : float
+        Height there, in the unit of the spectrum.
+    prominence : float
+        Peak-to-median ratio, >= 1 for the highest peak.
+
+    Examples
+    --------
+    >>> Peak(0.3, 0.5, 1.4).prominence
+    1.4
+    """
+
+    azimuth_rad: float
+    value: float
+    prominence: float
+
+
+def find_peaks(spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int = 4) -> tuple[Peak, ...]:
+    r"""Find the highest local maxima, interpolated by a parabola through three grid points.
+
+    With P at the grid point i of a maximum and at its neighbours,
+
+    .. math:: \delta = \frac{P_{i-1} - P_{i+1}}{2 (P_{i-1} - 2 P_i + P_{i+1})}, \qquad
+              \hat\theta = \theta_i + \delta\, \Delta\theta, \qquad
+              \hat P = P_i - \tfrac14 (P_{i-1} - P_{i+1})\, \delta.
+
+    A spectrum of zeros (silence) has no peak. A maximum at an end of the grid is not interpolated.
+
+    Parameters
+    ----------
+    spectrum : array_like, shape (A,)
+        Non-negative, any unit.
+    azimuths_rad : array_like, shape (A,)
+        Ascending, evenly spaced, radians; A >= 3.
+    max_peaks : int
+        Largest number of peaks.
+
+    Returns
+    -------
+    tuple of Peak
+        Highest first; empty in silence.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, fewer than three points, NaN or infinity.
+
+    References
+    ----------
+    J. O. Smith and X. Serra, "PARSHL: an analysis/synthesis program for non-harmonic sounds", ICMC 1987 (the
+    parabola).
+
+    Examples
+    --------
+    >>> grid = np.radians(np.arange(-90.0, 91.0))
+    >>> beam = 0.1 + np.exp(-((grid - 0.30) ** 2) / 0.02) + 0.5 * np.exp(-((grid + 0.60) ** 2) / 0.02)
+    >>> [(round(p.azimuth_rad, 3), round(p.value, 3)) for p in find_peaks(beam, grid)]
+    [(0.3, 1.1), (-0.6, 0.6)]
+    """
+    azimuths = finite_array("azimuths_rad", azimuths_rad, (None,))
+    values = finite_array("spectrum", spectrum, azimuths.shape)
+    if len(values) < 3:
+        raise InvalidArgumentError(f"azimuths_rad: expected at least three points, got {len(values)}")
+    return highest_peaks(values, azimuths, max_peaks)
+
+
+def highest_peaks(values: FloatArray, azimuths: FloatArray, max_peaks: int) -> tuple[Peak, ...]:
+    """Return what `find_peaks` finds in arrays that are finite and fit each other.
+
+    Shapes: values (A,), azimuths (A,).
+    """
+    if values.max() <= 0.0:
+        return ()
+    median = max(float(np.median(values)), np.finfo(np.float64).tiny)
+    candidates = _local_maxima(values)
+    highest = candidates[np.argsort(-values[candidates], kind="stable")][:max_peaks]
+    peaks = (_interpolate(values, azimuths, int(index), median) for index in highest)
+    return tuple(peak for peak in peaks if peak.prominence >= 1.0)
+
+
+def _local_maxima(values: FloatArray) -> IndexArray:
+    """Return the indices of local maxima; of a plateau the first."""
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    return np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+
+
+def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: float) -> Peak:
+    height, shift = float(values[index]), 0.0
+    if 0 < index < len(values) - 1:
+        left, right = float(values[index - 1]), float(values[index + 1])
+        bend = left - 2.0 * height + right
+        shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+        height -= 0.25 * (left - right) * shift
+    azimuth = azimuths[index] + shift * (azimuths[1] - azimuths[0])
+    return Peak(float(azimuth), height, height / median)
+
 
 # Exponent and share were set on simulated streets (docs/bearing.md): of vehicles in view the error over the
 # stated deviation has a root mean square of .9 to 1.4 with 56, 14, 7 and 4 microphones. The exponent 2
@@ -120,3 +229,114 @@ def direct_probability(peaks: Sequence[Peak]) -> float:
     if any(peak.value - median > _SECOND * excess for peak in peaks[1:]):
         return 0.0
     return 1.0 / (1.0 + math.exp((_MIDDLE - excess / (1.0 - median)) / _WIDTH)) if median < 1.0 else 0.0
+
+
+# Thresholds of a curve, evenly spread over the coverage.
+_MOST_POINTS = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GatingCurve:
+    r"""Coverage and median error of bearings over the threshold on their prominence.
+
+    .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
+              e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
+
+    Parameters
+    ----------
+    threshold : ndarray, shape (T,)
+        Smallest prominence kept, ascending.
+    coverage : ndarray, shape (T,)
+        Share of the bearings kept, in (0, 1].
+    median_error_rad : ndarray, shape (T,)
+        Median absolute error of the bearings kept, radians.
+
+    Examples
+    --------
+    >>> curve = gating_curve([1.1, 1.2, 2.0, 3.0], [0.4, 0.3, 0.02, 0.01])
+    >>> curve.coverage, curve.median_error_rad
+    (array([1.  , 0.75, 0.5 , 0.25]), array([0.16 , 0.02 , 0.015, 0.01 ]))
+    """
+
+    threshold: FloatArray
+    coverage: FloatArray
+    median_error_rad: FloatArray
+
+    def at_coverage(self, share: float) -> tuple[float, float]:
+        r"""Return the highest threshold that keeps at least a share of the bearings, and the error there.
+
+        .. math:: \rho^* = \max\{\rho_0 : c(\rho_0) \ge s\}
+
+        Parameters
+        ----------
+        share : float
+            In (0, 1].
+
+        Returns
+        -------
+        threshold, median_error_rad : float
+            Prominence, and radians.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the share is out of range.
+
+        Examples
+        --------
+        >>> gating_curve([1.1, 1.2, 2.0, 3.0], [0.5, 0.25, 0.125, 0.125]).at_coverage(0.5)
+        (2.0, 0.125)
+        """
+        least = in_range("share", share, 0.0, 1.0, open_low=True)
+        last = int(np.flatnonzero(self.coverage >= least - 1e-12)[-1])
+        return float(self.threshold[last]), float(self.median_error_rad[last])
+
+
+def gating_curve(prominence: ArrayLike, error_rad: ArrayLike) -> GatingCurve:
+    r"""Compute coverage and median error over the prominence threshold from bearings with known errors.
+
+    .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
+              e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
+
+    Parameters
+    ----------
+    prominence : array_like, shape (n,)
+        Peak-to-median ratios; n >= 1.
+    error_rad : array_like, shape (n,)
+        Bearing minus truth, wrapped here.
+
+    Returns
+    -------
+    GatingCurve
+        One point for every prominence that occurs, or an even choice of them; the first keeps all.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, no bearings, NaN or infinity.
+
+    References
+    ----------
+    The results of the paper (gating by the peak-to-median ratio); C. K. Chow, "On optimum recognition error
+    and reject tradeoff", IEEE Trans. IT 16, 1970 (the curve).
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> prominence = 1.0 + rng.exponential(0.5, 2000)
+    >>> curve = gating_curve(prominence, rng.standard_normal(2000) * 0.1 / (prominence - 0.9))
+    >>> len(curve.threshold), bool(curve.median_error_rad[150] < 0.5 * curve.median_error_rad[0])
+    (200, True)
+    """
+    ratios = finite_array("prominence", prominence, (None,))
+    errors = np.abs(wrap_angle(finite_array("error_rad", error_rad, ratios.shape)))
+    if not len(ratios):
+        raise InvalidArgumentError("prominence: expected at least one bearing, got none")
+    order = np.argsort(ratios, kind="stable")
+    ratios, errors = ratios[order], errors[order]
+    # Equal prominences are kept or dropped together.
+    starts = np.flatnonzero(np.diff(ratios, prepend=-np.inf))
+    if len(starts) > _MOST_POINTS:
+        starts = starts[np.linspace(0, len(starts) - 1, _MOST_POINTS).round().astype(np.intp)]
+    medians = np.array([np.median(errors[start:]) for start in starts])
+    return GatingCurve(ratios[starts], 1.0 - starts / len(ratios), medians)

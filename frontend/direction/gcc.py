@@ -16,8 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.spectra.finite_complex import finite_complex
-from worldstate.ground.checks import finite_array
+from worldstate.ground.checks import finite_array, finite_complex
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray, IndexArray
 

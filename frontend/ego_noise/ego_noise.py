@@ -21,8 +21,10 @@ it: noise then reads 1/M at any speed.
 """
 
 import math
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -30,12 +32,10 @@ from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.stft import whiten
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import Complex64Array, FloatArray
+from worldstate.ground.typing import Complex64Array, ComplexArray, FloatArray
 
 from .elevation_split import ElevationSplit, share_of
 from .harmonic_cancellation import HarmonicCanceller
-from .noise_memory import GuardDelay, NoiseCovariance, NoiseLevel
-from .prewhitening import WhitenedBeams, shrunk_inverse_root, white_share
 
 _TINY = np.float32(1e-30)
 # Shares of below-horizon power at which whitening begins and is complete. Simulated streets: below 0.1;
@@ -278,3 +278,181 @@ def _direction_sum(spectra: Complex64Array) -> Complex64Array:
 def _whole(name: str, value: int, low: int, high: int) -> None:
     if value != int(value) or not low <= value <= high:
         raise InvalidArgumentError(f"{name}: expected a whole number in [{low}, {high}], got {value}")
+
+
+Item = TypeVar("Item")
+
+
+class GuardDelay(Generic[Item]):
+    r"""Queue of hops, weighted :math:`w'_n = \min(w_n, \dots, w_{n + hops})` over the guard interval."""
+
+    # Each hop leaves after `hops` hops. Without the delay a source is learned as noise in the moments before
+    # it is detected.
+
+    def __init__(self, hops: int) -> None:
+        self._waiting: deque[Item] = deque()
+        self._weights: deque[float] = deque(maxlen=hops + 1)
+
+    def push(self, item: Item, weight: float) -> tuple[Item, float] | None:
+        """Take a hop with its weight; return the one that leaves the delay, None while it fills."""
+        self._waiting.append(item)
+        self._weights.append(weight)
+        if len(self._waiting) < (self._weights.maxlen or 0):
+            return None
+        return self._waiting.popleft(), min(self._weights)
+
+
+# Memory of the level of whitened noise, hops: one second, for the level follows the speed of the vehicle.
+_LEVEL_HOPS = 10.0
+
+
+class NoiseCovariance:
+    """Recursive mean of unit-length snapshots' covariance, per bin."""
+
+    def __init__(self, n_bins: int, n_microphones: int, forgetting_frames: float) -> None:
+        self.n_frames = 0.0
+        self._sum = np.zeros((n_bins, n_microphones, n_microphones), np.complex64)
+        self._forgetting = forgetting_frames
+
+    def learn(self, total: Complex64Array, n_frames: int, weight: float) -> None:
+        r"""Add a hop's sum (bins, M, M) over `n_frames` with a weight in (0, 1]; `total` is overwritten.
+
+        .. math:: S \leftarrow e^{-w T / F} S + w \sum_t x_t x_t^H, \qquad n \leftarrow e^{-w T / F} n + w T
+        """
+        kept = math.exp(-weight * n_frames / self._forgetting)
+        total *= np.float32(weight)
+        self._sum *= np.float32(kept)
+        self._sum += total
+        self.n_frames = kept * self.n_frames + weight * n_frames
+
+    def mean(self, bin_index: int) -> Complex64Array:
+        """Return the covariance S / n of one bin; the mean of its diagonal is one."""
+        return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
+
+    @property
+    def total(self) -> Complex64Array:
+        """The weighted sum S, (bins, M, M)."""
+        return self._sum
+
+
+class NoiseLevel:
+    """Level of whitened noise relative to white noise, learned like the covariance."""
+
+    def __init__(self, guard_hops: int) -> None:
+        self._guard: GuardDelay[float] = GuardDelay(guard_hops)
+        self._sum = self._weights = 0.0
+
+    def push(self, level: float, weight: float) -> float:
+        r"""Take a hop's level with its weight; return the level learned so far, 1 before any.
+
+        .. math:: c = \frac{\sum_i w_i l_i e^{-W_i / 10}}{\sum_i w_i e^{-W_i / 10}}
+        with the weights w of the levels l and W the weight learned since.
+        """
+        ripe = self._guard.push(level, weight)
+        if ripe is not None and ripe[1] > 0.0:
+            learned, weight = ripe
+            kept = math.exp(-weight / _LEVEL_HOPS)
+            self._sum = kept * self._sum + weight * learned
+            self._weights = kept * self._weights + weight
+        return self._sum / self._weights if self._weights else 1.0
+
+
+# Noise power of a microphone, relative to the mean, below which it is dead and left out: its inverse would
+# dominate.
+_DEAD = 1e-9
+
+
+def white_share(R: ComplexArray, n_frames: float) -> float:
+    r"""Return the oracle-approximating shrinkage of a sample covariance towards white noise.
+
+    .. math:: s = \min\Big(1, \frac{(1 - 2/M) \operatorname{tr} R^2 + \operatorname{tr}^2 R}
+              {(n + 1 - 2/M) (\operatorname{tr} R^2 - \operatorname{tr}^2 R / M)}\Big)
+
+    Shapes: R (M, M).
+
+    Examples
+    --------
+    >>> white_share(np.eye(4), 100), round(white_share(np.ones((4, 4)), 100), 3)
+    (1.0, 0.02)
+    """
+    # Y. Chen et al., IEEE Trans. Signal Processing 58, 2010. One if the eigenvalues spread no more than those
+    # of n frames of white noise, so that white noise is not whitened; near zero if a few directions dominate.
+    size = len(R)
+    squares = float(np.square(R.real).sum() + np.square(R.imag).sum())
+    trace = float(np.einsum("mm->", R).real) ** 2
+    spread = (n_frames + 1.0 - 2.0 / size) * (squares - trace / size)
+    share = (1.0 - 2.0 / size) * squares + trace
+    return share / spread if spread > share else 1.0
+
+
+def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
+    r"""Return the Hermitian inverse root of a noise covariance, shrunk towards white noise of equal power.
+
+    .. math:: \big[(1 - s) R / p + s I\big]^{-1/2} =
+              V \operatorname{diag}\big[(1 - s) \lambda / p + s\big]^{-1/2} V^H, \qquad p = \operatorname{tr}
+              R / M
+
+    Shapes: R (M, M).
+    """
+    # Shrinkage after O. Ledoit and M. Wolf (2004): no direction is amplified by more than 1 / sqrt(s), and s
+    # = 1 changes nothing. The Hermitian root after A. Kessy et al. (2018). Dead microphones give zeros; where
+    # all are silent the identity is returned.
+    power = np.einsum("mm->m", R).real
+    alive = power > _DEAD * power.mean()
+    root = np.zeros_like(R) if alive.any() else np.eye(len(R), dtype=R.dtype)
+    if alive.any():
+        both = np.ix_(alive, alive)
+        root[both] = _shrunk_root(R[both] / power[alive].mean(), s)
+    return root
+
+
+def _shrunk_root(R: ComplexArray, s: float) -> ComplexArray:
+    if s >= 1.0:
+        return np.eye(len(R), dtype=R.dtype)
+    values, vectors = np.linalg.eigh(R)
+    shrunk = (1.0 - s) * np.maximum(values, 0.0) + s
+    gains = 1.0 / np.sqrt(np.maximum(shrunk, np.finfo(values.dtype).tiny))
+    return np.asarray((vectors * gains.astype(values.dtype)) @ vectors.conj().T)
+
+
+class WhitenedBeams:
+    r"""Beams for whitened spectra, updated bin by bin.
+
+    .. math:: y = R^{-1/2} x, \qquad b(\theta) = \sqrt{M}\, \frac{R^{-1/2} a(\theta)}{\|R^{-1/2} a(\theta)\|}
+
+    with the noise covariance R per bin and its Hermitian root, the root that changes the microphones least:
+    where R is a multiple of the identity, y is x and b is a. Whitening attenuates the steering vector as it
+    does the sound, hence its new length.
+
+    MUSIC in these coordinates is the generalised eigenvalue form (R. Roy and T. Kailath, IEEE Trans. ASSP 37,
+    1989; for ego-noise K. Nakamura et al., IROS 2009): the eigenvectors v of :math:`R^{-1/2} R_x R^{-1/2}`
+    are :math:`R^{1/2} u` with :math:`R_x u = \lambda R u`.
+
+    With :math:`W = B C` of `Steering`, the weights for :math:`y = R^{-1/2} x` are
+    :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the
+    microphones that are not dead).
+    """
+
+    def __init__(self, plain: Steering) -> None:
+        self.plain = plain
+        basis = None if plain.basis is None else plain.basis.copy()
+        self.steering = Steering(basis, plain.weights.copy(), plain.conjugate.copy())
+
+    def update(self, bin_index: int, root: Complex64Array) -> None:
+        r"""Set the inverse root (M, M) of one bin.
+
+        .. math:: w(\theta) = \sqrt M\, \frac{\overline{R^{-1/2}}\, \overline{a(\theta)}}
+                  {\|R^{-1/2}\, a(\theta)\|}
+        """
+        plain, ours = self.plain, self.steering
+        weights = plain.weights[bin_index]
+        if plain.basis is None or ours.basis is None:
+            weights = root.conj() @ weights
+            gram = np.square(np.abs(weights)).sum(axis=0)
+        else:
+            basis = root.conj() @ plain.basis[bin_index]
+            ours.basis[bin_index] = basis
+            gram = (weights.conj() * ((basis.conj().T @ basis) @ weights)).real.sum(axis=0)
+        alive = np.float32(np.count_nonzero(np.einsum("mm->m", root)))
+        scaled = weights * np.sqrt(alive / np.maximum(gram, _TINY))
+        ours.weights[bin_index], ours.conjugate[bin_index] = scaled, scaled.conj()

@@ -5,7 +5,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.frontend.array.microphone_array import ChannelMask
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable
 

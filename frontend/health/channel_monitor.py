@@ -1,19 +1,212 @@
-"""Monitor the channels of a stream, hop by hop, against each other."""
+"""Monitor the channels of a stream, hop by hop: levels, clipping, activity, dropouts, geometry."""
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.array.channel_mask import ChannelMask
-from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray
 
-from .channel_activity import ChannelActivity
 from .channel_health import MASKED_FAULTS, ArrayHealth, ChannelFault, Fault, faults_where
-from .channel_levels import ChannelLevels
-from .clipping import ClippingCounter
 from .dropouts import Dropout, DropoutFinder
 from .geometry_check import GeometryCheck
 from .sample_clock import SampleClock
+
+# Width of the interval below an extreme, in halves of the span: an unclipped sound has more samples there
+# than at the extreme itself.
+_SHELL = np.float32(0.1)
+# Step to the next value, in halves of the span, from which coarse quantisation would be taken for clipping.
+_COARSE = np.float32(0.02)
+# Fewer samples at the extreme occur by chance.
+_MIN_COUNT = 16
+
+
+class ClippingCounter:
+    """Count samples at and just below the highest and the lowest value of every channel."""
+
+    # An unclipped sound reaches its extreme once and the values just below it more often; a clipped one stays
+    # at it. Only hops that reach the extreme again are counted, so that a clean stream costs nothing; a new
+    # extreme restarts the count, because the old one was no clipping level.
+
+    def __init__(self, n_channels: int) -> None:
+        self._n_samples = 0
+        self._extreme = np.full((2, n_channels), -np.inf, np.float32)
+        self._at = np.zeros((2, n_channels), np.int64)
+        self._below = np.zeros((2, n_channels), np.int64)
+
+    def push(self, samples: Float32Array, lowest: Float32Array, highest: Float32Array) -> None:
+        r"""Take the samples (n, M) of a hop and their extremes (M,).
+
+        .. math:: n_{at} = \#\{x = x_{max}\}, \qquad
+                  n_{below} = \#\{x_{max} - \tfrac1{20} s \le x < x_{max}\}
+
+        Shapes: samples (n, M), lowest, highest (M,).
+        """
+        # Counted for x and for -x; s is the span of the hop.
+        self._n_samples += len(samples)
+        span = highest - lowest
+        self._side(0, np.float32(1.0), samples, highest, span)
+        self._side(1, np.float32(-1.0), samples, -lowest, span)
+
+    def _side(
+        self,
+        side: int,
+        sign: np.float32,
+        samples: Float32Array,
+        top: Float32Array,
+        span: Float32Array,
+    ) -> None:
+        extreme, at, below = self._extreme[side], self._at[side], self._below[side]
+        reached = np.flatnonzero((top == extreme) & (span > 0.0))
+        higher = top > extreme
+        extreme[higher], at[higher], below[higher] = top[higher], 0, 0
+        if len(reached):
+            values = sign * samples[:, reached]
+            is_at = values == extreme[reached]
+            n_at = is_at.sum(axis=0)
+            half = np.float32(0.5) * span[reached]
+            n_below = (values >= extreme[reached] - _SHELL * half).sum(axis=0) - n_at
+            next_level = values.max(axis=0, where=~is_at, initial=-np.inf)
+            fine = extreme[reached] - next_level < _COARSE * half
+            at[reached] += n_at * fine
+            below[reached] += n_below * fine
+
+    def clipped_share(self) -> FloatArray:
+        r"""Share of all samples at a clipping level, shape (M,); 0 for channels without one.
+
+        .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]
+        """
+        clipped = np.where((self._at >= _MIN_COUNT) & (self._at > self._below), self._at, 0)
+        return np.asarray(clipped.sum(axis=0) / max(self._n_samples, 1))
+
+
+# Ten seconds; gusts last half a second to three, with lulls of as much between them.
+_LEVEL_HOPS = 100
+# Median of half a second: single hops of sound scatter by 2 dB between microphones, and a crackle is one hop.
+_SMOOTHED = 5
+# Six seconds: after two, the first gust is taken for a gain.
+_FEWEST_HOPS = 60
+# The fifth of the hops that is nearest to the others': in the lulls of gusts a channel has its own level.
+_QUIET = 0.2
+# Simulated streets, 56 and 8 microphones, standing and moving ego: healthy levels below 2.2 dB, their rise
+# within ten seconds below 0.9 dB, of a siren that interferes at one microphone 3.1 dB; gusts rise by 6 to 19.
+_LEVEL_DB, _GUST_DB = 4.0, 4.5
+# Hops of half a second's mean: one bang is no gust.
+_FEWEST_GUSTY = 3
+_TINY = np.finfo(np.float64).tiny
+
+
+class ChannelLevels:
+    r"""Level of every channel against the median channel, a mean over bins in decibels.
+
+    .. math:: L_m = \Big\langle 10 \lg \frac{E_{km}}{\mathrm{median}_j\, E_{kj}} \Big\rangle_k
+
+    The mean of logarithms: a tone that interferes at one microphone is one bin of many.
+    """
+
+    def __init__(self, n_channels: int) -> None:
+        self._hops = np.zeros((_LEVEL_HOPS, n_channels))
+        self._latest = np.zeros(n_channels)
+        self._count = np.zeros(n_channels, np.int64)
+        self._n_hops = 0
+
+    def push(self, powers: FloatArray, good: BoolArray) -> None:
+        """Take the mean power of one hop per bin and channel, (K, M), and the channels that sound, (M,)."""
+        if good.any():
+            level = 10.0 * np.log10(np.maximum(powers, _TINY))
+            level -= np.median(level[:, good], axis=1, keepdims=True)
+            # A hop in which a channel breaks off says nothing of its level.
+            self._latest = np.where(good, level.mean(axis=0), self._latest)
+        self._hops[self._n_hops % _LEVEL_HOPS] = self._latest
+        self._n_hops += 1
+        self._count += good
+
+    def faults(self) -> list[ChannelFault]:
+        r"""Return wrong gains in dB, and gusts with their share of the last ten seconds.
+
+        .. math:: g_m = q_{20\%}(L) > 4 \;\text{or}\; q_{80\%}(L) < -4, \qquad
+                  \#\{L - q_{20\%}(L) > 4.5\} \ge 3
+
+        A channel with gusts has no gain.
+        """
+        n = min(self._n_hops, _LEVEL_HOPS)
+        if n < _FEWEST_HOPS:
+            return []
+        newest = self._n_hops % _LEVEL_HOPS if self._n_hops >= _LEVEL_HOPS else 0
+        ordered = np.roll(self._hops, -newest, axis=0)[:n]
+        smooth = np.median(sliding_window_view(ordered, _SMOOTHED, axis=0), axis=2)
+        low, high = np.quantile(smooth, (_QUIET, 1.0 - _QUIET), axis=0)
+        level = np.clip(0.0, low, high)
+        usable = self._count >= _FEWEST_HOPS // 2
+        gusty = (smooth - low > _GUST_DB).sum(axis=0)
+        gusts = usable & (gusty >= _FEWEST_GUSTY)
+        wrong = usable & ~gusts & (np.abs(level) > _LEVEL_DB)
+        return faults_where(Fault.LEVEL, wrong, level) + faults_where(Fault.GUSTS, gusts, gusty / len(smooth))
+
+
+# Five seconds: an intermittent contact comes back within that, and one bad hop is forgotten soon enough.
+_ACTIVITY_HOPS = 50
+# A hop without any change on any channel is a dropout of the transport; after a second the array is dead.
+_SILENCE_HOPS = 10
+
+
+class ChannelActivity:
+    """Flags of unusable hops of every channel over the last five seconds."""
+
+    # One stretch of bad hops that lasts until now is dead; several, or one that has ended, are intermittent.
+    # A single bad hop is masked and not reported: a slammed door is no fault.
+
+    def __init__(self, n_channels: int) -> None:
+        self._bad = np.zeros((_ACTIVITY_HOPS, n_channels), bool)
+        self._n_hops = 0
+        self._n_silent = 0
+        self._dead = self._intermittent = np.zeros(n_channels, bool)
+        self._share = np.zeros(n_channels)
+
+    def push(self, bad: BoolArray) -> BoolArray:
+        """Take one flag per channel, shape (M,), and return it."""
+        self._n_silent = 0
+        return self._remember(bad)
+
+    def all_silent(self) -> BoolArray:
+        """Take a hop in which all channels are silent; return flags that are set after one second of this."""
+        self._n_silent += 1
+        silent = np.full(self._bad.shape[1], self._n_silent >= _SILENCE_HOPS)
+        return self._remember(silent) if silent.any() else silent
+
+    def _remember(self, bad: BoolArray) -> BoolArray:
+        self._bad[self._n_hops % _ACTIVITY_HOPS] = bad
+        self._n_hops += 1
+        if bad.any() or self._share.any():
+            self._classify(bad)
+        return bad
+
+    def _classify(self, bad: BoolArray) -> None:
+        n = min(self._n_hops, _ACTIVITY_HOPS)
+        newest = self._n_hops % _ACTIVITY_HOPS
+        ordered = self._bad[:n] if n < _ACTIVITY_HOPS else np.roll(self._bad, -newest, axis=0)
+        count = ordered.sum(axis=0)
+        stretches = (ordered[1:] & ~ordered[:-1]).sum(axis=0) + ordered[0]
+        repeated = count >= 2
+        self._dead = repeated & bad & (stretches == 1)
+        self._intermittent = repeated & ~self._dead
+        self._share = count / n
+
+    @property
+    def suspects(self) -> BoolArray:
+        """Dead and intermittent channels, (M,)."""
+        return np.asarray(self._dead | self._intermittent)
+
+    def faults(self) -> list[ChannelFault]:
+        r"""Return the dead and the intermittent channels with their share of bad hops.
+
+        .. math:: q_m = \frac1n \sum_{i=1}^{n} b_{i,m}, \qquad n \le 50
+        """
+        if not self._share.any():
+            return []
+        dead = faults_where(Fault.DEAD, self._dead, self._share)
+        return dead + faults_where(Fault.INTERMITTENT, self._intermittent, self._share)
+
 
 # Time constant, hops: three seconds.
 _HOPS = 30
@@ -53,7 +246,6 @@ _CLIPPED_SHARE = 1e-4
 _KEPT_DROPOUTS = 16
 # Samples taken as one row by `_extremes`: a minimum along long rows is several times faster.
 _ROWS = 16
-_TINY = np.finfo(np.float64).tiny
 # Statistics with a memory of seconds are evaluated once a second.
 _EVERY_HOPS = 10
 

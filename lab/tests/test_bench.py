@@ -11,9 +11,9 @@ from worldstate_lab.cli.main import main
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
 from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.approach.tone_stage import ToneReading
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56
-from worldstate.frontend.direction.music_stage import MusicReading
+from worldstate.frontend.direction.music import MusicReading
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.values import NotUsable
 

@@ -28,12 +28,11 @@ from worldstate_lab.trials.takes import Take, TakeList
 from worldstate_lab.trials.training_windows import windows_from_simulation, windows_from_table
 from worldstate_lab.trials.trial import Decisions, Trial
 
-from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import load_model, read_model, save_model
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
 from worldstate.operations.recordings.bearing_gating import bearing_curve
 from worldstate.operations.recordings.hop_stream import ABSENT

@@ -36,9 +36,9 @@ from worldstate_lab.streets.window_measures import (
     spread_values,
 )
 
-from worldstate.abduction.signature.pattern_features import mirror_features
+from worldstate.abduction.signature.expert import mirror_features
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.scene.presets import preset

@@ -18,7 +18,7 @@ from worldstate.abduction.cueing.calibration_error import (
     calibration_error_sampling,
     expected_calibration_error,
 )
-from worldstate.frontend.direction.gating import gating_curve
+from worldstate.frontend.direction.bearing import gating_curve
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.recordings.hop_table import HopTable
 

@@ -8,8 +8,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.simulation.camera.simulated_detector import (
     Frame,

@@ -11,8 +11,7 @@ from scipy.fft import rfft, rfftfreq
 
 from worldstate.adapters.datasets.ovad import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray

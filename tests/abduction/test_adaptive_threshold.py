@@ -12,8 +12,13 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.cueing.adaptive_threshold import AdaptiveBudget, AdaptiveThreshold
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule, uncalibrated_policy
+from worldstate.abduction.cueing.cueing_policy import (
+    AdaptiveBudget,
+    AdaptiveThreshold,
+    CueingPolicy,
+    SustainedRule,
+    uncalibrated_policy,
+)
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError

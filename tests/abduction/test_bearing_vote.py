@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 
 from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
-from worldstate.frontend.direction.bearing import direct_probability
-from worldstate.frontend.direction.peaks import Peak
+from worldstate.frontend.direction.bearing import Peak, direct_probability
 
 likelihoods = st.floats(-8.0, 8.0)
 bearings = st.tuples(st.floats(-1.5, 1.5), st.floats(0.03, 0.9))

@@ -11,22 +11,20 @@ from scipy.stats import norm
 from sklearn.linear_model import LogisticRegression
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.grounding.class_descriptors import (
-    Coupling,
-    Descriptor,
-    car,
-    engine_line,
-    motorcycle,
-    tyre_noise_shape,
-)
 from worldstate.abduction.grounding.grounded_likelihood import (
     BACKGROUNDS,
     AzimuthPrior,
     Background,
+    Coupling,
+    Descriptor,
     GroundedObservation,
     GroundedSettings,
     Observable,
+    car,
+    engine_line,
     ground,
+    motorcycle,
+    tyre_noise_shape,
 )
 from worldstate.abduction.signature.classifier_signature import ClassifierSignature
 from worldstate.ground.errors import InvalidArgumentError

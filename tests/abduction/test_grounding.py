@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.grounding.class_descriptors import car
 from worldstate.abduction.grounding.grounded_likelihood import (
     GroundedObservation,
     GroundedSettings,
     Observable,
+    car,
 )
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.acoustic_grounding import LINE_SPACING, Grounding, observe
 from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.approach.tone_stage import ToneReading
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.values import NotUsable
 

@@ -10,9 +10,13 @@ from made_up_sequence import evidence_of, sequence_model
 
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
-from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
-from worldstate.abduction.sequence.street_hearing import StreetHearing, StreetListener
-from worldstate.abduction.sequence.street_sides import SECTORS
+from worldstate.abduction.sequence.street_sides import (
+    SECTORS,
+    PassSound,
+    SidePatterns,
+    StreetHearing,
+    StreetListener,
+)
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable
 

@@ -11,9 +11,15 @@ from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
-from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
-from worldstate.abduction.sequence.street_hearing import StreetHearing, StreetListener
-from worldstate.abduction.sequence.street_sides import SECTORS, StreetSides, arrival_pattern
+from worldstate.abduction.sequence.street_sides import (
+    SECTORS,
+    PassSound,
+    SidePatterns,
+    StreetHearing,
+    StreetListener,
+    StreetSides,
+    arrival_pattern,
+)
 from worldstate.adapters.acoustic_sequence import street_listener
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import read_model

@@ -17,8 +17,7 @@ from worldstate.abduction.signature.ensemble_training import (
     SimulatedWindows,
     SiteEnsembleClassifier,
 )
-from worldstate.abduction.signature.expert import VIEWS, expert_views
-from worldstate.abduction.signature.pattern_features import mirror_features, shape_features
+from worldstate.abduction.signature.expert import VIEWS, expert_views, mirror_features, shape_features
 from worldstate.abduction.signature.site_reference import SiteReference, log_levels, site_reference
 from worldstate.abduction.signature.window_classes import CLASSES, WINDOW_CLASSES, mirrored_classes
 from worldstate.adapters.datasets.feature_table import FeatureTable

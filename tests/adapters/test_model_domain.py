@@ -20,8 +20,7 @@ from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import load_model, read_model, save_model
 from worldstate.adapters.listen import ListenSettings, listen, measure_steps, open_source
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.serialisation import encode
 from worldstate.measurement.measurement import Bearing

@@ -12,7 +12,7 @@ from worldstate.commissioning.guard_training import (
     threshold_of,
 )
 from worldstate.commissioning.sound_rows import FOREIGN, SIGNALS, STREET, SoundRows, sound_rows
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.serialisation import encode
 

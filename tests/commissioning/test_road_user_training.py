@@ -14,7 +14,7 @@ from worldstate.commissioning.road_user_training import (
     fit_road_users,
     road_user_rows,
 )
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 
 N_INPUTS, EACH, SITES = len(MEASURES) + len(BANDS), 12, ("one", "two", "three")

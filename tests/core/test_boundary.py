@@ -9,14 +9,14 @@ import pytest
 
 from worldstate.abduction.co_evidence import Absent
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import read_model
 from worldstate.core.filter import WorldFilter
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground import checks
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable

@@ -5,8 +5,7 @@ import pytest
 
 from worldstate.frontend.array.geometry import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.direction.music import covariance, covariance_subspace, music_spectrum
-from worldstate.frontend.direction.music_stage import MusicReading
+from worldstate.frontend.direction.music import MusicReading, covariance, covariance_subspace, music_spectrum
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz

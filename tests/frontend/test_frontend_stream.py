@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.approach.tone_stage import ToneReading
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.music_stage import MusicReading
+from worldstate.frontend.direction.music import MusicReading
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings

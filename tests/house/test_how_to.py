@@ -13,7 +13,7 @@ import soundfile
 
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.cli.main import main
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "adapters")]

@@ -19,7 +19,7 @@ from worldstate.adapters.live.datagram_socket import DetectionSocket
 from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
 from worldstate.adapters.live.live_camera import REMEMBERED, LiveCamera
 from worldstate.adapters.live.live_sound import LiveSound
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing

@@ -16,8 +16,7 @@ from worldstate.abduction.cueing.calibration_error import (
     expected_calibration_error,
     reliability_curve,
 )
-from worldstate.abduction.cueing.platt import fit_sigmoid
-from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
+from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt, fit_sigmoid
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.roc import auroc, auroc_by_group
 

@@ -15,8 +15,7 @@ from worldstate.adapters.files.acoustic_domain import check_tables, feature_orde
 from worldstate.adapters.files.model_file import load_model
 from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.feature import feature_nfft, published_feature
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError

@@ -8,7 +8,7 @@ import scipy.signal
 import scipy.special
 from worldstate_lab.streets.simulated_windows import RATE_HZ
 
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.ambience import site_ambience

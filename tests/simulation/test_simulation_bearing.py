@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worldstate_lab.streets.simulated_windows import NFFT, RATE_HZ, simulated_windows
 
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
 from worldstate.frontend.direction.srp import srp_phat

@@ -13,7 +13,7 @@ import numpy as np
 from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ, ToneReading
+from worldstate.frontend.approach.tone import ENGINE_BAND_HZ, ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.frame import AcousticFrame

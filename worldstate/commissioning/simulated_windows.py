@@ -14,9 +14,8 @@ import scipy.signal
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import OPEN_FIELD, SimulatedWindows
-from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
+from worldstate.abduction.signature.site_estimate import HOP_S, SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import KINDS, log_levels, site_reference
-from worldstate.abduction.signature.site_signature import HOP_S
 from worldstate.abduction.signature.window_classes import BOTH, DIRECT
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.adapters.parallel import in_processes

@@ -8,7 +8,7 @@ from typing import Annotated, TypeAlias
 import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
-from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
+from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.explanation import AsLogs, BeliefLag, ExplanationBelief, HiddenBelief

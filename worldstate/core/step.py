@@ -9,8 +9,7 @@ from operator import attrgetter
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold, CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS

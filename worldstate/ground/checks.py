@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .errors import InvalidArgumentError
-from .typing import FloatArray
+from .typing import ComplexArray, FloatArray
 
 
 def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:
@@ -30,6 +30,24 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Fl
     if not np.isfinite(array).all():
         raise InvalidArgumentError(f"{name}: expected finite numbers, got NaN or infinity")
     return array
+
+
+def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> ComplexArray:
+    """Return `value` as finite complex numbers of the given shape, keeping single precision as it is.
+
+    Examples
+    --------
+    >>> finite_complex("spectra", [[1, 1j]], (None, 2)).shape
+    (1, 2)
+    """
+    array = np.asarray(value)
+    if array.dtype.kind not in "biufc":
+        raise InvalidArgumentError(f"{name}: expected numbers, got {array.dtype}")
+    check_shape(name, array.shape, shape)
+    if not np.isfinite(array).all():
+        raise InvalidArgumentError(f"{name}: expected finite numbers, got NaN or infinity")
+    single = array.dtype in (np.complex64, np.float32)
+    return array.astype(np.complex64 if single else np.complex128, copy=False)
 
 
 def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
-from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
+from worldstate.abduction.sequence.street_sides import PassSound, SidePatterns
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import ADDED, Layout
 from worldstate.state.context import Context, Occluder, Rates

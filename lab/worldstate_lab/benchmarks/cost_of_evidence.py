@@ -17,7 +17,7 @@ from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.acoustic_sequence import read_hop
 from worldstate.adapters.files.model_file import read_model

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.frontend.approach.looming import looming
-from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ, ToneStage
-from worldstate.frontend.array.channel_mask import ChannelMask
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.approach.tone import ENGINE_BAND_HZ, ToneStage
+from worldstate.frontend.array.microphone_array import ChannelMask, roof_array_56
 from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.direction.bearing import find_peaks
 from worldstate.frontend.direction.feature import feature_steering, pair_sum_of, segment_feature
-from worldstate.frontend.direction.music_stage import MusicStage
-from worldstate.frontend.direction.peaks import find_peaks
+from worldstate.frontend.direction.music import MusicStage
 from worldstate.frontend.direction.srp import normalised, steered_power
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.levels import LevelMeter

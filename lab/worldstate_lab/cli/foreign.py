@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.files.atomic import write_text
     from worldstate.commissioning.guard_training import guard_rows
     from worldstate.commissioning.heard_stream import HeardStream
-    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.frontend.array.microphone_array import ovad_array
     from worldstate.ground.checks import in_range
     from worldstate.ground.errors import InvalidArgumentError
     from worldstate_lab.streets.guard_exam import GUARDS, guard_exam

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.commissioning.heard_stream import HeardStream
     from worldstate.commissioning.plan import CommissionSettings, learned_streams
     from worldstate.commissioning.road_user_training import road_user_rows
-    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.frontend.array.microphone_array import ovad_array
     from worldstate.ground.checks import in_range
     from worldstate_lab.streets.road_user_exam import road_user_exam, stream_exam
 

@@ -307,7 +307,7 @@ def _check_model(model: Path, dataset: Path | None) -> None:
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.files.acoustic_domain import check_array
     from worldstate.adapters.files.model_file import read_model
-    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.frontend.array.microphone_array import ovad_array
 
     domain = read_model(model).domain
     if domain is not None:
@@ -342,7 +342,7 @@ def _simulated(arguments: argparse.Namespace) -> Path:
 def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifiers":
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.files.array_match import microphone_order
-    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.frontend.array.microphone_array import ovad_array
     from worldstate.simulation.scene.junction import MOVING_SITES, SITES
     from worldstate_lab.trials import training_windows as windows
     from worldstate_lab.trials.classification import Classifiers

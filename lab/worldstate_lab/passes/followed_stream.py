@@ -11,10 +11,9 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
-from worldstate.abduction.sequence.street_hearing import StreetListener
-from worldstate.abduction.sequence.street_sides import arrival_pattern, somebody_comes
+from worldstate.abduction.sequence.street_sides import StreetListener, arrival_pattern, somebody_comes
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.acoustic_sequence import learn_passes, street_listener
 from worldstate.adapters.camera.detections import DetectionFilter

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.abduction.signature.ensemble import explain
 from worldstate.abduction.signature.ensemble_training import standardisation
-from worldstate.abduction.signature.pattern_features import mirror_features
+from worldstate.abduction.signature.expert import mirror_features
 from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import read_model

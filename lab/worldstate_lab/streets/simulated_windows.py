@@ -18,8 +18,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.adapters.datasets.sample_windows import window_ends_s
 from worldstate.adapters.parallel import in_processes
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.array.steering import cross_spectra
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
-from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.sample_windows import FRONT, FRONT_LATER_S
 from worldstate.ground.errors import InvalidArgumentError

@@ -10,9 +10,9 @@ from scipy.optimize import brentq
 from worldstate.frontend.approach.doppler import (
     RadialSpeed,
     radial_speed,
+    radial_speed_m_s,
 )
 from worldstate.frontend.approach.engine_line import HarmonicSettings, HarmonicTrack, track_fundamental
-from worldstate.frontend.approach.pass_by import radial_speed_m_s
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
 

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.frontend.approach.tone_stage import ToneReading, ToneStage
-from worldstate.frontend.array.channel_mask import ChannelMask
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.approach.tone import ToneReading, ToneStage
+from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray, roof_array_56
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.decimator import Decimator

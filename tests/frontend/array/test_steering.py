@@ -6,11 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.frontend.array.channel_mask import ChannelMask
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering, interpolation_nodes
-from worldstate.frontend.direction.music import covariance_subspace
-from worldstate.frontend.direction.music_stage import MusicReading, MusicStage, WindowSum
+from worldstate.frontend.direction.music import MusicReading, MusicStage, WindowSum, covariance_subspace
 from worldstate.frontend.spectra.stft import bin_frequencies_hz
 
 RATE, NFFT, BINS = 47_998, 512, range(3, 19)

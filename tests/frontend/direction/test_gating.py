@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldstate.cli.main import main
-from worldstate.frontend.direction.gating import gating_curve
+from worldstate.frontend.direction.bearing import gating_curve
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.operations.recordings.bearing_gating import bearing_curve, bearing_figures, check_bearings

@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 
 from worldstate.frontend.direction.music import (
     Subspace,
+    SubspaceTracker,
+    count_sources,
     covariance,
     covariance_subspace,
     music_spectrum,
     signal_subspace,
 )
-from worldstate.frontend.direction.source_count import count_sources
-from worldstate.frontend.direction.subspace import SubspaceTracker
 from worldstate.ground.errors import InvalidArgumentError
 
 SAMPLE_RATE_HZ, NFFT, SOUND_M_S = 48_000, 512, 343.0

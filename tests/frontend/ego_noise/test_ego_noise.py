@@ -16,9 +16,13 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.music import covariance_subspace, music_spectrum
 from worldstate.frontend.direction.srp import steered_power
-from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
+from worldstate.frontend.ego_noise.ego_noise import (
+    EgoNoise,
+    EgoNoiseSettings,
+    shrunk_inverse_root,
+    white_share,
+)
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
-from worldstate.frontend.ego_noise.prewhitening import shrunk_inverse_root, white_share
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, whiten
 from worldstate.frontend.stream import FrontEnd

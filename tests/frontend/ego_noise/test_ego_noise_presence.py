@@ -18,8 +18,7 @@ import scipy.signal
 from sklearn.metrics import roc_auc_score
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.site_estimate import SiteEstimateSettings
-from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.model_file import load_model
 from worldstate.core.filter import WorldFilter

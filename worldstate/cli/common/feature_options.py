@@ -33,8 +33,7 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
         open_field_features,
         open_field_windows,
     )
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
     from worldstate.operations.training.site_references import simulated_beside
 
     tables = [read_features(path).group(arguments.group) for path in arguments.simulated or ()]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from .array_options import search_of
 
 if TYPE_CHECKING:
-    from worldstate.abduction.sequence.side_patterns import SidePatterns
+    from worldstate.abduction.sequence.street_sides import SidePatterns
     from worldstate.adapters.listen import ListenSettings
     from worldstate.state import Context
 

@@ -87,8 +87,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def _heard_windows(labels: Path, table: "FeatureTable") -> "FeatureTable":
     """Return the features of labelled windows, by the microphones that the table's were heard by."""
     from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table, read_labels
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 
     array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
     windows = read_labels(labels, labels.parent)

@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         write_exam_figure,
     )
     from worldstate.commissioning.plan import exam_streams, learned_streams
-    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.frontend.array.microphone_array import ovad_array
 
     check_outputs(arguments, "out", "report", figures=("figure",))
     settings = _settings(arguments)

@@ -22,8 +22,8 @@ from worldstate.frontend.bounds.cramer_rao import (
     endfire_information,
     tone_crb_hz2,
 )
+from worldstate.frontend.direction.bearing import find_peaks
 from worldstate.frontend.direction.gcc import gcc_delays
-from worldstate.frontend.direction.peaks import find_peaks
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range

@@ -6,8 +6,12 @@ from typing import Literal
 
 import numpy as np
 
-from worldstate.abduction.cueing.adaptive_threshold import AdaptiveBudget
-from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy, sustained_statistic
+from worldstate.abduction.cueing.cueing_policy import (
+    AdaptiveBudget,
+    CueingPolicies,
+    CueingPolicy,
+    sustained_statistic,
+)
 from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, correlation_time_hops, fit_risk_map
 from worldstate.abduction.cueing.thresholds import (
     conformal_threshold,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.abduction.sequence.side_patterns import PassSound
+from worldstate.abduction.sequence.street_sides import PassSound
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import FloatArray

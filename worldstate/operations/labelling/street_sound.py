@@ -8,8 +8,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.sequence.side_patterns import PassSound
-from worldstate.abduction.sequence.street_sides import arrival_pattern, somebody_comes
+from worldstate.abduction.sequence.street_sides import PassSound, arrival_pattern, somebody_comes
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listen import Source, measure_steps, open_source

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.signature.site_signature import HOP_S
+from worldstate.abduction.signature.site_estimate import HOP_S
 from worldstate.ground.checks import check_shape, finite_array, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 

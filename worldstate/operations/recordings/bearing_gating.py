@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.frontend.direction.gating import GatingCurve, gating_curve
+from worldstate.frontend.direction.bearing import GatingCurve, gating_curve
 from worldstate.ground.checks import check_shape
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle

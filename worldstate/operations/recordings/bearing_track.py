@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.audio.sound_file import Audio
-from worldstate.frontend.direction.source_count import count_sources
+from worldstate.frontend.direction.music import count_sources
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins
 from worldstate.frontend.stream import FrontEnd

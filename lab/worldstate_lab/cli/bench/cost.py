@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[imp
 
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
-from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
+from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.direction.srp import srp_phat
