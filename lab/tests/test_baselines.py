@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worldstate_lab.methods.line_of_sight import RadarFieldOfView, VisionOnly, seen_early_s
+from worldstate_lab.methods.line_of_sight import OcSortRecovery, RadarFieldOfView, VisionOnly, seen_early_s
 from worldstate_lab.methods.oc_sort import OcSort, OcSortSettings
-from worldstate_lab.methods.track_recovery import OcSortRecovery
 from worldstate_lab.trials.trial import LEFT, RIGHT, Trial
 
 from worldstate.adapters.camera.detections import read_detections

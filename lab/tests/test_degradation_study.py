@@ -16,9 +16,12 @@ from worldstate_lab.degradation.conditions import (
     CLEAN,
     FAMILIES,
     OFF,
+    RAIN_DB,
     Condition,
     all_conditions,
     degrade_reduced,
+    level_rms,
+    rained,
 )
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
 from worldstate_lab.degradation.looks import (
@@ -29,7 +32,6 @@ from worldstate_lab.degradation.looks import (
     look,
     motion_detectors,
 )
-from worldstate_lab.degradation.rain import RAIN_DB, level_rms, rained
 from worldstate_lab.degradation.staged_filter import by_condition, cameras, filter_in_conditions
 from worldstate_lab.degradation.stream_sweep import (
     STATES,

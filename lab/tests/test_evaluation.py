@@ -13,19 +13,23 @@ from hypothesis import strategies as st
 from made_up_trials import made_up
 from worldstate_lab.evaluation.evaluation import lacking_data
 from worldstate_lab.evaluation.front_end_study import front_end_study
-from worldstate_lab.evaluation.protocol_run import ProtocolRun, run_protocol
-from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STATIC
+from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STATIC, ProtocolRun, run_protocol
 from worldstate_lab.evaluation.scores import Score
-from worldstate_lab.methods.calibrated_cue import CalibratedCue
-from worldstate_lab.methods.published_rule import PublishedRule
+from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
 from worldstate_lab.streets.simulated_windows import simulated_windows
-from worldstate_lab.trials.classification import Classifiers, classified, junction_of, posteriors
+from worldstate_lab.trials.classification import (
+    Classifiers,
+    classified,
+    junction_of,
+    posteriors,
+    windows_from_simulation,
+    windows_from_table,
+)
 from worldstate_lab.trials.engine import Failed
 from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import pass_time_s
 from worldstate_lab.trials.takes import Take, TakeList
-from worldstate_lab.trials.training_windows import windows_from_simulation, windows_from_table
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from worldstate.abduction.signature.site_estimate import SiteSignature

@@ -24,22 +24,18 @@ from worldstate_lab.degradation.degradation_study import (
 from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate_lab.evaluation.front_end_study import front_end_study
 from worldstate_lab.evaluation.paper_values import PAPER_VALUES, paper_value
-from worldstate_lab.evaluation.protocol_run import ProtocolRun
-from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC
+from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, ProtocolRun
 from worldstate_lab.evaluation.report.approach_timeline import ApproachTimeline, approach_figure
 from worldstate_lab.evaluation.report.contents import evaluation_document
-from worldstate_lab.evaluation.report.cueing_panels import roc_curve
+from worldstate_lab.evaluation.report.panels import roc_curve
 from worldstate_lab.evaluation.report.study_sections import signature_values
 from worldstate_lab.evaluation.scores import Score
-from worldstate_lab.methods.calibrated_cue import CalibratedCue
+from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.line_of_sight import VisionOnly
-from worldstate_lab.methods.published_rule import PublishedRule
 from worldstate_lab.metrics.intervals import stratified_draws
-from worldstate_lab.report.document import Document, Section
-from worldstate_lab.report.pages import html_page, markdown_page
+from worldstate_lab.report.pages import Document, Section, html_page, markdown_page, write_document
 from worldstate_lab.report.results import keep_results, read_results
 from worldstate_lab.report.table import Figure, Table, Value
-from worldstate_lab.report.writing import write_document
 from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 from worldstate_lab.trials.takes import Take, TakeList
 from worldstate_lab.trials.trial import Trial

@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate_lab.evaluation.against import save_scores
     from worldstate_lab.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
     from worldstate_lab.evaluation.report.contents import evaluation_document
-    from worldstate_lab.report.writing import write_document
+    from worldstate_lab.report.pages import write_document
     from worldstate_lab.trials.engine import Engine
     from worldstate_lab.trials.hearing import Hearing
 
@@ -181,7 +181,7 @@ def _degradation(
     from worldstate_lab.degradation.degradation_study import DegradationSettings
     from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
     from worldstate_lab.evaluation.camera_failure import whole_sweep
-    from worldstate_lab.trials.training_windows import model_from_windows
+    from worldstate_lab.trials.classification import model_from_windows
 
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
     foreign = any(_is_foreign(take) for take in takes.static if take.filmed)
@@ -344,7 +344,7 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
     from worldstate.adapters.files.array_match import microphone_order
     from worldstate.frontend.array.microphone_array import ovad_array
     from worldstate.simulation.scene.junction import MOVING_SITES, SITES
-    from worldstate_lab.trials import training_windows as windows
+    from worldstate_lab.trials import classification as windows
     from worldstate_lab.trials.classification import Classifiers
 
     folder = arguments.out / "cache"

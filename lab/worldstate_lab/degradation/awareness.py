@@ -23,8 +23,7 @@ from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import stream_statistic
 from worldstate_lab.metrics.intervals import FOLDS, deal_folds, middle
 
-from .conditions import CLEAN, LENS, OFF, RAIN, ROOF, Condition, all_conditions
-from .rain import RAIN_DB
+from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions
 
 # One recording by the name of its condition, with the columns of `staged_filter.filter_in_conditions`.
 Staged = Mapping[str, HopTable]

@@ -30,9 +30,8 @@ from .beta_curves import (
     counts_table,
     pooled_rates,
 )
-from .conditions import FAMILIES
+from .conditions import FAMILIES, RAIN_DB
 from .looks import READINGS, StagedDetector, look, motion_detectors
-from .rain import RAIN_DB
 from .staged_filter import by_condition, cameras, filter_in_conditions
 from .sweep_data import sweep_data
 

@@ -22,9 +22,8 @@ from worldstate.operations.detectors.miss_rate_measurement import AbsenceSetting
 from worldstate.operations.recordings.hop_stream import hop_stream
 from worldstate.operations.recordings.hop_table import HopTable, joined
 
-from .conditions import OFF, Condition, all_conditions
+from .conditions import OFF, Condition, all_conditions, level_rms, rained
 from .looks import READINGS, StagedDetector, degradation_in, detections_in
-from .rain import level_rms, rained
 
 # Changes whenever the same sound and looks would give other beliefs.
 VERSION = 5

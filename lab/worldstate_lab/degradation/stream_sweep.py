@@ -27,8 +27,7 @@ from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate_lab.metrics.intervals import DRAWS, middle, poisson_upper
 
 from .awareness import Estimate
-from .conditions import CLEAN, LENS, OFF, RAIN, ROOF, Condition
-from .rain import RAIN_DB, level_rms, rained
+from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, level_rms, rained
 
 # Changes whenever the same stream would give other advisories.
 VERSION = 3

@@ -21,8 +21,7 @@ from worldstate_lab.trials.trial import Trial
 from .camera_failure import camera_failure, lacking_films, staged_streams
 from .front_end_study import FrontEndStudy, front_end_study
 from .operating_curve import EqualDetection, equal_detection
-from .protocol_run import ProtocolRun, run_protocol
-from .protocols import PROTOCOLS
+from .protocols import PROTOCOLS, ProtocolRun, run_protocol
 from .scores import Score
 
 # The paper's alpha.

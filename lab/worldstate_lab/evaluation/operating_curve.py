@@ -10,7 +10,7 @@ from worldstate.abduction.sequence.sequence_model import held
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate_lab.methods.sustained_rule import SUSTAIN_CHOICES
+from worldstate_lab.methods.acoustic_rules import SUSTAIN_CHOICES
 from worldstate_lab.metrics.intervals import draw_weights, middle, ratio
 from worldstate_lab.trials.trial import Decisions, Trial
 

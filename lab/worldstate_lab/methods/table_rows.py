@@ -4,11 +4,8 @@ from collections.abc import Sequence
 
 from worldstate_lab.trials.trial import Method, Trial
 
-from .calibrated_cue import CalibratedCue
-from .line_of_sight import RadarFieldOfView, VisionOnly
-from .published_rule import PublishedRule
-from .shipped_chain import ShippedChain
-from .track_recovery import OcSortRecovery
+from .acoustic_rules import CalibratedCue, PublishedRule, ShippedChain
+from .line_of_sight import OcSortRecovery, RadarFieldOfView, VisionOnly
 
 METHODS: tuple[Method, ...] = (
     VisionOnly(),

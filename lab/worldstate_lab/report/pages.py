@@ -1,12 +1,55 @@
-"""A document as one HTML page without script or network, and as Markdown with pictures as files."""
+"""A report of sections as one HTML page, as Markdown, and as files: all or nothing."""
 
 import re
+import tempfile
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 
-from .document import Document, Section
+from worldstate.adapters.files.atomic import check_target, deferred_signals
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.figure_style import figure_file
+
 from .table import Block, Cell, Figure, Value, cell_text
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A heading, its paragraphs, then tables and figures, then the sections below it."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    blocks: tuple[Block, ...] = ()
+    subsections: "tuple[Section, ...]" = ()
+
+    def walk(self, level: int) -> "Iterator[tuple[int, Section]]":
+        """Yield this section and those below it in the order of reading, each with its level."""
+        yield level, self
+        for one in self.subsections:
+            yield from one.walk(level + 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A whole report; the facts (versions, seeds, settings) stand at its end."""
+
+    title: str
+    lead: str
+    sections: tuple[Section, ...]
+    facts: tuple[tuple[str, str], ...] = ()
+
+    def walk(self) -> Iterator[tuple[int, Section]]:
+        """Yield every section in the order of reading, with the level of its heading."""
+        for section in self.sections:
+            yield from section.walk(2)
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Every table and figure, in the order of reading."""
+        return tuple(block for _, section in self.walk() for block in section.blocks)
+
 
 # A wider figure gets a row of its own, and on a phone a box in which it scrolls.
 WIDE_IN = 6.0
@@ -145,3 +188,48 @@ def _escaped(text: str) -> str:
     """Return text in which nothing is markup; a line break would end a row of a table."""
     one_line = " ".join(text.split())
     return re.sub(r"([\\`*_|~])|\[(?=[^\]]*\]\()", lambda m: "\\" + m.group(0), one_line).replace("<", "&lt;")
+
+
+PAGE, MARKDOWN, FILES = "report.html", "report.md", "report_files"
+
+
+def write_document(document: Document, folder: Path) -> None:
+    """Write `report.html`, `report.md` and `report_files/` into an existing folder, all or nothing.
+
+    Raises
+    ------
+    InputFileError
+        If one of the names is taken by something else, or the folder is missing or not writable.
+    """
+    for name in (PAGE, MARKDOWN):
+        check_target(folder / name)
+    if (folder / FILES).exists() and not (folder / FILES).is_dir():
+        raise InputFileError(folder / FILES, "expected a folder of an earlier report, or nothing")
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as temporary:
+        new = Path(temporary)
+        _write_all(document, new)
+        # Pages of one run beside pictures of another would be worse than none: no signal between the moves.
+        with deferred_signals():
+            if (folder / FILES).exists():
+                (folder / FILES).rename(new / "before")
+            for name in (FILES, MARKDOWN, PAGE):
+                (new / name).replace(folder / name)
+
+
+def _write_all(document: Document, folder: Path) -> None:
+    files, pictures = folder / FILES, {}
+    files.mkdir()
+    for block in document.blocks:
+        _write(files / f"{block.name}.csv", block.csv())
+        if isinstance(block, Figure):
+            picture = files / f"{block.name}.png"
+            with figure_file(picture, *block.size_in) as canvas:
+                block.draw(canvas)
+            pictures[block.name] = picture.read_bytes()
+    _write(folder / PAGE, html_page(document, pictures, FILES))
+    _write(folder / MARKDOWN, markdown_page(document, FILES))
+
+
+def _write(path: Path, text: str) -> None:
+    # A file name that is no UTF-8 comes in with surrogates, which cannot be written.
+    path.write_text(text, encoding="utf-8", errors="replace")

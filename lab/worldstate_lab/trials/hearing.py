@@ -13,7 +13,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.origin import origin_of
+from worldstate_lab.trials.pass_cache import origin_of
 
 from .engine import Engine, Failed
 from .listening import (

@@ -13,7 +13,7 @@ from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.protocols import PROTOCOLS, STATIC, Protocol
 from worldstate_lab.evaluation.report import study_sections as study
 from worldstate_lab.evaluation.report import warning_sections as warning
-from worldstate_lab.report.document import Document, Section
+from worldstate_lab.report.pages import Document, Section
 from worldstate_lab.report.table import Cell, Table
 from worldstate_lab.signatures.signature_study import SignatureStudy
 from worldstate_lab.trials.hearing import data_fingerprint

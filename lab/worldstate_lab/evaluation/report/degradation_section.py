@@ -11,11 +11,11 @@ from worldstate_lab.degradation.conditions import FAMILIES, OFF
 from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
 from worldstate_lab.degradation.stream_sweep import StreamSweep
 from worldstate_lab.evaluation.paper_values import COMMANDS, paper_value
-from worldstate_lab.report.document import Section
+from worldstate_lab.report.pages import Section
 from worldstate_lab.report.table import Cell, Figure, Table, Value, plain
 
-from .camera_panels import awareness_figure, miss_rate_angle_figure, miss_rate_level_figure
 from .measured_values import Place
+from .recording_panels import awareness_figure, miss_rate_angle_figure, miss_rate_level_figure
 
 _RATES, _AWARE = "miss rate of the camera", "after line-of-sight entry"
 _CONDITION = (

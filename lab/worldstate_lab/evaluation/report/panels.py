@@ -1,15 +1,20 @@
-"""What the panels of a report share: marks and colours, a legend below the axes, thinned curves."""
+"""Panels of calibrated cueing: ROC by horizon, reliability, operating curve; what all panels share."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.ground.typing import FloatArray
+from worldstate.abduction.cueing.calibration_error import reliability_curve
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from worldstate_lab.report.table import Figure, Value
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
+
 
 # A curve of more points than this looks the same at 600 pixels, and its CSV takes megabytes.
 MOST_POINTS = 200
@@ -37,3 +42,167 @@ def mark_chance(axes: "Axes") -> None:
     """Draw the diagonal: chance of a ROC, perfect calibration of a reliability curve."""
     axes.plot([0.0, 1.0], [0.0, 1.0], color=GREY, linewidth=0.8, zorder=0)
     axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.02))
+
+
+def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return false- and true-positive rates at every threshold, from 0 to 1, shape (k,) each.
+
+    Examples
+    --------
+    >>> roc_curve(np.array([0.9, 0.4]), np.array([0.6, 0.1]))
+    (array([0. , 0. , 0.5, 0.5, 1. ]), array([0. , 0.5, 0.5, 1. , 1. ]))
+    """
+    thresholds = np.unique(np.concatenate([positives, negatives]))[::-1]
+    rates = [
+        np.searchsorted(np.sort(-scores), -thresholds, side="right") / max(scores.size, 1)
+        for scores in (negatives, positives)
+    ]
+    false, true = (np.concatenate([[0.0], rate]) for rate in rates)
+    return false, true
+
+
+def roc_figure(hazards: Mapping[str, FloatArray], free: FloatArray, areas: Mapping[str, Value]) -> Figure:
+    """Draw the ROC of hazard windows against hazard-free ones, one curve a horizon.
+
+    `hazards` holds the statistic of the windows by horizon, `free` that of hazard-free windows, `areas` the
+    area of each horizon beside the paper's.
+    """
+    curves = {name: thinned(*roc_curve(scores, free)) for name, scores in hazards.items() if scores.size}
+
+    def draw(canvas: "Canvas") -> None:
+        axes = canvas.subplots()
+        mark_chance(axes)
+        for name, curve in curves.items():
+            axes.plot(*curve, label=f"{name}: {_beside(areas[name])}")
+        axes.set(xlabel="false-positive rate of windows", ylabel="true-positive rate of windows")
+        legend_below(canvas, columns=1)
+
+    rows = [(name, *point) for name, curve in curves.items() for point in zip(*curve, strict=True)]
+    return Figure(
+        "cueing_roc",
+        "(a) Windows told apart, by time to line of sight",
+        "ROC of the hazard statistic: windows of occluded approaches that end within the horizon before T0 "
+        "against hazard-free windows. Area with its 95 % interval; the grey diagonal is chance.",
+        draw,
+        ("horizon", "false_positive_rate", "true_positive_rate"),
+        rows,
+    )
+
+
+def reliability_figure(
+    risks: Mapping[str, FloatArray], labels: BoolArray, errors: Mapping[str, Value]
+) -> Figure:
+    """Draw the observed share of hazards over what was predicted, by reading (raw, calibrated).
+
+    `risks` holds the probabilities by reading, each as long as `labels`; `errors` their ECE.
+    """
+    curves = {name: reliability_curve(values, labels) for name, values in risks.items()}
+
+    def draw(canvas: "Canvas") -> None:
+        axes, counts = canvas.subplots(2, 1, sharex=True, height_ratios=(1.0, 0.28))
+        mark_chance(axes)
+        for (name, curve), mark in zip(curves.items(), MARKS, strict=False):
+            axes.plot(
+                curve.predicted,
+                curve.observed,
+                marker=mark,
+                ms=4,
+                label=f"{name}: ECE {_beside(errors[name])}",
+            )
+            counts.plot(curve.predicted, curve.counts, marker=mark, ms=3)
+        axes.set(ylabel="observed share of hazards")
+        most = max(int(one.counts.max()) for one in curves.values())
+        counts.set(xlabel="predicted probability", ylabel="windows", ylim=(0, 1.1 * most), yticks=(0, most))
+        legend_below(canvas, columns=1)
+
+    rows = [
+        (name, *point)
+        for name, one in curves.items()
+        for point in zip(one.predicted, one.observed, one.counts, strict=True)
+    ]
+    return Figure(
+        "cueing_reliability",
+        "(b) Reliability of the stated probability",
+        f"Ten equal bins, held-out folds, {labels.mean():.0%} of the windows are hazards. "
+        "Below: windows in each bin. On the diagonal a probability means what it says.",
+        draw,
+        ("reading", "predicted", "observed", "windows"),
+        rows,
+        size_in=(4.4, 4.2),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OperatingPoint:
+    """One method on the plane of detection and false alarms; `alpha` where it is one of the curve."""
+
+    name: str
+    false_alarms_per_hour: Value
+    detection: Value
+    alpha: float | None = None
+
+
+def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) -> Figure:
+    """Draw detection against achieved false alarms an hour: the curve over alpha, the others as points."""
+
+    def draw(canvas: "Canvas") -> None:
+        _draw_operating(canvas, points, max(quantum_per_hour, 1e-3))
+
+    return Figure(
+        "cueing_operating",
+        "(c) Detection against achieved false alarms",
+        f"Bars are 95 % intervals; open marks are the paper's. One alarm onset is {quantum_per_hour:.3g} "
+        "an hour: left of it the axis is linear, right of it logarithmic.",
+        draw,
+        ("method", "alpha", "detection", "false_alarms_per_hour"),
+        [(one.name, one.alpha, one.detection, one.false_alarms_per_hour) for one in points],
+        size_in=(4.4, 4.4),
+    )
+
+
+def _draw_operating(canvas: "Canvas", points: Sequence[OperatingPoint], linear: float) -> None:
+    curve = sorted((one for one in points if one.alpha is not None), key=lambda one: one.alpha or 0.0)
+    others = [one for one in points if one.alpha is None]
+    axes = canvas.subplots()
+    # The hour has few alarms: between none and one onset the axis is linear, above it logarithmic.
+    axes.set_xscale("symlog", linthresh=linear)
+    line = [(one.false_alarms_per_hour.value, one.detection.value) for one in curve]
+    if line:
+        axes.plot(*zip(*line, strict=True), color=GREEN, zorder=1)
+        axes.plot([], [], "o", color="black", fillstyle="none", label="the paper's (open)")
+    for one in curve:
+        _mark(canvas, one, GREEN, "o", r"proposed, over $\alpha$")
+        place = one.false_alarms_per_hour.value, one.detection.value
+        axes.annotate(f"{one.alpha:g}", place, (-5, 5), textcoords="offset points", ha="right", fontsize=8)
+    for i, one in enumerate(others):
+        _mark(canvas, one, COLOURS[i % len(COLOURS)], MARKS[(i + 1) % len(MARKS)], one.name)
+    axes.set(xlabel="false alarms per hazard-free hour", ylabel="approaches detected", ylim=(-0.03, 1.05))
+    rates = [one.false_alarms_per_hour for one in points]
+    right = np.nanmax([[one.value, one.high] for one in rates] + [[10.0 * linear] * 2])
+    ticks = [
+        tick for tick in (0, 10, 30, 100, 300, 1000, 3000, 10_000) if tick == 0 or linear <= tick <= right
+    ]
+    axes.set_xticks(ticks, map(str, ticks))
+    axes.minorticks_off()
+    axes.set_xlim(-0.3 * linear, 1.3 * right)
+    legend_below(canvas)
+
+
+def _beside(value: Value) -> str:
+    return value.text + (f", paper {value.paper.number}" if value.paper else "")
+
+
+def _mark(canvas: "Canvas", one: OperatingPoint, colour: str, mark: str, label: str) -> None:
+    """Draw a point with its two intervals, and the paper's as an open mark of the same shape."""
+    axes = canvas.axes[0]
+    x, y = one.false_alarms_per_hour, one.detection
+    if not np.isfinite([x.value, y.value]).all():
+        return
+    for spread, horizontal in ((x, True), (y, False)):
+        if spread.interval:
+            ends = [spread.low, spread.high]
+            along = (ends, [y.value] * 2) if horizontal else ([x.value] * 2, ends)
+            axes.plot(*along, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
+    axes.plot(x.value, y.value, mark, color=colour, ms=6, label=label, linestyle="none")
+    if x.paper and y.paper:
+        axes.plot(x.paper.value, y.paper.value, mark, color=colour, ms=7, fillstyle="none", linestyle="none")

@@ -11,7 +11,7 @@ from worldstate_lab.evaluation.figures import FIGURES
 from worldstate_lab.evaluation.paper_values import COMMANDS, PAPER_VALUES, PaperValue
 from worldstate_lab.evaluation.protocols import FIXED, RETRAINED, STATIC
 from worldstate_lab.methods.table_rows import GROUNDED
-from worldstate_lab.report.document import Section
+from worldstate_lab.report.pages import Section
 from worldstate_lab.report.table import Cell, Figure, Table, Value
 from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 
@@ -265,4 +265,4 @@ def _named(one: PaperValue) -> tuple[str, str, str]:
 def _filled(one: PaperValue, simulated: bool) -> str:
     if one.basis == "ovad" and not simulated:
         return "this run"
-    return {"array": "this run", "stated": "stated of the data"}.get(one.basis, one.command)
+    return {"array": "this run", "stated": "stated of the data"}.get(one.basis, COMMANDS[one.basis])

@@ -16,13 +16,13 @@ from worldstate_lab.evaluation.protocols import STATIC
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate_lab.evaluation.scores import paired
 from worldstate_lab.methods.table_rows import CURVE_ALPHAS
-from worldstate_lab.report.document import Section
+from worldstate_lab.report.pages import Section
 from worldstate_lab.report.table import Cell, Figure, Table, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from .approach_timeline import ApproachImage, ApproachTimeline, approach_figure, approach_images
-from .cueing_panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
 from .measured_values import PROPOSED, MeasuredValues, score_values
+from .panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
 from .recording_panels import lead_figure
 
 _BUDGETS = {f"proposed {text}": float(text) for text in (".01", ".02", ".05")}
