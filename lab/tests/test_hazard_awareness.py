@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from worldstate_lab.degradation.awareness import AwarenessSettings, hazard_awareness
+from worldstate_lab.degradation.awareness import hazard_awareness
 from worldstate_lab.degradation.beta_curves import beta_curves, counts_of, counts_table
 from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, OFF, all_conditions
-from worldstate_lab.degradation.degradation_study import DegradationSettings
+from worldstate_lab.degradation.degradation_study import DegradationSettings, sweep_data
 from worldstate_lab.degradation.looks import motion_detectors
-from worldstate_lab.degradation.sweep_data import sweep_data
-from worldstate_lab.evaluation.camera_failure import whole_sweep
+from worldstate_lab.evaluation.evaluation import whole_sweep
 from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.trials.takes import Take, TakeList
 
@@ -26,7 +25,6 @@ from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, UNQUERI
 from worldstate.operations.recordings.hop_table import HopTable
 
 PRIOR = (0.25,) * 4
-SETTINGS = AwarenessSettings(PRIOR)
 HOPS, T0_S = 60, 4.0
 STATES = {state.name: state for state in all_conditions()}
 BETA = dict(zip(LEVELS, (0.05, 0.3, 0.6, 0.9, 1.0), strict=True))
@@ -69,10 +67,10 @@ def changed(one, **columns):
     return {state: table.replace(**columns) for state, table in one.items()}
 
 
-def judged(corpus, settings=SETTINGS):
+def judged(corpus):
     kinds = [one[CLEAN].hazard_free for one in corpus]
     draws = stratified_draws(kinds, np.random.default_rng(1), draws=200)
-    return hazard_awareness(corpus, settings, draws, np.random.default_rng(0))
+    return hazard_awareness(corpus, PRIOR, 3, draws, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")

@@ -150,7 +150,7 @@ def test_a_cluster_gives_the_same_figures(smoke, tmp_path, monkeypatch):
     shutil.copytree(out / "smoke", tmp_path / "again" / "smoke", copy_function=os.link)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
         monkeypatch.chdir(tmp_path)
-        there = ["--engine", "dask", "--scheduler", workers.scheduler_address]
+        there = ["--scheduler", workers.scheduler_address]
         assert main(["table", "--smoke", "--out", "again", *there]) == 0
     found = json.loads((tmp_path / "again" / "evaluation.json").read_text())
     assert found.pop("against") == []

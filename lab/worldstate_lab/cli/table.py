@@ -29,15 +29,13 @@ recordings are named and not scored.
 
 import argparse
 import os
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.detector_options import detector_filter, detector_maker, detector_name
 from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
-from worldstate.cli.common.progress import Bar, progress_bar
+from worldstate.cli.common.progress import progress_bar, track
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,7 +67,7 @@ PASSAGES = 6
 # What two evaluations must have in common for their figures to be comparable.
 COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
 # Where the work is done and what is printed of it.
-_NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "engine", "scheduler", "against")
+_NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "scheduler", "against", "seeds")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
 SHOWN = ("lead_s", "detection", "random_detection", "bearing_deg")
 
@@ -96,8 +94,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     add("--jobs", type=int, default=cores, help="processes (default: one a core)")
-    add_choice(parser, "--engine", "where the work is done", "local", "dask")
-    add("--scheduler", metavar="ADDRESS", help="of the Dask cluster, which sees the same paths")
+    add("--scheduler", metavar="ADDRESS", help="work on the Dask cluster there, which sees the same paths")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -117,20 +114,20 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     lacking_data(takes)
     classifiers = _classifiers(arguments, takes)
     seeds = tuple(range(arguments.seed, arguments.seed + (FULL_SEEDS if arguments.full else 1)))
-    with ExitStack() as stack:
-        found = evaluate(
-            takes,
-            Hearing(arguments.out / "cache", arguments.model),
-            classifiers,
-            Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
-            _Bars(stack),
-            EvaluationSettings(
-                seeds,
-                arguments.hazard_free_hours,
-                degradation=_degradation(arguments, classifiers, takes),
-                stage_streams=arguments.stage_streams,
-            ),
-        )
+    arguments.seeds = seeds
+    found = evaluate(
+        takes,
+        Hearing(arguments.out / "cache", arguments.model),
+        classifiers,
+        Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
+        track,
+        EvaluationSettings(
+            seeds,
+            arguments.hazard_free_hours,
+            degradation=_degradation(arguments, classifiers, takes),
+            stage_streams=arguments.stage_streams,
+        ),
+    )
     save_scores(arguments.out, found.scores, COMPARABLE)
     compared = _compared(arguments)
     report = _report(found, compared)
@@ -180,7 +177,7 @@ def _degradation(
     """
     from worldstate_lab.degradation.degradation_study import DegradationSettings
     from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
-    from worldstate_lab.evaluation.camera_failure import whole_sweep
+    from worldstate_lab.evaluation.evaluation import whole_sweep
     from worldstate_lab.trials.classification import model_from_windows
 
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
@@ -215,8 +212,6 @@ def _check(arguments: argparse.Namespace) -> None:
     from worldstate.ground.errors import InvalidArgumentError
 
     in_range("--jobs", arguments.jobs, 1, 256)
-    if (arguments.engine == "dask") != (arguments.scheduler is not None):
-        raise InvalidArgumentError("--engine dask and --scheduler ADDRESS: expected both or neither")
     if arguments.stage_streams and not arguments.hazard_free:
         raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
     if arguments.dataset is not None and arguments.smoke:
@@ -270,22 +265,6 @@ def _against_lines(compared: "Sequence[Comparison]") -> list[str]:
     ]
     table = Table("against", "less the other evaluation:", ("protocol", "method", "shared", *COMPARED), rows)
     return ["", *table.lines()] if rows else []
-
-
-class _Bars:
-    """One progress bar a step, each in the place of the last."""
-
-    def __init__(self, stack: ExitStack) -> None:
-        self._stack = stack
-        self._bar: Bar | None = None
-
-    def begin(self, description: str, parts: int) -> None:
-        self._stack.pop_all().close()
-        self._bar = self._stack.enter_context(progress_bar(description, parts))
-
-    def advance(self) -> None:
-        if self._bar is not None:
-            self._bar.advance()
 
 
 def _takes(arguments: argparse.Namespace) -> "TakeList":

@@ -9,7 +9,6 @@ import numpy as np
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.camera.degradation import LEVELS
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import (
@@ -21,12 +20,16 @@ from worldstate.operations.metrics.approach_table import (
 from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import stream_statistic
-from worldstate_lab.metrics.intervals import FOLDS, deal_folds, middle
+from worldstate_lab.metrics.intervals import deal_folds, middle
 
 from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions
 
 # One recording by the name of its condition, with the columns of `staged_filter.filter_in_conditions`.
 Staged = Mapping[str, HopTable]
+
+
+# Share of hazard-free windows in alarm.
+ALPHA = 0.02
 
 
 class Estimate(NamedTuple):
@@ -35,27 +38,6 @@ class Estimate(NamedTuple):
     value: float
     low: float
     high: float
-
-
-@dataclass(frozen=True, slots=True)
-class AwarenessSettings:
-    """How thresholds are set.
-
-    Examples
-    --------
-    >>> AwarenessSettings((0.25,) * 4).alpha
-    0.02
-    """
-
-    reference_prior: tuple[float, ...]  # Of the advisory's statistic
-    alpha: float = 0.02  # Share of hazard-free windows in alarm
-    sustain_hops: int = 3  # Hops that the statistic of an advisory has to hold
-    folds: int = FOLDS  # By recording
-
-    def __post_init__(self) -> None:
-        in_range("alpha", self.alpha, 0.0, 1.0, open_high=True)
-        in_range("sustain_hops", self.sustain_hops, 1, 1000)
-        in_range("folds", self.folds, 2, 1000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,21 +95,26 @@ class Awareness:
 
 
 def hazard_awareness(
-    recordings: Sequence[Staged], settings: AwarenessSettings, draws: IndexArray, rng: np.random.Generator
+    recordings: Sequence[Staged],
+    prior: Sequence[float],
+    sustain_hops: int,
+    draws: IndexArray,
+    rng: np.random.Generator,
 ) -> Awareness:
     """Judge every condition by the same thresholds.
 
     Both are set on other recordings' hazard-free hops: gamma(alpha) of the advisory's statistic on the clean
     ones, as that only falls when absence says less; and that of P(hidden) + P(visible) without a camera, as
-    that only rises. `draws` (draws, recordings) says which recordings make each draw of an interval.
+    that only rises. The statistic is formed at `prior` and has to hold for `sustain_hops`. `draws` (draws,
+    recordings) says which recordings make each draw of an interval.
     """
     clean = [one[CLEAN] for one in recordings]
     if not any(one.after_sight().any() for one in clean):
         raise InvalidArgumentError("recordings: expected an approach that comes into view")
     sites = [str(one.about.get("site", "")) for one in clean]
-    folds = deal_folds([one.label for one in clean], sites, rng, settings.folds).tolist()
+    folds = deal_folds([one.label for one in clean], sites, rng).tolist()
     judges = {
-        fold: _judge([r for r, f in zip(recordings, folds, strict=True) if f != fold], settings)
+        fold: _judge([r for r, f in zip(recordings, folds, strict=True) if f != fold], prior, sustain_hops)
         for fold in set(folds)
     }
     judged = {
@@ -190,13 +177,12 @@ class _Counts:
         return float(part.sum() / self._hops.sum()), shares
 
 
-def _judge(others: Sequence[Staged], settings: AwarenessSettings) -> Callable[[HopTable], _Judged]:
+def _judge(others: Sequence[Staged], prior: Sequence[float], hops: int) -> Callable[[HopTable], _Judged]:
     """Set the two thresholds of a fold on the recordings of the others."""
-    prior, hops = settings.reference_prior, settings.sustain_hops
     free = [one for one in others if one[CLEAN].hazard_free]
     calm = [stream_statistic(one[CLEAN], prior) for one in free]
-    gamma = neyman_pearson_threshold(calm, settings.alpha, hops)
-    presence = neyman_pearson_threshold([one[OFF].presence for one in free], settings.alpha)
+    gamma = neyman_pearson_threshold(calm, ALPHA, hops)
+    presence = neyman_pearson_threshold([one[OFF].presence for one in free], ALPHA)
 
     def judge(one: HopTable) -> _Judged:
         alarm = sustained_alarm(stream_statistic(one, prior) >= gamma, hops)

@@ -1,6 +1,7 @@
 """The degradation sweep of the paper: miss rates of two detectors, and awareness while the camera fails."""
 
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,9 +19,9 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import BoolArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.degradation import looks, staged_filter
-from worldstate_lab.metrics.intervals import FOLDS, deal_folds, stratified_draws
+from worldstate_lab.metrics.intervals import deal_folds, stratified_draws
 
-from .awareness import Awareness, AwarenessRow, AwarenessSettings, hazard_awareness
+from .awareness import Awareness, AwarenessRow, hazard_awareness
 from .beta_curves import (
     BetaCurves,
     Counts,
@@ -33,13 +34,85 @@ from .beta_curves import (
 from .conditions import FAMILIES, RAIN_DB
 from .looks import READINGS, StagedDetector, look, motion_detectors
 from .staged_filter import by_condition, cameras, filter_in_conditions
-from .sweep_data import sweep_data
+
+# Of each kind: with fewer, no recording is left to set thresholds and miss rates on.
+LEAST = 2
+
+
+@dataclass(frozen=True, slots=True)
+class SweepData:
+    """Recordings of a sweep, and in words what there ought to be more of."""
+
+    approaches: tuple[Recording, ...]
+    hazard_free: tuple[Recording, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """Both kinds."""
+        return *self.approaches, *self.hazard_free
+
+    @property
+    def lacks(self) -> str | None:
+        """What a sweep needs and does not find; None where it can be run."""
+        if min(len(self.approaches), len(self.hazard_free)) >= LEAST:
+            return None
+        least = f"needs {LEAST} filmed approaches and {LEAST} filmed hazard-free recordings"
+        return f"{least}; {'; '.join(self.missing)}"
+
+
+def sweep_data(recordings: Sequence[Recording], approaches: int = 12, hazard_free: int = 12) -> SweepData:
+    """Choose so many filmed recordings of a standing ego of each kind, evenly over junctions and sides.
+
+    Examples
+    --------
+    >>> sweep_data([], approaches=2, hazard_free=0).missing
+    ('2 of 2 filmed approaches are missing',)
+    """
+    of_kind = [[one for one in recordings if (one.label == "none") == free] for free in (False, True)]
+    names = "approaches", "hazard-free recordings"
+    wanted = approaches, hazard_free
+    filmed = [[one for one in found if _usable(one)] for found in of_kind]
+    missing = [
+        f"{number - len(usable)} of {number} filmed {name} are missing" + _why(found)
+        for name, number, usable, found in zip(names, wanted, filmed, of_kind, strict=True)
+        if len(usable) < number
+    ]
+    chosen, free = (tuple(_evenly(usable, number)) for usable, number in zip(filmed, wanted, strict=True))
+    return SweepData(chosen, free, tuple(missing))
+
+
+def _usable(recording: Recording) -> bool:
+    # From a moving camera every box moves: there is no reference there.
+    standing = not recording.moving_ego and recording.label is not None
+    return standing and recording.detections_path is not None and (recording.path / VIDEO_NAME).is_file()
+
+
+def _why(found: Sequence[Recording]) -> str:
+    without = [one.recording_id for one in found if not one.moving_ego and not _usable(one)]
+    if not without:
+        return ""
+    more = f" and {len(without) - 3} more" if len(without) > 3 else ""
+    return f": no {VIDEO_NAME} or no detections beside {', '.join(without[:3])}{more}"
+
+
+def _evenly(recordings: Sequence[Recording], number: int) -> list[Recording]:
+    """Take one of each junction and side in turn; kept in the order of the data set."""
+    taken: Counter[tuple[str | None, str | None]] = Counter()
+    ranked = []
+    for place, one in enumerate(recordings):
+        stratum = (one.environment, one.label)
+        # By side before the junction, so that a remainder goes to as many junctions as it can.
+        ranked.append((taken[stratum], one.label or "", place))
+        taken[stratum] += 1
+    return [recordings[place] for place in sorted(place for *_, place in sorted(ranked)[:number])]
+
 
 Tables = Mapping[str, HopTable]
 # Keeps what a pass over a recording gave: name of the pass, what it depends on, and how to make it.
 Keep = Callable[[str, object, Callable[[], Tables]], Tables]
-# Does the work on every item, in order. What is no mapping says, as text, why a recording failed.
-Over = Callable[[Callable[["Item"], Tables], Sequence["Item"]], Iterable[object]]
+# Does the work on every item, in order; text is the problem of a recording that failed.
+Over = Callable[[Callable[["SweepItem"], Tables], Sequence["SweepItem"]], Iterable[Tables | str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +125,8 @@ class DegradationSettings:
         Tried in every condition; both kinds of background subtraction by default.
     model : Path, optional
         Signature model; the one that ships where not given.
-    miss_rates : mapping of str to MissRates
-        By detector, measured elsewhere; those of the other folds' recordings for a detector without.
-    alpha : float
-        False-positive budget of the thresholds.
     approaches, hazard_free : int
         Recordings of each kind.
-    folds : int
-        Thresholds and miss rates of a recording come from those of the other folds.
     width_px : int
         Images are reduced to this width once, before anything is staged; detectors then find them small
         enough.
@@ -73,17 +140,14 @@ class DegradationSettings:
 
     Examples
     --------
-    >>> DegradationSettings().alpha
-    0.02
+    >>> DegradationSettings().approaches
+    12
     """
 
     detectors: tuple[StagedDetector, ...] = field(default_factory=motion_detectors)
     model: Path | None = None
-    miss_rates: Mapping[str, MissRates] = field(default_factory=dict)
-    alpha: float = 0.02
     approaches: int = 12
     hazard_free: int = 12
-    folds: int = FOLDS
     width_px: int = 640
     seed: int = 0
 
@@ -91,10 +155,6 @@ class DegradationSettings:
         names = {one.name for one in self.detectors}
         if not names or len(names) < len(self.detectors) or READINGS in names:
             raise InvalidArgumentError(f"detectors: expected names of their own, got {sorted(names)}")
-        if not set(self.miss_rates) <= names:
-            raise InvalidArgumentError(
-                f"miss_rates: expected those of {sorted(names)}, got {sorted(self.miss_rates)}"
-            )
         in_range("width_px", self.width_px, 64, 8192)
 
 
@@ -178,9 +238,9 @@ def degradation_study(
 ) -> DegradationStudy:
     """Stage blur, darkness, noise and rain, four levels each, and say what vision and the filter still hold.
 
-    Nobody is told what is staged: d is read from the images, and beta from a table that was measured on the
-    recordings of other folds with the same detector. Thresholds are gamma(alpha) on the hazard-free
-    recordings of other folds.
+    Neither camera nor filter is given what is staged: d is read from the images, and beta from a table that
+    was measured on the recordings of other folds with the same detector. Thresholds are gamma(alpha) on the
+    hazard-free recordings of other folds.
 
     Parameters
     ----------
@@ -189,8 +249,8 @@ def degradation_study(
     settings : DegradationSettings, optional
         What is swept.
     over : callable
-        Does the work on every recording, in order; ``map``, or `Engine.over`. What it gives in place of
-        tables says why a recording failed, which is then skipped.
+        Does the work on every recording, in order. What it gives as text says why a recording failed,
+        which is then skipped.
     keep : callable
         Keeps what a pass gave, such as `PassCache.tables`.
     fingerprint : callable
@@ -226,16 +286,15 @@ def degradation_study(
         raise InvalidArgumentError(f"recordings: a sweep {data.lacks}")
     passes = _Passes(chosen, {one.recording_id: fingerprint(one.path) for one in data.recordings}, keep)
     rng, skipped = np.random.default_rng(chosen.seed), dict[str, str]()
-    seen = _done(over, passes.look, [Item(one) for one in data.recordings], skipped)
+    seen = _done(over, passes.look, [SweepItem(one) for one in data.recordings], skipped)
     counts = [{name: counts_of(one.tables[f"{name} misses"]) for name in passes.names} for one in seen]
-    folds = _folds(seen, chosen.folds, rng)
+    folds = _folds(seen, rng)
     rates = {fold: passes.rates(folds != fold, seen, counts) for fold in set(folds.tolist())}
     items = [replace(one, rates=rates[fold]) for one, fold in zip(seen, folds.tolist(), strict=True)]
     believed = _done(over, passes.filter, items, skipped)
     # By kind alone: a junction and side has one recording or two, which would hardly vary.
     draws = stratified_draws([one.hazard_free for one in believed], rng)
     policy = read_model(chosen.model).policies.policies[0]
-    judging = AwarenessSettings(policy.reference_prior, chosen.alpha, policy.sustain_hops, chosen.folds)
     left = {str(one) for one in believed}
     counts = [one for one, its in zip(counts, seen, strict=True) if str(its) in left]
     # The same folds for every detector: what differs between them is no draw of the folds.
@@ -243,7 +302,8 @@ def degradation_study(
 
     def sweep(name: str) -> DetectorSweep:
         staged = [by_condition(one.tables[name]) for one in believed]
-        awareness = hazard_awareness(staged, judging, draws, np.random.default_rng(fold_seed))
+        anew = np.random.default_rng(fold_seed)
+        awareness = hazard_awareness(staged, policy.reference_prior, policy.sustain_hops, draws, anew)
         return DetectorSweep(name, beta_curves([one[name] for one in counts], draws), awareness)
 
     names = {free: tuple(str(one) for one in believed if one.hazard_free == free) for free in (False, True)}
@@ -252,7 +312,7 @@ def degradation_study(
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class SweepItem:
     """One recording on its way through the passes; its text is its name."""
 
     recording: Recording
@@ -281,7 +341,7 @@ class _Passes:
         """Of the detectors."""
         return [one.name for one in self.settings.detectors]
 
-    def look(self, item: Item) -> Tables:
+    def look(self, item: SweepItem) -> Tables:
         """Return what every detector reported in every condition of the camera, and what it missed."""
         recording = item.recording
 
@@ -296,7 +356,7 @@ class _Passes:
 
         return self.keep("degraded-looks", self._look_key(item), make)
 
-    def filter(self, item: Item) -> Tables:
+    def filter(self, item: SweepItem) -> Tables:
         """Return what the filter believed in every condition, a table a detector."""
         recording, model = item.recording, read_model(self.settings.model)
         rates = {name: one.to_dict() for name, one in item.rates.items()}
@@ -323,39 +383,38 @@ class _Passes:
         return self.keep("degraded-beliefs", key, make)
 
     def rates(
-        self, others: BoolArray, seen: Sequence[Item], counts: Sequence[Mapping[str, Counts]]
+        self, others: BoolArray, seen: Sequence[SweepItem], counts: Sequence[Mapping[str, Counts]]
     ) -> dict[str, MissRates]:
-        """Return the miss rates of every detector: as they were given, or measured on `others`."""
+        """Return the miss rates of every detector, measured on `others`."""
         chosen = np.flatnonzero(others).tolist()
         readings = [seen[i].tables[READINGS] for i in chosen]
         return {
-            name: self.settings.miss_rates.get(name)
-            or pooled_rates([counts[i][name] for i in chosen], readings, {"detector": name})
+            name: pooled_rates([counts[i][name] for i in chosen], readings, {"detector": name})
             for name in self.names
         }
 
-    def _look_key(self, item: Item) -> list[object]:
+    def _look_key(self, item: SweepItem) -> list[object]:
         chosen = self.settings
         return [looks.VERSION, self.fingerprints[str(item)], self.names, chosen.width_px, chosen.seed]
 
-    def _seed(self, item: Item) -> tuple[int, int]:
+    def _seed(self, item: SweepItem) -> tuple[int, int]:
         """No recording's noise depends on which others there are."""
         return self.settings.seed, zlib.crc32(str(item).encode())
 
 
 def _done(
-    over: Over, work: Callable[[Item], Tables], items: Sequence[Item], skipped: dict[str, str]
-) -> list[Item]:
+    over: Over, work: Callable[[SweepItem], Tables], items: Sequence[SweepItem], skipped: dict[str, str]
+) -> list[SweepItem]:
     """Do a pass; return the items with what it gave, and write down those that failed."""
     done = []
     for item, tables in zip(items, over(work, items), strict=True):
-        if isinstance(tables, Mapping):
-            done.append(replace(item, tables=tables))
+        if isinstance(tables, str):
+            skipped[str(item)] = tables
         else:
-            skipped[str(item)] = str(tables)
+            done.append(replace(item, tables=tables))
     return done
 
 
-def _folds(seen: Sequence[Item], folds: int, rng: np.random.Generator) -> IndexArray:
+def _folds(seen: Sequence[SweepItem], rng: np.random.Generator) -> IndexArray:
     labels = [str(one.recording.label) for one in seen]
-    return deal_folds(labels, [str(one.recording.environment) for one in seen], rng, folds)
+    return deal_folds(labels, [str(one.recording.environment) for one in seen], rng)

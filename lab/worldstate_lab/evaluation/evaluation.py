@@ -1,42 +1,60 @@
 """The whole evaluation: recordings are heard once, every protocol is run on them, everything is scored."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
+from operator import attrgetter
 from typing import Protocol as Interface
+from typing import TypeVar
 
 import numpy as np
 
+from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.files.model_file import model_to_dict, read_model
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import IndexArray
-from worldstate_lab.degradation.degradation_study import DegradationSettings, DegradationStudy
-from worldstate_lab.degradation.stream_sweep import StreamSweep
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.degradation.degradation_study import (
+    DegradationSettings,
+    DegradationStudy,
+    SweepItem,
+    Tables,
+    degradation_study,
+)
+from worldstate_lab.degradation.staged_filter import (
+    STREAM_VERSION,
+    StreamSweep,
+    staged_advisories,
+    states_told,
+    stream_sweep,
+)
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
 from worldstate_lab.trials.classification import Classifiers
 from worldstate_lab.trials.engine import Engine, Failed
 from worldstate_lab.trials.hearing import Hearing, hear, within_hours
+from worldstate_lab.trials.listening import model_refusal
+from worldstate_lab.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
 from worldstate_lab.trials.takes import Take, TakeList
 from worldstate_lab.trials.trial import Trial
 
-from .camera_failure import camera_failure, lacking_films, staged_streams
 from .front_end_study import FrontEndStudy, front_end_study
 from .operating_curve import EqualDetection, equal_detection
 from .protocols import PROTOCOLS, ProtocolRun, run_protocol
 from .scores import Score
 
+Item = TypeVar("Item")
+
 # The paper's alpha.
 ALPHA = 0.02
 
 
-class Steps(Interface):
-    """Where progress is told to: one call a step begun, and one for each of its parts done."""
+class Track(Interface):
+    """Shows progress: hands on the items of a step with so many of them."""
 
-    def begin(self, description: str, parts: int) -> None:
-        """Begin a step of so many parts."""
-        ...
-
-    def advance(self) -> None:
-        """Tell that a part is done."""
+    def __call__(self, items: Iterable[Item], description: str, total: int, /) -> Iterator[Item]:
+        """Yield the items."""
         ...
 
 
@@ -88,27 +106,30 @@ def evaluate(
     hearing: Hearing,
     classifiers: Classifiers,
     engine: Engine,
-    steps: Steps,
+    track: Track,
     settings: EvaluationSettings,
 ) -> Evaluation:
     """Hear all recordings, run every protocol that they suffice for and score every method."""
     lacking_data(takes)
     every = (*takes.static, *takes.dynamic)
-    steps.begin("listening", len(every))
-    heard, failed = hear(every, hearing, engine, steps.advance)
+    heard, failed = hear(track(engine.over(hearing, every, attrgetter("name")), "listening", len(every)))
     trials = within_hours(heard, settings.hazard_free_hours)
     left = _left(takes, trials)
     # Again, on what is left: one broken recording of a small data set may be one too many.
     lacking = lacking_data(left, failed)
     chosen = [protocol for protocol in PROTOCOLS if protocol.name not in lacking]
-    steps.begin("fitting and deciding", len(chosen))
-    runs, refused = {}, {}
-    for protocol in chosen:
-        own = [trial for trial in trials if bool(trial.hops.about["moving"]) == protocol.moving]
-        runs[protocol.name] = run_protocol(protocol, own, methods_for(own), classifiers, settings.seeds)
-        refused[protocol.name] = refused_methods(own)
-        steps.advance()
-    scores = _scored(runs, steps)
+    own = {one.name: [t for t in trials if bool(t.hops.about["moving"]) == one.moving] for one in chosen}
+    runs = {
+        one.name: run_protocol(one, own[one.name], methods_for(own[one.name]), classifiers, settings.seeds)
+        for one in track(chosen, "fitting and deciding", len(chosen))
+    }
+    scores = {
+        name: {
+            method: Score.of(run.trials, passes)
+            for method, passes in track(run.decisions.items(), "scoring", len(run.decisions))
+        }
+        for name, run in runs.items()
+    }
     rng = np.random.default_rng(settings.seeds[0])
     drawn = {
         name: stratified_draws([(t.label, t.site) for t in run.trials], rng, settings.draws)
@@ -116,6 +137,15 @@ def evaluate(
     }
     standing = [trial for trial in trials if not trial.hops.about["moving"]]
     filmed = any(np.isfinite(trial.hops.reference_rad).any() for trial in standing)
+    front_end = front_end_study(standing, rng, settings.draws) if filmed else None
+    degradation = staged = None
+    # Broken videos may leave a sweep fewer recordings than it needs: no reason to lose all other figures.
+    if settings.degradation is not None:
+        with _noted(lacking, "degradation sweep"):
+            degradation = _degradation(left, hearing, engine, track, settings.degradation)
+    if settings.stage_streams:
+        with _noted(lacking, "staged streams"):
+            staged = _staged(left, trials, hearing, engine, track, settings.seeds[0])
     return Evaluation(
         takes,
         tuple(trials),
@@ -124,78 +154,91 @@ def evaluate(
         runs,
         scores,
         drawn,
-        front_end_study(standing, rng, settings.draws) if filmed else None,
-        _degradation(left, hearing, engine, steps, settings.degradation, lacking),
+        front_end,
+        degradation,
         settings,
-        refused,
+        {name: refused_methods(trials) for name, trials in own.items()},
         {
             name: equal_detection(run.trials, run.decisions, drawn[name])
             for name, run in runs.items()
             if not run.protocol.by_junction
         },
-        _staged(left, trials, hearing, engine, steps, settings, lacking),
+        staged,
     )
 
 
-def _scored(runs: Mapping[str, ProtocolRun], steps: Steps) -> dict[str, dict[str, Score]]:
-    steps.begin("scoring", sum(len(run.decisions) for run in runs.values()))
-    scores: dict[str, dict[str, Score]] = {}
-    for name, run in runs.items():
-        scores[name] = {}
-        for method, passes in run.decisions.items():
-            scores[name][method] = Score.of(run.trials, passes)
-            steps.advance()
-    return scores
+@contextmanager
+def _noted(lacking: dict[str, str], name: str) -> Iterator[None]:
+    """Note what a part of the evaluation lacks in place of its result."""
+    try:
+        yield
+    except InvalidArgumentError as error:
+        lacking[name] = str(error)
 
 
 def _left(takes: TakeList, trials: Sequence[Trial]) -> TakeList:
     """Return the recordings that were heard and are scored, a stream if any piece of it is."""
     names = {str(trial.hops.about.get("stream", trial.name)) for trial in trials}
+    kept = [tuple(one for one in some if one.name in names) for some in (takes.static, takes.dynamic)]
+    return replace(takes, static=kept[0], dynamic=kept[1])
 
-    def kept(some: Sequence[Take]) -> tuple[Take, ...]:
-        return tuple(take for take in some if take.name in names)
 
-    return replace(takes, static=kept(takes.static), dynamic=kept(takes.dynamic))
+def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSettings:
+    """Return the settings of a sweep over all filmed recordings, in place of an even choice of them."""
+    calm = [take.hazard_free for take in takes.static if take.filmed]
+    return replace(settings, approaches=calm.count(False), hazard_free=calm.count(True))
 
 
 def _degradation(
-    takes: TakeList,
-    hearing: Hearing,
-    engine: Engine,
-    steps: Steps,
-    settings: DegradationSettings | None,
-    lacking: dict[str, str],
-) -> DegradationStudy | None:
-    if settings is None:
-        return None
-    lacks = lacking_films(takes, settings)
-    if lacks is not None:
-        lacking["degradation sweep"] = lacks
-        return None
-    try:
-        return camera_failure(takes, hearing.folder, engine, settings, steps.begin, steps.advance)
-    except InvalidArgumentError as error:
-        # Broken videos may leave it fewer recordings than it needs: no reason to lose all other figures.
-        lacking["degradation sweep"] = str(error)
-        return None
+    takes: TakeList, hearing: Hearing, engine: Engine, track: Track, settings: DegradationSettings
+) -> DegradationStudy:
+    """Run the sweep; the recordings are worked on as all others are, and what was seen is kept."""
+    model, filmed = read_model(settings.model), [take for take in takes.static if take.filmed]
+    for take in filmed:
+        if (refusal := model_refusal(take, model)) is not None:
+            raise InvalidArgumentError(f"needs a model that was made for this sound; {refusal}")
+
+    def over(work: Callable[[SweepItem], Tables], items: Sequence[SweepItem]) -> Iterator[Tables | str]:
+        done = track(engine.over(work, items), "degrading the camera", len(items))
+        return (one.problem if isinstance(one, Failed) else one for one in done)
+
+    named = partial(fingerprint, memo=FingerprintMemo(hearing.folder / "fingerprints"))
+    recordings = [Recording.open(take.path) for take in filmed]
+    keep = PassCache(hearing.folder).tables
+    return degradation_study(recordings, settings, over=over, keep=keep, fingerprint=named)
+
+
+@dataclass(frozen=True, slots=True)
+class _StagedStream:
+    """Work on one stream, in any process."""
+
+    hearing: Hearing
+    seed: int
+
+    def __call__(self, take: Take) -> HopTable:
+        """Return the advisories of every state of the camera, or what an earlier run found."""
+        folder, model = self.hearing.folder, self.hearing.model
+        mark = fingerprint(take.path, FingerprintMemo(folder / "fingerprints"))
+        key = [STREAM_VERSION, mark, states_told(), model_to_dict(read_model(model)), self.seed]
+
+        def make() -> dict[str, HopTable]:
+            return {"advised": staged_advisories(take.path, model, self.seed)}
+
+        return PassCache(folder).tables("staged-streams", key, make)["advised"]
 
 
 def _staged(
-    takes: TakeList,
-    trials: Sequence[Trial],
-    hearing: Hearing,
-    engine: Engine,
-    steps: Steps,
-    settings: EvaluationSettings,
-    lacking: dict[str, str],
-) -> StreamSweep | None:
-    if not settings.stage_streams:
-        return None
+    takes: TakeList, trials: Sequence[Trial], hearing: Hearing, engine: Engine, track: Track, seed: int
+) -> StreamSweep:
+    """Stage every state of camera and roof on the hazard-free streams."""
     names = {str(trial.hops.about["stream"]) for trial in trials if "stream" in trial.hops.about}
     streams = [take for take in takes.static if take.name in names]
-    try:
-        return staged_streams(streams, hearing, engine, settings.seeds[0], steps.begin, steps.advance)
-    except InvalidArgumentError as error:
-        # All other figures stand by now.
-        lacking["staged streams"] = str(error)
-        return None
+    if not streams:
+        raise InvalidArgumentError("needs a stream of two minutes or more without hazards, found none")
+    work = engine.over(_StagedStream(hearing, seed), streams, attrgetter("name"))
+    found = []
+    for one in track(work, "staging camera and rain on streams", len(streams)):
+        if isinstance(one, Failed):
+            raise InvalidArgumentError(f"{one.name}: {one.problem}")
+        found.append(one)
+    return stream_sweep(found, seed)

@@ -1,13 +1,14 @@
 """Every number that the paper states in its sections IV, VII, VIII and IX, and what it takes to fill it.
 
-The numbers stand in `paper_values.csv`, in the order of the paper. The text says .881 where Table I prints .88;
-both are 37 of 42.
+The numbers stand in `paper_values.csv`, in the order of the paper. The text says .881 where Table I prints
+.88; both are 37 of 42.
 """
 
 import csv
 import math
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import Any
 
 # What fills a number, by what it stands on: the positions of the microphones, this machine, OVAD's sound and
 # video, the sound of the two roadside corpora; "stated" is said of the data or the setting and is no outcome.
@@ -42,14 +43,14 @@ class PaperValue:
         return max(stated, 2) if stated and self.unit in ("share", "") else stated
 
 
+_NUMBERS = ("value", "low", "high")
+
+
 def _read() -> tuple[PaperValue, ...]:
     text = files(__package__).joinpath("paper_values.csv").read_text(encoding="utf-8")
-    rows = list(csv.reader(text.splitlines()))[1:]
-    return tuple(
-        PaperValue(*names, *(float(number or math.nan) for number in numbers), unit)
-        for *names, value, low, high, unit in rows
-        for numbers in [(value, low, high)]
-    )
+    rows: list[dict[str, Any]] = list(csv.DictReader(text.splitlines()))
+    numbers = ({name: float(row[name] or math.nan) for name in _NUMBERS} for row in rows)
+    return tuple(PaperValue(**(row | known)) for row, known in zip(rows, numbers, strict=True))
 
 
 PAPER_VALUES = _read()

@@ -1,7 +1,7 @@
 """Which recordings calibrate and which are tested, and every method fitted and asked on them."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,7 +147,6 @@ def run_protocol(
     methods: Sequence[Method],
     classifiers: Classifiers,
     seeds: Sequence[int],
-    on_part: Callable[[], None] = lambda: None,
 ) -> ProtocolRun:
     """Fit and ask all methods on all folds, for every seed; by junction the first seed is the only one.
 
@@ -160,7 +159,6 @@ def run_protocol(
         said: dict[str, dict[int, Decisions]] = {method.name: {} for method in methods}
         for calibration, tested in protocol.parts(trials, np.random.default_rng(seed)):
             _one_part(protocol, trials, methods, classifiers, calibration, tested, seed, said)
-            on_part()
         passes.append(said)
     rows = sorted(next(iter(passes[0].values())))
     return ProtocolRun(

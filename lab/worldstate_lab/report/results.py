@@ -13,7 +13,7 @@ from worldstate.ground.errors import InputFileError
 from .table import plain
 
 # Options that say where work is done and what is written, and change no figure.
-_NO_FIGURE = ("--results", "--out", "--report", "--predictions", "--jobs", "--engine", "--scheduler")
+_NO_FIGURE = ("--results", "--out", "--report", "--predictions", "--jobs", "--scheduler")
 
 
 def result_key(words: Sequence[str]) -> str:

@@ -1,6 +1,6 @@
 """From recordings to trials: every pass over the sound, each recording's results kept by its content."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.trials.pass_cache import origin_of
 
-from .engine import Engine, Failed
+from .engine import Failed
 from .listening import (
     VERSION,
     chain_tables,
@@ -86,18 +86,15 @@ class Hearing:
         return Trial(hops, heard["boxes"], heard["truth"], chains)
 
 
-def hear(
-    takes: Sequence[Take], hearing: Hearing, engine: Engine, on_take: Callable[[], None] = lambda: None
-) -> tuple[list[Trial], list[Failed]]:
-    """Return the trials in the order of the recordings, and the recordings that cannot be read."""
+def hear(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
+    """Return the trials in the order of the recordings, cut to pieces, and what cannot be read."""
     trials: list[Trial] = []
     failed: list[Failed] = []
-    for found in engine.over(hearing, takes, lambda take: take.name):
+    for found in heard:
         if isinstance(found, Failed):
             failed.append(found)
         else:
             trials += _pieces(found)
-        on_take()
     return trials, failed
 
 
