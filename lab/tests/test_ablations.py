@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hop_tables import blank_stream
 from scipy.signal import lfilter
-from worldstate_lab.paper.ablations import (
+from worldstate_lab.cli.ablations import (
     AblationSwitches,
     ablation_table,
     evaluate_ablation,

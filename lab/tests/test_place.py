@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from worldstate_lab.cli.place import followed_places
 from worldstate_lab.places.junctions import WALLS, place_models, simulated_pass
-from worldstate_lab.places.place_exam import followed_places
 from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter
 from worldstate_lab.places.place_measurements import PlaceMeasurements
 from worldstate_lab.places.sound_paths import StreetWalls, sound_paths

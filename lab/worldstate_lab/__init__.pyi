@@ -1,9 +1,9 @@
+from .cli.ablations import AblationSwitches as AblationSwitches
+from .cli.ablations import evaluate_ablation as evaluate_ablation
 from .degradation.degradation_study import DegradationSettings as DegradationSettings
 from .degradation.degradation_study import degradation_study as degradation_study
 from .features.comparison import comparison as comparison
 from .features.published_classifier import PublishedClassifier as PublishedClassifier
-from .paper.ablations import AblationSwitches as AblationSwitches
-from .paper.ablations import evaluate_ablation as evaluate_ablation
 from .paper.identifiability import reach_of_array as reach_of_array
 from .paper.identifiability import reach_on_data as reach_on_data
 from .paper.information import fano_bound as fano_bound

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worldstate_lab.streets.road_user_exam import road_user_exam
+from worldstate_lab.cli.kinds import road_user_exam
 
 from worldstate.commissioning.road_user_training import (
     CLASS_OF,

@@ -9,10 +9,280 @@ approaches need a T0, and there have to be hazard-free recordings.
 """
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from worldstate.abduction.cueing.calibration_error import (
+    brier_score,
+    calibration_error_sampling,
+    expected_calibration_error,
+)
+from worldstate.abduction.cueing.cueing_policy import sustained_alarm
+from worldstate.abduction.cueing.risk_map import fit_isotonic
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
+from worldstate.adapters.files.model_file import load_model
 from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.listening import read_streams
 from worldstate.cli.common.output import CommandResult
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.operations.metrics.approach_table import ApproachTable, alarm_outcome
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.stream_statistic import (
+    StatisticSwitches,
+    presence_statistic,
+    stream_statistic,
+)
+from worldstate_lab.metrics.intervals import deal_folds
+
+
+@dataclass(frozen=True, slots=True)
+class AblationSwitches:
+    """What is left in.
+
+    Parameters
+    ----------
+    use_absence : bool
+        (a) False: the signature alone, whatever the camera answered.
+    calibrated : bool
+        (b) False: the raw statistic is read as the risk.
+    approach_weights : tuple of float
+        Weights of looming that may be taken; the one with the largest AUROC on the calibration folds is.
+        ``(0.0,)`` leaves looming out.
+    alpha, sustain_hops : float, int
+        Budget and sustained rule.
+    folds : int
+        Recording-level folds.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> AblationSwitches(use_absence=False).approach_weights
+    (0.0,)
+    """
+
+    use_absence: bool = True
+    calibrated: bool = True
+    approach_weights: tuple[float, ...] = (0.0,)
+    alpha: float = 0.02
+    sustain_hops: int = 3
+    folds: int = 5
+
+    def __post_init__(self) -> None:
+        if not self.approach_weights:
+            raise InvalidArgumentError("approach_weights: expected at least one")
+        in_range("alpha", self.alpha, 0.0, 1.0, open_high=True)
+        in_range("folds", self.folds, 2, 1000)
+
+    def statistic_with(self, weight: float) -> StatisticSwitches:
+        """Return the switches of the statistic at one weight of looming."""
+        return StatisticSwitches(use_absence=self.use_absence, approach_weight=weight)
+
+
+@dataclass(frozen=True, slots=True)
+class AblationRow:
+    """One row of the table; None where the streams hold nothing to form it from."""
+
+    auroc: float | None  # Windows before T0 against hazard-free ones
+    detected: float | None  # Share of approaches announced before T0, and by how much in the mean
+    lead_time_s: float | None
+    false_alarms_per_hour: float | None  # On hazard-free recordings
+    window_rate: float | None
+    ece: float | None  # Of the risk on the same windows, with its sampling floor
+    ece_floor: float | None
+    brier: float | None
+    # Share of the hops after T0, while the vehicle is in view, in which a detection is there or P(hidden) +
+    # P(visible) is above its threshold, and in which a detection is there.
+    awareness: float | None
+    vision_only: float | None
+    approach_weight: float  # Mean of the weights chosen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scored:
+    """One held-out recording with what the calibration folds made of it."""
+
+    stream: HopTable
+    statistic: FloatArray
+    risk: FloatArray
+    alarm: BoolArray
+    aware: BoolArray
+    weight: float
+
+
+def evaluate_ablation(
+    streams: Sequence[HopTable],
+    reference_prior: Sequence[float],
+    rng: np.random.Generator,
+    switches: AblationSwitches | None = None,
+) -> AblationRow:
+    """Evaluate one setting of the switches by recording-level folds.
+
+    Parameters
+    ----------
+    streams : sequence of HopTable
+        Approaches with a T0, and hazard-free recordings.
+    reference_prior : sequence of float
+        Prior of the statistic.
+    rng : numpy.random.Generator
+        Deals recordings to folds, and draws the floor of the ECE.
+    switches : AblationSwitches, optional
+        What is left in; all of it where not given.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are fewer than two approaches or two hazard-free recordings.
+
+    Returns
+    -------
+    AblationRow
+        Detection, lead, false alarms and calibration at these switches.
+
+    Examples
+    --------
+    Twenty made-up recordings, half of them approaches that are heard from 6 s on:
+
+    >>> def stream(i):
+    ...     time_s, hazard = 1.0 + 0.1 * np.arange(100), bool(i % 2)
+    ...     scores = np.random.default_rng(i).normal(0.0, 0.3, (100, 4)) + np.array([0.0, 0.0, 0.0, 3.0])
+    ...     scores[50:, 0] += 8.0 * hazard
+    ...     columns = {"time_s": time_s, "log_likelihoods": scores, "clutter_rate": np.zeros(100)}
+    ...     columns |= dict.fromkeys(("answer", "seen", "there"), np.zeros(100, dtype=bool))
+    ...     columns["miss_rate"] = np.ones(100)
+    ...     return HopTable(columns, f"{i}", "left" if hazard else "none", 9.0 if hazard else np.nan)
+    >>> row = evaluate_ablation([stream(i) for i in range(20)], (0.25,) * 4, np.random.default_rng(0))
+    >>> row.detected
+    1.0
+    """
+    chosen = switches or AblationSwitches()
+    sites = [str(stream.about.get("site", "")) for stream in streams]
+    folds = deal_folds([stream.label for stream in streams], sites, rng, chosen.folds)
+    scored: list[_Scored] = []
+    for fold in np.unique(folds):
+        learned = _Learned(
+            [streams[i] for i in np.flatnonzero(folds != fold).tolist()], reference_prior, chosen
+        )
+        scored += [learned.score(streams[i]) for i in np.flatnonzero(folds == fold).tolist()]
+    return _row(scored, rng)
+
+
+def ablation_table(
+    streams: Sequence[HopTable],
+    reference_prior: Sequence[float],
+    seed: int,
+    switches: AblationSwitches | None = None,
+    approach_weights: tuple[float, ...] = (0.0, 0.1, 0.2, 0.4, 0.8),
+) -> dict[str, AblationRow]:
+    """Evaluate everything on, each part off, and looming added; the folds are the same in every row."""
+    base = switches or AblationSwitches()
+    rows = {
+        "full": base,
+        "signature_only": replace(base, use_absence=False),
+        "raw_risk": replace(base, calibrated=False),
+        "with_looming": replace(base, approach_weights=approach_weights),
+    }
+    return {
+        name: evaluate_ablation(streams, reference_prior, np.random.default_rng(seed), row)
+        for name, row in rows.items()
+    }
+
+
+class _Learned:
+    """Weight, thresholds and risk map of the calibration folds."""
+
+    def __init__(
+        self, streams: Sequence[HopTable], prior: Sequence[float], switches: AblationSwitches
+    ) -> None:
+        free = [stream for stream in streams if stream.hazard_free]
+        approaches = [stream for stream in streams if stream.before_sight().any()]
+        self._prior, self._switches = prior, switches
+        self.weight = self._best_weight(free, approaches)
+        calm = [self._statistic(stream, self.weight) for stream in free]
+        self.gamma = neyman_pearson_threshold(calm, switches.alpha, switches.sustain_hops)
+        presence = [self._presence(stream) for stream in free]
+        self.presence_gamma = neyman_pearson_threshold(presence, switches.alpha)
+        self._risk_map = None
+        if switches.calibrated and approaches:
+            self._risk_map = fit_isotonic(*_windows(calm, self._hazards(approaches, self.weight)))
+
+    def score(self, stream: HopTable) -> _Scored:
+        statistic = self._statistic(stream, self.weight)
+        risk = statistic if self._risk_map is None else self._risk_map(statistic)
+        alarm = sustained_alarm(statistic >= self.gamma, self._switches.sustain_hops)
+        aware = stream.seen | (self._presence(stream) >= self.presence_gamma)
+        return _Scored(stream, statistic, risk, alarm, aware, self.weight)
+
+    def _statistic(self, stream: HopTable, weight: float) -> FloatArray:
+        return stream_statistic(stream, self._prior, self._switches.statistic_with(weight))
+
+    def _presence(self, stream: HopTable) -> FloatArray:
+        return presence_statistic(stream, self._prior, self._switches.statistic_with(0.0))
+
+    def _hazards(self, approaches: Sequence[HopTable], weight: float) -> list[FloatArray]:
+        return [self._statistic(stream, weight)[stream.before_sight()] for stream in approaches]
+
+    def _best_weight(self, free: Sequence[HopTable], approaches: Sequence[HopTable]) -> float:
+        weights = self._switches.approach_weights
+        if len(weights) == 1 or not approaches:
+            return weights[0]
+        areas = []
+        for weight in weights:
+            calm = [self._statistic(stream, weight) for stream in free]
+            areas.append(auroc(*_windows(calm, self._hazards(approaches, weight))) or 0.0)
+        return weights[int(np.argmax(areas))]
+
+
+def _windows(calm: Sequence[FloatArray], hazards: Sequence[FloatArray]) -> tuple[FloatArray, BoolArray]:
+    scores = np.concatenate([*calm, *hazards])
+    return scores, np.arange(scores.size) >= sum(part.size for part in calm)
+
+
+def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
+    free = [one for one in scored if one.stream.hazard_free]
+    approaches = [one for one in scored if one.stream.before_sight().any()]
+    before = [one.stream.before_sight() for one in approaches]
+    statistic, hazards = _windows(
+        [one.statistic for one in free], [one.statistic[b] for one, b in zip(approaches, before, strict=True)]
+    )
+    risk, _ = _windows(
+        [one.risk for one in free], [one.risk[b] for one, b in zip(approaches, before, strict=True)]
+    )
+    found = ApproachTable(
+        [alarm_outcome(one.stream.time_s, one.alarm, one.stream.t0_s) for one in approaches],
+        [one.alarm for one in free],
+    ).figures()
+    both = bool(approaches) and bool(free)
+    return AblationRow(
+        auroc=auroc(statistic, hazards),
+        detected=found["detected"],
+        lead_time_s=found["lead_s"],
+        false_alarms_per_hour=found["onsets_per_hour"],
+        window_rate=found["hazard_free_share"],
+        ece=expected_calibration_error(risk, hazards) if both else None,
+        ece_floor=calibration_error_sampling(risk, rng)[0] if both else None,
+        brier=brier_score(risk, hazards) if both else None,
+        awareness=_share_in_sight(approaches, [one.aware for one in approaches]),
+        vision_only=_share_in_sight(approaches, [one.stream.seen for one in approaches]),
+        approach_weight=float(np.mean([one.weight for one in scored])),
+    )
+
+
+def _share_in_sight(scored: Sequence[_Scored], flags: Sequence[BoolArray]) -> float | None:
+    """Return the share of hops after T0, the vehicle in view, in which a flag holds."""
+    after = [flag[one.stream.after_sight()] for one, flag in zip(scored, flags, strict=True)]
+    hops = np.concatenate(after) if after else np.empty(0)
+    return float(hops.mean()) if hops.size else None
+
 
 EXAMPLE = """\
 examples:
@@ -33,12 +303,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from dataclasses import asdict
-
-    from worldstate.adapters.files.model_file import load_model
-    from worldstate.cli.common.listening import read_streams
-    from worldstate_lab.paper.ablations import AblationSwitches, ablation_table
-
     policy = load_model(arguments.model)[1].policies[0]
     switches = AblationSwitches(alpha=arguments.alpha, sustain_hops=policy.sustain_hops)
     streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)

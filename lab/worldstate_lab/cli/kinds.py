@@ -10,9 +10,114 @@ be of other junctions than the drawn ones.
 """
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
 from worldstate.cli.common.output import CommandResult, write_report
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar
+from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.commissioning.plan import CommissionSettings, learned_streams
+from worldstate.commissioning.road_user_training import (
+    CLASSES,
+    FIRST_S,
+    LAST_S,
+    RoadUserRows,
+    class_shares,
+    cross_validated,
+    fit_road_users,
+    road_user_rows,
+)
+from worldstate.commissioning.sequence_training import AUDIBLE_DB, ROW_S
+from worldstate.commissioning.sound_rows import characters
+from worldstate.frontend.array.microphone_array import ovad_array
+from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND
+from worldstate.ground.checks import in_range
+from worldstate.ground.typing import FloatArray
+
+_ALONE_DB, _SILENT_DB = 6.0, -100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoadUserExam:
+    """Hops near line of sight, at sites that were not learned."""
+
+    log_loss: float  # Mean of -ln p of the true class; nats
+    prior_log_loss: float  # Of the shares of the classes in a town instead
+    worst_site: float  # The largest difference of the two at any site; negative where better everywhere
+    classes: tuple[str, ...]
+    shares: FloatArray  # shape (classes,): In a town, as the model has them
+    hops: FloatArray  # shape (classes,): Number
+    confusion: FloatArray  # shape (classes, classes): Mean probability, one row a true class
+    recall: FloatArray  # shape (classes,): Share in which the true class is the likeliest
+    recall_of_equals: FloatArray  # shape (classes,): The same if all classes were as frequent
+
+
+def road_user_exam(rows: RoadUserRows) -> RoadUserExam:
+    """Judge every site by a model that never heard it, kinds as frequent as in a town."""
+    near = rows.select(rows.counts)
+    return _examined(near, cross_validated(rows)[rows.counts], near.weights, class_shares(near))
+
+
+def stream_exam(rows: RoadUserRows, streams: Sequence[HeardStream]) -> RoadUserExam:
+    """Judge hops of streams, as they come, by a model of other sites."""
+    heard = RoadUserRows.joined([stream_rows(one) for one in streams])
+    said = fit_road_users(rows).probabilities(heard.measures)
+    return _examined(heard, said, np.ones(len(said)), class_shares(rows))
+
+
+def stream_rows(stream: HeardStream) -> RoadUserRows:
+    """Return the hops of a stream in which one vehicle that comes into view is heard alone."""
+    sound = stream.hops.middle / np.float32(np.iinfo(np.int16).max)
+    measures, usable = characters(sound.ravel(), float(sound.shape[1] * HOPS_A_SECOND))
+    time_s, vehicles, rows = stream.hops.time_s, stream.vehicles, stream.rows
+    levels = np.full((len(vehicles) + 1, len(time_s)), _SILENT_DB)
+    hop = np.round((rows.time_s - time_s[0]) / ROW_S).astype(np.intp)
+    inside = (hop >= 0) & (hop < len(time_s))
+    for number, vehicle in enumerate(vehicles.vehicle):
+        mine = inside & (rows.vehicle == vehicle)
+        levels[number, hop[mine]] = rows.loudness_db[mine]
+    loudest = levels[:-1].argmax(axis=0)
+    first, second = np.sort(levels, axis=0)[[-1, -2]]
+    after_s = time_s - vehicles.entry_s[loudest]
+    comes = vehicles.hazard[loudest] & (after_s >= FIRST_S) & (after_s <= LAST_S)
+    kept = usable & comes & (first - second >= _ALONE_DB)
+    return RoadUserRows(
+        measures[kept[usable]],
+        vehicles.kind[loudest][kept],
+        np.full(int(kept.sum()), str(stream.hops.about["site"])),
+        first[kept] >= AUDIBLE_DB,
+        np.ones(int(kept.sum()), np.bool_),
+    )
+
+
+def _examined(near: RoadUserRows, said: FloatArray, weights: FloatArray, shares: FloatArray) -> RoadUserExam:
+    classes = near.classes
+    losses = -np.log(said[np.arange(len(said)), classes])
+    prior = -np.log(shares[classes])
+    gains = [
+        float(np.average((losses - prior)[here], weights=weights[here]))
+        for here in (near.sites == name for name in np.unique(near.sites))
+    ]
+    # A class that no hop has leaves a row of zeros.
+    counts = np.bincount(classes, minlength=len(CLASSES)).astype(np.float64)
+    confusion = np.stack([said[classes == number].sum(axis=0) for number in range(len(CLASSES))])
+    hits, equals = (one.argmax(axis=1) == classes for one in (said, said / shares))
+    return RoadUserExam(
+        log_loss=float(np.average(losses, weights=weights)),
+        prior_log_loss=float(np.average(prior, weights=weights)),
+        worst_site=max(gains),
+        classes=CLASSES,
+        shares=shares,
+        hops=counts,
+        confusion=confusion / np.maximum(counts, 1.0)[:, None],
+        recall=np.bincount(classes, hits, len(CLASSES)) / np.maximum(counts, 1.0),
+        recall_of_equals=np.bincount(classes, equals, len(CLASSES)) / np.maximum(counts, 1.0),
+    )
+
 
 EXAMPLE = """\
 examples:
@@ -38,19 +143,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from dataclasses import asdict
-
-    import numpy as np
-
-    from worldstate.cli.common.outputs import check_outputs
-    from worldstate.cli.common.progress import progress_bar
-    from worldstate.commissioning.heard_stream import HeardStream
-    from worldstate.commissioning.plan import CommissionSettings, learned_streams
-    from worldstate.commissioning.road_user_training import road_user_rows
-    from worldstate.frontend.array.microphone_array import ovad_array
-    from worldstate.ground.checks import in_range
-    from worldstate_lab.streets.road_user_exam import road_user_exam, stream_exam
-
     check_outputs(arguments, "report")
     in_range("--passes", arguments.passes, 1, 100)
     plan = learned_streams(CommissionSettings(junctions=arguments.junctions))

@@ -8,15 +8,28 @@ Printed are collisions, braking that nobody made necessary, and time.
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.parallel import in_processes
 from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
-
-if TYPE_CHECKING:
-    from worldstate_lab.planner.encounters import BelievedStream
+from worldstate.ground.checks import in_range
+from worldstate_lab.planner.encounters import FROM_STANDING, BelievedStream, EgoVehicle, believed_stream
+from worldstate_lab.planner.planner_exam import (
+    THRESHOLDS,
+    approaches_drawn,
+    draw_corners,
+    drives_of,
+    every_planner,
+    planner_figures,
+    safe_threshold,
+    write_planner_figure,
+)
 
 EXAMPLE = """\
 examples:
@@ -48,21 +61,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    import numpy as np
-
-    from worldstate.ground.checks import in_range
-    from worldstate_lab.planner.encounters import FROM_STANDING, EgoVehicle
-    from worldstate_lab.planner.planner_exam import (
-        THRESHOLDS,
-        approaches_drawn,
-        draw_corners,
-        drives_of,
-        every_planner,
-        planner_figures,
-        safe_threshold,
-        write_planner_figure,
-    )
-
     check_outputs(arguments, "report", figures=("figure",))
     count = int(in_range("--count", arguments.count, 10, 100_000))
     ego, rng = (
@@ -93,12 +91,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     return CommandResult(report, table={}, lines=lines)
 
 
-def _believed(arguments: argparse.Namespace, paths: list[Path]) -> "list[BelievedStream]":
-    from functools import partial
-
-    from worldstate.adapters.files.model_file import read_model
-    from worldstate.adapters.parallel import in_processes
-    from worldstate_lab.planner.encounters import believed_stream
+def _believed(arguments: argparse.Namespace, paths: list[Path]) -> list[BelievedStream]:
 
     follow = partial(believed_stream, model=read_model(arguments.model), cache=arguments.cache)
     found = []

@@ -16,19 +16,72 @@ and without one, by level and by the shape of the spectrum alone, and the range 
 """
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from worldstate.adapters.datasets.feature_extraction import read_windows
+from worldstate.adapters.datasets.feature_table import read_features
+from worldstate.adapters.datasets.sample_windows import sample_windows
 from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.feature_options import add_group
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.ground.checks import in_range
+from worldstate.operations.figure_style import figure_file, legend_beside
+from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData, reach_of_array, reach_on_table
+from worldstate_lab.signatures.fisher_profile import BandProfile, band_profile
 
 if TYPE_CHECKING:
-    from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData
-    from worldstate_lab.signatures.fisher_profile import BandProfile
+    from matplotlib.axes import Axes
+
+
+def write_identifiability_figure(
+    path: Path, array: ReachOfArray, data: ReachOnData | None, bands: BandProfile | None
+) -> None:
+    """Draw one panel for each part that was asked for, and write them by the ending of `path`."""
+    panels = 1 + (data is not None) + (bands is not None)
+    with figure_file(path, 5.2 * panels, 3.4) as figure:
+        axes = iter(np.atleast_1d(figure.subplots(1, panels)))
+        _draw_array(next(axes), array)
+        if data is not None:
+            _draw_data(next(axes), data)
+        if bands is not None:
+            _draw_bands(next(axes), bands)
+
+
+def _draw_array(axes: "Axes", array: ReachOfArray) -> None:
+    azimuth_deg = np.degrees(array.azimuths_rad)
+    for label, std_rad in (("sound alone", array.std_rad), ("with camera", array.with_vision_rad)):
+        known = np.isfinite(std_rad)
+        axes.semilogy(azimuth_deg[known], np.degrees(std_rad[known]), marker="o", label=label)
+    axes.set(xlabel="azimuth, left positive (deg)", ylabel="smallest std of a bearing (deg)")
+    legend_beside(axes)
+
+
+def _draw_data(axes: "Axes", data: ReachOnData) -> None:
+    values = {
+        "classifier's error": data.error,
+        "bound on any error": data.sharp_fano,
+        "information / entropy, at most": data.information_high / data.entropy_bits,
+        "information / entropy, at least": data.information_lower / data.entropy_bits,
+    }
+    axes.barh(list(values), list(values.values()))
+    axes.set(xlim=(0.0, 1.0), xlabel=f"share ({data.windows} windows, {data.states} classes)")
+
+
+def _draw_bands(axes: "Axes", bands: BandProfile) -> None:
+    axes.stairs(bands.by_level, bands.edges_hz, label="level")
+    axes.stairs(bands.by_shape, bands.edges_hz, label="shape", linewidth=2.0)
+    axes.axvspan(*bands.range_hz, color="grey", alpha=0.15, lw=0)
+    axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio, vehicle against none")
+    legend_beside(axes)
+
 
 # Both ways to endfire of an array across the vehicle, where the bound diverges.
 AZIMUTHS_DEG = tuple(range(-90, 91, 15))
@@ -58,10 +111,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from dataclasses import asdict
-
-    from worldstate_lab.paper.identifiability_figure import write_identifiability_figure
-
     check_outputs(arguments, figures=("figure",))
     array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
     if arguments.figure is not None:
@@ -71,12 +120,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     return CommandResult(report, table={}, lines=_lines(array, data, bands))
 
 
-def _array(arguments: argparse.Namespace) -> "ReachOfArray":
-    import numpy as np
-
-    from worldstate.frontend.array.microphone_array import roof_array_56
-    from worldstate.ground.checks import in_range
-    from worldstate_lab.paper.identifiability import reach_of_array
+def _array(arguments: argparse.Namespace) -> ReachOfArray:
 
     array = given_array(arguments) or roof_array_56()
     low, high = arguments.band
@@ -91,26 +135,17 @@ def _array(arguments: argparse.Namespace) -> "ReachOfArray":
     )
 
 
-def _data(arguments: argparse.Namespace) -> "ReachOnData | None":
+def _data(arguments: argparse.Namespace) -> ReachOnData | None:
     if arguments.features is None:
         return None
-    import numpy as np
-
-    from worldstate.adapters.datasets.feature_table import read_features
-    from worldstate_lab.paper.identifiability import reach_on_table
 
     table = read_features(arguments.features).group(arguments.group)
     return reach_on_table(table, arguments.method, np.random.default_rng(arguments.seed))
 
 
-def _bands(arguments: argparse.Namespace) -> "BandProfile | None":
+def _bands(arguments: argparse.Namespace) -> BandProfile | None:
     if arguments.recordings is None:
         return None
-    import numpy as np
-
-    from worldstate.adapters.datasets.feature_extraction import read_windows
-    from worldstate.adapters.datasets.sample_windows import sample_windows
-    from worldstate_lab.signatures.fisher_profile import band_profile
 
     windows = sample_windows(arguments.recordings)[0]
     vehicle = np.array([window.label != "none" for window in windows], dtype=bool)
@@ -119,8 +154,6 @@ def _bands(arguments: argparse.Namespace) -> "BandProfile | None":
 
 def _plain(value: object) -> object:
     """Return arrays as lists; what is not finite, a bound that says nothing, is None."""
-    import numpy as np
-
     if isinstance(value, dict):
         return {name: _plain(one) for name, one in value.items()}
     if isinstance(value, np.ndarray):
@@ -128,11 +161,7 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _lines(array: "ReachOfArray", data: "ReachOnData | None", bands: "BandProfile | None") -> list[str]:
-
-    from dataclasses import asdict
-
-    import numpy as np
+def _lines(array: ReachOfArray, data: ReachOnData | None, bands: BandProfile | None) -> list[str]:
 
     lines = [f"{'azimuth':>8} {'std, deg':>10} {'with camera':>12} {'share':>7}"]
     columns = np.degrees(array.azimuths_rad), np.degrees(array.std_rad), np.degrees(array.with_vision_rad)

@@ -9,11 +9,16 @@ The streams must be of other seeds, and for an honest figure of other junctions,
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
 
+from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.parallel import in_processes
 from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
+from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
+from worldstate_lab.passes.pass_outcomes import pass_figures
 
 EXAMPLE = """\
 examples:
@@ -39,13 +44,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from functools import partial
-
-    from worldstate.adapters.files.model_file import read_model
-    from worldstate.adapters.parallel import in_processes
-    from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
-    from worldstate_lab.passes.pass_outcomes import pass_figures
-
     check_outputs(arguments, "report")
     model = read_model(arguments.model)
     given = {"camera": arguments.camera, "seed": arguments.seed, "learns": arguments.sides}

@@ -28,18 +28,24 @@ With --model a finished model is evaluated instead; it is refused where it was t
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, read_ids
+from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.feature_options import add_table_options, read_beside
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
-
-if TYPE_CHECKING:
-    from worldstate.adapters.datasets.feature_table import FeatureTable
-    from worldstate_lab.features.feature_evaluation import Predictions
-    from worldstate_lab.features.methods import Passes
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate_lab.features.comparison import comparison, row_predictions, run_passes
+from worldstate_lab.features.feature_evaluation import Predictions
+from worldstate_lab.features.feature_report import report, write_predictions
+from worldstate_lab.features.held_out import predict_held_out
+from worldstate_lab.features.methods import ROWS, Passes, row_of, rows_beside
 
 Figures = dict[str, Any]
 # What fits a line of the table; the JSON object has the gains of all figures.
@@ -69,9 +75,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.datasets.feature_table import read_features, read_ids
-    from worldstate_lab.features.feature_report import write_predictions
-
     check_outputs(arguments, "predictions")
     whole = read_features(arguments.table)
     table = whole.group(arguments.group)
@@ -85,11 +88,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _evaluate_method(
-    arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
-) -> tuple[Figures, "list[Predictions]"]:
-    from worldstate_lab.features.comparison import comparison, row_predictions
-    from worldstate_lab.features.feature_report import report
-    from worldstate_lab.features.methods import row_of
+    arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
+) -> tuple[Figures, list[Predictions]]:
 
     row = row_of(arguments.method, arguments.protocol, arguments.reference)
     passes = _passes(arguments, whole, table, row)
@@ -100,13 +100,9 @@ def _evaluate_method(
 
 
 def _passes(
-    arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable", row: str
-) -> "dict[str, Passes]":
+    arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable, row: str
+) -> dict[str, Passes]:
     """Run every seed of the method and of those that it is compared with."""
-    from worldstate.ground.checks import in_range
-    from worldstate_lab.features.comparison import run_passes
-    from worldstate_lab.features.methods import ROWS, rows_beside
-
     in_range("--seeds", arguments.seeds, 1, 10_000)
     in_range("--jobs", arguments.jobs, 1, 256)
     afar = arguments.protocol == "transfer"
@@ -127,13 +123,8 @@ def _passes(
 
 
 def _evaluate_model(
-    arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
-) -> tuple[Figures, "list[Predictions]"]:
-    import numpy as np
-
-    from worldstate.adapters.files.model_file import read_model
-    from worldstate_lab.features.feature_report import report
-    from worldstate_lab.features.held_out import predict_held_out
+    arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
+) -> tuple[Figures, list[Predictions]]:
 
     predictions = predict_held_out(
         read_model(arguments.model), table, arguments.alpha, arguments.reference, np.random.default_rng(0)
@@ -142,8 +133,7 @@ def _evaluate_model(
     return figures, [predictions[1.0]]
 
 
-def _standing(whole: "FeatureTable", arguments: argparse.Namespace) -> "FeatureTable":
-    from worldstate.ground.errors import InvalidArgumentError
+def _standing(whole: FeatureTable, arguments: argparse.Namespace) -> FeatureTable:
 
     if arguments.group != "dynamic":
         raise InvalidArgumentError("--protocol transfer: expected --group dynamic, static is learned from")
