@@ -10,12 +10,13 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 from sklearn.feature_selection import mutual_info_classif
 from sklearn.linear_model import LogisticRegression
-from worldstate_lab.paper.identifiability import reach_of_array, reach_on_data
-from worldstate_lab.paper.information import (
+from worldstate_lab.paper.identifiability import (
     entropy_bits,
     fano_bound,
     information_from_posteriors,
     nearest_neighbour_information_bits,
+    reach_of_array,
+    reach_on_data,
     sharp_fano_bound,
 )
 

@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 from released_data import FOLDER, TABLE, needs_released_windows
-from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate
-from worldstate_lab.features.feature_report import report
-from worldstate_lab.features.held_out import check_unseen, predict_held_out
+from worldstate_lab.features.comparison import report
+from worldstate_lab.features.feature_evaluation import (
+    WindowMethod,
+    check_unseen,
+    cross_validate,
+    predict_held_out,
+)
 from worldstate_lab.features.published_classifier import PublishedClassifier
 
 from worldstate.adapters.datasets.feature_table import read_features, read_ids

@@ -8,9 +8,8 @@ import pytest
 from released_data import FOLDER, needs_released_windows
 from released_data import TABLE as NAME
 from worldstate_lab.cli.main import main
-from worldstate_lab.features.comparison import comparison, run_passes
-from worldstate_lab.features.feature_report import report
-from worldstate_lab.features.held_out import predict_held_out
+from worldstate_lab.features.comparison import comparison, report, run_passes
+from worldstate_lab.features.feature_evaluation import predict_held_out
 from worldstate_lab.features.methods import row_of
 
 from worldstate.adapters.datasets.feature_table import read_features, read_ids

@@ -10,8 +10,7 @@ import scipy.signal
 from released_data import FOLDER, TABLE, needs_released_windows
 from worldstate_lab.cli import realism as command
 from worldstate_lab.cli.main import main
-from worldstate_lab.streets.realism import Realism, measure_realism
-from worldstate_lab.streets.realism_rows import halves
+from worldstate_lab.streets.realism import Realism, halves, measure_realism
 from worldstate_lab.streets.set_classifiers import (
     measure_areas,
     odd_profiles,

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worldstate_lab.cli.main import main
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, signature, signature_edges_hz
-from worldstate_lab.signatures.separability import (
+from worldstate_lab.signatures.signature_study import (
     area,
     balanced_accuracy,
     held_out,
     interval,
     scores_of,
+    signature_study,
     transferred,
 )
-from worldstate_lab.signatures.signature_study import signature_study
 from worldstate_lab.signatures.simulated_corpora import (
     CITY_STREET,
     RATE_HZ,

@@ -4,11 +4,11 @@ from .degradation.degradation_study import DegradationSettings as DegradationSet
 from .degradation.degradation_study import degradation_study as degradation_study
 from .features.comparison import comparison as comparison
 from .features.published_classifier import PublishedClassifier as PublishedClassifier
+from .paper.identifiability import fano_bound as fano_bound
+from .paper.identifiability import information_from_posteriors as information_from_posteriors
+from .paper.identifiability import nearest_neighbour_information_bits as nearest_neighbour_information_bits
 from .paper.identifiability import reach_of_array as reach_of_array
 from .paper.identifiability import reach_on_data as reach_on_data
-from .paper.information import fano_bound as fano_bound
-from .paper.information import information_from_posteriors as information_from_posteriors
-from .paper.information import nearest_neighbour_information_bits as nearest_neighbour_information_bits
-from .paper.information import sharp_fano_bound as sharp_fano_bound
+from .paper.identifiability import sharp_fano_bound as sharp_fano_bound
 from .signatures.fisher_profile import fisher_profile as fisher_profile
 from .streets.realism import measure_realism as measure_realism

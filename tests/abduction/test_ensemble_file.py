@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worldstate_lab.features.held_out import predict_held_out
+from worldstate_lab.features.feature_evaluation import predict_held_out
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.adapters.datasets.feature_table import FeatureTable

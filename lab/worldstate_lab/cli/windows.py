@@ -41,10 +41,14 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate_lab.features.comparison import comparison, row_predictions, run_passes
-from worldstate_lab.features.feature_evaluation import Predictions
-from worldstate_lab.features.feature_report import report, write_predictions
-from worldstate_lab.features.held_out import predict_held_out
+from worldstate_lab.features.comparison import (
+    comparison,
+    report,
+    row_predictions,
+    run_passes,
+    write_predictions,
+)
+from worldstate_lab.features.feature_evaluation import Predictions, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, row_of, rows_beside
 
 Figures = dict[str, Any]

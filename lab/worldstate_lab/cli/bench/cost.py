@@ -30,8 +30,7 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Complex64Array, Float32Array
-from worldstate_lab.benchmarks.cost_of_evidence import evidence_times
-from worldstate_lab.benchmarks.cost_of_peers import peer_times
+from worldstate_lab.benchmarks.cost_of_evidence import evidence_times, peer_times
 from worldstate_lab.benchmarks.cost_of_stages import (
     AZIMUTHS_RAD,
     GOAL,
