@@ -40,6 +40,8 @@ from worldstate.operations.recordings.stream_statistic import (
 )
 from worldstate_lab.metrics.intervals import deal_folds
 
+LOOMING_WEIGHTS = (0.0, 0.1, 0.2, 0.4, 0.8)
+
 
 @dataclass(frozen=True, slots=True)
 class AblationSwitches:
@@ -56,8 +58,6 @@ class AblationSwitches:
         ``(0.0,)`` leaves looming out.
     alpha, sustain_hops : float, int
         Budget and sustained rule.
-    folds : int
-        Recording-level folds.
 
     Raises
     ------
@@ -75,13 +75,11 @@ class AblationSwitches:
     approach_weights: tuple[float, ...] = (0.0,)
     alpha: float = 0.02
     sustain_hops: int = 3
-    folds: int = 5
 
     def __post_init__(self) -> None:
         if not self.approach_weights:
             raise InvalidArgumentError("approach_weights: expected at least one")
         in_range("alpha", self.alpha, 0.0, 1.0, open_high=True)
-        in_range("folds", self.folds, 2, 1000)
 
     def statistic_with(self, weight: float) -> StatisticSwitches:
         """Return the switches of the statistic at one weight of looming."""
@@ -166,13 +164,12 @@ def evaluate_ablation(
     """
     chosen = switches or AblationSwitches()
     sites = [str(stream.about.get("site", "")) for stream in streams]
-    folds = deal_folds([stream.label for stream in streams], sites, rng, chosen.folds)
+    folds = deal_folds([stream.label for stream in streams], sites, rng)
     scored: list[_Scored] = []
     for fold in np.unique(folds):
-        learned = _Learned(
-            [streams[i] for i in np.flatnonzero(folds != fold).tolist()], reference_prior, chosen
-        )
-        scored += [learned.score(streams[i]) for i in np.flatnonzero(folds == fold).tolist()]
+        others = [one for one, its in zip(streams, folds, strict=True) if its != fold]
+        learned = _Learned(others, reference_prior, chosen)
+        scored += [learned.score(one) for one, its in zip(streams, folds, strict=True) if its == fold]
     return _row(scored, rng)
 
 
@@ -181,7 +178,6 @@ def ablation_table(
     reference_prior: Sequence[float],
     seed: int,
     switches: AblationSwitches | None = None,
-    approach_weights: tuple[float, ...] = (0.0, 0.1, 0.2, 0.4, 0.8),
 ) -> dict[str, AblationRow]:
     """Evaluate everything on, each part off, and looming added; the folds are the same in every row."""
     base = switches or AblationSwitches()
@@ -189,7 +185,7 @@ def ablation_table(
         "full": base,
         "signature_only": replace(base, use_absence=False),
         "raw_risk": replace(base, calibrated=False),
-        "with_looming": replace(base, approach_weights=approach_weights),
+        "with_looming": replace(base, approach_weights=LOOMING_WEIGHTS),
     }
     return {
         name: evaluate_ablation(streams, reference_prior, np.random.default_rng(seed), row)
@@ -250,12 +246,11 @@ def _windows(calm: Sequence[FloatArray], hazards: Sequence[FloatArray]) -> tuple
 def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
     free = [one for one in scored if one.stream.hazard_free]
     approaches = [one for one in scored if one.stream.before_sight().any()]
-    before = [one.stream.before_sight() for one in approaches]
     statistic, hazards = _windows(
-        [one.statistic for one in free], [one.statistic[b] for one, b in zip(approaches, before, strict=True)]
+        [one.statistic for one in free], [one.statistic[one.stream.before_sight()] for one in approaches]
     )
     risk, _ = _windows(
-        [one.risk for one in free], [one.risk[b] for one, b in zip(approaches, before, strict=True)]
+        [one.risk for one in free], [one.risk[one.stream.before_sight()] for one in approaches]
     )
     found = ApproachTable(
         [alarm_outcome(one.stream.time_s, one.alarm, one.stream.t0_s) for one in approaches],
@@ -271,16 +266,14 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
         ece=expected_calibration_error(risk, hazards) if both else None,
         ece_floor=calibration_error_sampling(risk, rng)[0] if both else None,
         brier=brier_score(risk, hazards) if both else None,
-        awareness=_share_in_sight(approaches, [one.aware for one in approaches]),
-        vision_only=_share_in_sight(approaches, [one.stream.seen for one in approaches]),
+        awareness=_share([one.aware[one.stream.after_sight()] for one in approaches]),
+        vision_only=_share([one.stream.seen[one.stream.after_sight()] for one in approaches]),
         approach_weight=float(np.mean([one.weight for one in scored])),
     )
 
 
-def _share_in_sight(scored: Sequence[_Scored], flags: Sequence[BoolArray]) -> float | None:
-    """Return the share of hops after T0, the vehicle in view, in which a flag holds."""
-    after = [flag[one.stream.after_sight()] for one, flag in zip(scored, flags, strict=True)]
-    hops = np.concatenate(after) if after else np.empty(0)
+def _share(flags: Sequence[BoolArray]) -> float | None:
+    hops = np.concatenate(flags) if flags else np.empty(0)
     return float(hops.mean()) if hops.size else None
 
 

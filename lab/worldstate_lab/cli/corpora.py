@@ -33,8 +33,9 @@ from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
-from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, RED, figure_file, legend_beside
+from worldstate.operations.figure_style import BLUE, ORANGE, RED, figure_file, legend_beside
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, hear_clips
+from worldstate_lab.signatures.fisher_profile import draw_band_profile
 from worldstate_lab.signatures.signature_study import (
     IDMT,
     MELAUDIS,
@@ -48,8 +49,6 @@ from worldstate_lab.signatures.simulated_corpora import STREETS, simulated_corpo
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from worldstate_lab.signatures.fisher_profile import BandProfile
 
 
 CHANCE = 0.5  # Of both figures: a row whose interval holds it has separated nothing
@@ -97,7 +96,7 @@ def write_signature_figure(path: Path, study: SignatureStudy) -> None:
         axes = iter(np.atleast_1d(figure.subplots(len(heights), 1, height_ratios=heights)))
         _draw_bars(next(axes), bars)
         if study.profile is not None:
-            _draw_profile(next(axes), study.profile)
+            draw_band_profile(next(axes), study.profile, PAPER_RANGE_HZ)
 
 
 def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
@@ -114,19 +113,6 @@ def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
     axes.axvline(CHANCE, color="grey", linewidth=0.8, linestyle=":", label="chance")
     axes.set(xlim=(0.0, 1.03), xlabel="AUROC; balanced accuracy where the bar is orange")
     axes.margins(y=0.01)
-    legend_beside(axes)
-
-
-def _draw_profile(axes: "Axes", profile: "BandProfile") -> None:
-    axes.axvspan(*PAPER_RANGE_HZ, color=RED, alpha=0.12, linewidth=0, label="paper's range")
-    axes.stairs(profile.by_level, profile.edges_hz, label="level", baseline=None)
-    axes.stairs(profile.by_shape, profile.edges_hz, label="shape", baseline=None, color=GREEN)
-    axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio,\nvehicle against none")
-    # Decades alone would leave a span of two of them with three labels.
-    axes.set_xlim(profile.edges_hz[0], profile.edges_hz[-1])
-    axes.set_xticks([50, 100, 300, 1000, 1800, 4000, 8000], ["50", "100", "300", "1k", "1.8k", "4k", "8k"])
-    axes.minorticks_off()
-    axes.set_ylim(bottom=0.0)
     legend_beside(axes)
 
 

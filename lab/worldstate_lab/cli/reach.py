@@ -35,7 +35,8 @@ from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.checks import in_range
 from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData, reach_of_array, reach_on_table
-from worldstate_lab.signatures.fisher_profile import BandProfile, band_profile
+from worldstate_lab.report.table import plain
+from worldstate_lab.signatures.fisher_profile import BandProfile, band_profile, draw_band_profile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +53,7 @@ def write_identifiability_figure(
         if data is not None:
             _draw_data(next(axes), data)
         if bands is not None:
-            _draw_bands(next(axes), bands)
+            draw_band_profile(next(axes), bands, bands.range_hz)
 
 
 def _draw_array(axes: "Axes", array: ReachOfArray) -> None:
@@ -73,14 +74,6 @@ def _draw_data(axes: "Axes", data: ReachOnData) -> None:
     }
     axes.barh(list(values), list(values.values()))
     axes.set(xlim=(0.0, 1.0), xlabel=f"share ({data.windows} windows, {data.states} classes)")
-
-
-def _draw_bands(axes: "Axes", bands: BandProfile) -> None:
-    axes.stairs(bands.by_level, bands.edges_hz, label="level")
-    axes.stairs(bands.by_shape, bands.edges_hz, label="shape", linewidth=2.0)
-    axes.axvspan(*bands.range_hz, color="grey", alpha=0.15, lw=0)
-    axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio, vehicle against none")
-    legend_beside(axes)
 
 
 # Both ways to endfire of an array across the vehicle, where the bound diverges.
@@ -116,12 +109,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if arguments.figure is not None:
         write_identifiability_figure(arguments.figure, array, data, bands)
     found = {"array": array, "features": data, "bands": bands}
-    report = {name: _plain(asdict(one)) for name, one in found.items() if one is not None}
+    report = {name: plain(one) for name, one in found.items() if one is not None}
     return CommandResult(report, table={}, lines=_lines(array, data, bands))
 
 
 def _array(arguments: argparse.Namespace) -> ReachOfArray:
-
     array = given_array(arguments) or roof_array_56()
     low, high = arguments.band
     in_range("--band", low, 1.0, high)
@@ -138,7 +130,6 @@ def _array(arguments: argparse.Namespace) -> ReachOfArray:
 def _data(arguments: argparse.Namespace) -> ReachOnData | None:
     if arguments.features is None:
         return None
-
     table = read_features(arguments.features).group(arguments.group)
     return reach_on_table(table, arguments.method, np.random.default_rng(arguments.seed))
 
@@ -146,23 +137,12 @@ def _data(arguments: argparse.Namespace) -> ReachOnData | None:
 def _bands(arguments: argparse.Namespace) -> BandProfile | None:
     if arguments.recordings is None:
         return None
-
     windows = sample_windows(arguments.recordings)[0]
     vehicle = np.array([window.label != "none" for window in windows], dtype=bool)
     return band_profile(track(read_windows(windows), "reading", len(windows)), vehicle)
 
 
-def _plain(value: object) -> object:
-    """Return arrays as lists; what is not finite, a bound that says nothing, is None."""
-    if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
-    if isinstance(value, np.ndarray):
-        return [_plain(one) for one in value.tolist()]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def _lines(array: ReachOfArray, data: ReachOnData | None, bands: BandProfile | None) -> list[str]:
-
     lines = [f"{'azimuth':>8} {'std, deg':>10} {'with camera':>12} {'share':>7}"]
     columns = np.degrees(array.azimuths_rad), np.degrees(array.std_rad), np.degrees(array.with_vision_rad)
     for azimuth, std, both, share in zip(*columns, array.endfire, strict=True):

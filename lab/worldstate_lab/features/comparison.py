@@ -30,32 +30,48 @@ from .methods import ROWS, Passes, methods
 # The floor belongs to the risks: another seed in every run would only add noise to it.
 FLOOR_SEED = 0
 Figures = dict[str, float | None]
+DEVIATING = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "fpr", "ece")
 POSTERIORS = tuple(f"p_{label}" for label in CLASSES)
 COLUMNS = ("seed", "fold", "recording", "environment", "class", *POSTERIORS, "score", "risk", "decision")
 
 
 def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
     """Return the figures of one pass over the table."""
-    # Hazard windows against hazard-free ones; `front` counts in the 4-class accuracy only.
     scored = table.hazards | table.hazard_free
-    hazards, score, risk = table.hazards[scored], predictions.score[scored], predictions.risk[scored]
-    floor, floor_std = calibration_error_sampling(risk, np.random.default_rng(FLOOR_SEED))
-    by_group = auroc_by_group(score, hazards, table.environments[scored])
+    hazards, score = table.hazards[scored], predictions.score[scored]
+    floor = calibration_error_sampling(predictions.risk[scored], np.random.default_rng(FLOOR_SEED))
     return {
-        "accuracy": float(np.mean(predictions.classes == table.labels)),
-        "auroc_macro": macro(by_group),
-        "auroc_pooled": auroc(score, hazards),
-        "worst_group_auroc": min(by_group.values()),
-        "tpr": rate(predictions.decision, table.hazards),
-        "fpr": rate(predictions.decision, table.hazard_free),
-        "worst_group_fpr": worst_rate(predictions.decision, table.hazard_free, table.environments),
+        **_figures_on(table, predictions)(np.arange(len(table))),
         "ece_raw": expected_calibration_error(score, hazards),
-        "ece": expected_calibration_error(risk, hazards),
-        "ece_floor": floor,
-        "ece_floor_std": floor_std,
+        "ece_floor": floor[0],
+        "ece_floor_std": floor[1],
         "brier_raw": brier_score(score, hazards),
-        "brier": brier_score(risk, hazards),
     }
+
+
+def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray], Figures]:
+    """Return what forms the figures of some rows: hazard windows against hazard-free ones."""
+    # `front` counts in the 4-class accuracy only.
+    hazards, hazard_free, correct = table.hazards, table.hazard_free, one.classes == table.labels
+    sites = np.unique(table.environments, return_inverse=True)[1]
+
+    def figures(rows: IndexArray) -> Figures:
+        scored = rows[(hazards | hazard_free)[rows]]
+        labels, score, risk = (values[scored] for values in (hazards, one.score, one.risk))
+        by_site, decision = auroc_by_group(score, labels, sites[scored]), one.decision[rows]
+        return {
+            "accuracy": float(correct[rows].mean()),
+            "auroc_macro": macro(by_site),
+            "auroc_pooled": auroc(score, labels),
+            "worst_group_auroc": min(by_site.values()),
+            "tpr": rate(decision, hazards[rows]),
+            "fpr": rate(decision, hazard_free[rows]),
+            "worst_group_fpr": worst_rate(decision, hazard_free[rows], sites[rows]),
+            "ece": expected_calibration_error(risk, labels),
+            "brier": brier_score(risk, labels),
+        }
+
+    return figures
 
 
 def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArray) -> Figures:
@@ -72,11 +88,13 @@ def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArra
 def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> dict[str, Any]:
     """Return the mean figures over all passes (seeds), with their standard deviation between seeds."""
     published, absent = ([one[beta] for one in passes] for beta in (1.0, 0.0))
-    figures = [window_figures(table, predictions) for predictions in published]
+    figures, others = ([window_figures(table, one) for one in some] for some in (published, absent))
+    # The posteriors, and so the classes, are the same.
+    means = {f"{key}_absent": value for key, value in mean_figures(others).items() if key != "accuracy"}
     return {
         **mean_figures(figures),
-        **{f"{key}_absent": value for key, value in _absent_figures(table, absent).items()},
-        "seed_std": _deviations(figures, ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "fpr", "ece")),
+        **means,
+        "seed_std": {key: np.std(np.array([one[key] for one in figures], float)).item() for key in DEVIATING},
         **count_windows(table),
         "per_group": report_groups(table, published),
     }
@@ -90,10 +108,6 @@ def count_windows(table: FeatureTable) -> dict[str, int]:
         "n_hazard_free": int(table.hazard_free.sum()),
         "n_recordings": len(np.unique(table.recording_keys)),
     }
-
-
-def _deviations(figures: Sequence[Figures], keys: tuple[str, ...]) -> Figures:
-    return {key: float(np.std([figure[key] for figure in figures])) for key in keys}  # type: ignore[arg-type]
 
 
 def mean_figures(figures: Sequence[Figures]) -> Figures:
@@ -118,28 +132,11 @@ def write_predictions(
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
-        for seed, predictions in zip(seeds, passes, strict=True):
-            writer.writerows([seed, *row] for row in _prediction_rows(table, predictions))
-
-
-def _prediction_rows(table: FeatureTable, predictions: Predictions) -> list[tuple[object, ...]]:
-    columns = (
-        predictions.folds,
-        table.recordings,
-        table.environments,
-        table.labels,
-        *predictions.probabilities.T,
-        predictions.score,
-        predictions.risk,
-        predictions.decision.astype(int),
-    )
-    return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _absent_figures(table: FeatureTable, passes: Sequence[Predictions]) -> Figures:
-    figures = mean_figures([window_figures(table, predictions) for predictions in passes])
-    del figures["accuracy"]  # The posteriors, and so the classes, are the same.
-    return figures
+        for seed, one in zip(seeds, passes, strict=True):
+            about = one.folds, table.recordings, table.environments, table.labels
+            told = *one.probabilities.T, one.score, one.risk, one.decision.astype(int)
+            rows = zip(*(column.tolist() for column in (*about, *told)), strict=True)
+            writer.writerows([seed, *row] for row in rows)
 
 
 def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[str, Figures]:
@@ -154,17 +151,6 @@ def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[st
 
 # The same samples for every method and run: the differences between methods are paired.
 BOOTSTRAP_SEED = 0
-FIGURES = (
-    "accuracy",
-    "auroc_macro",
-    "auroc_pooled",
-    "worst_group_auroc",
-    "tpr",
-    "fpr",
-    "worst_group_fpr",
-    "ece",
-    "brier",
-)
 
 
 def run_passes(
@@ -285,31 +271,6 @@ def draw_figures(
     """Return the figures on every bootstrap sample of recordings, mean over the passes (seeds)."""
     # The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
     measures = [_figures_on(table, one) for one in passes]
-    figures = np.array([[measure(rows) for rows in samples] for measure in measures]).mean(axis=0)
-    return dict(zip(FIGURES, figures.T, strict=True))
-
-
-def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray], list[float]]:
-    """Return what forms one number for each of `FIGURES` from some rows."""
-    hazards, hazard_free, correct = table.hazards, table.hazard_free, one.classes == table.labels
-    sites = np.unique(table.environments, return_inverse=True)[1]
-
-    def figures(rows: IndexArray) -> list[float]:
-        scored = rows[(hazards | hazard_free)[rows]]
-        labels, score, risk, there = (values[scored] for values in (hazards, one.score, one.risk, sites))
-        areas = [auroc(score[there == site], labels[there == site]) for site in np.unique(there)]
-        known = [area for area in areas if area is not None]
-        decision = one.decision[rows]
-        return [
-            float(correct[rows].mean()),
-            float(np.mean(known)),
-            auroc(score, labels) or 0.0,
-            min(known),
-            float(decision[hazards[rows]].mean()),
-            float(decision[hazard_free[rows]].mean()),
-            worst_rate(decision, hazard_free[rows], sites[rows]),
-            expected_calibration_error(risk, labels),
-            brier_score(risk, labels),
-        ]
-
-    return figures
+    found = [[measure(rows) for rows in samples] for measure in measures]
+    draws = {name: [[one[name] for one in mine] for mine in found] for name in found[0][0]}
+    return {name: np.array(values, float).mean(axis=0) for name, values in draws.items()}

@@ -6,6 +6,7 @@ at a time.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,10 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
+from worldstate.operations.figure_style import GREEN, RED, legend_beside
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +45,22 @@ def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArr
     if edges_hz is None:
         raise InvalidArgumentError("windows: expected at least two with a vehicle and two without")
     return profile_of(np.array(rows), vehicle, edges_hz)
+
+
+def draw_band_profile(axes: "Axes", profile: BandProfile, shaded_hz: tuple[float, float]) -> None:
+    """Draw the ratios of a profile over its bands, a range shaded: that of the shape, or the paper's."""
+    axes.axvspan(
+        *shaded_hz, color=RED, alpha=0.12, linewidth=0, label=f"{shaded_hz[0]:.0f}-{shaded_hz[1]:.0f} Hz"
+    )
+    axes.stairs(profile.by_level, profile.edges_hz, label="level", baseline=None)
+    axes.stairs(profile.by_shape, profile.edges_hz, label="shape", baseline=None, color=GREEN)
+    axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio,\nvehicle against none")
+    # Decades alone would leave a span of two of them with three labels.
+    axes.set_xlim(profile.edges_hz[0], profile.edges_hz[-1])
+    axes.set_xticks([50, 100, 300, 1000, 1800, 4000, 8000], ["50", "100", "300", "1k", "1.8k", "4k", "8k"])
+    axes.minorticks_off()
+    axes.set_ylim(bottom=0.0)
+    legend_beside(axes)
 
 
 def profile_of(energy: FloatArray, vehicle: BoolArray, edges_hz: FloatArray) -> BandProfile:
