@@ -12,8 +12,12 @@ from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, SchemaVersionError
 from worldstate.operations.labelling.street_file import read_street, write_street
-from worldstate.operations.labelling.street_passes import looks_at, streets_after, watched_recording
-from worldstate.operations.labelling.street_sound import HeardStreet
+from worldstate.operations.labelling.street_passes import (
+    HeardStreet,
+    looks_at,
+    streets_after,
+    watched_recording,
+)
 from worldstate.smoothing.learned_street import LearnedStreet, context_of
 from worldstate.state.context import Rates
 

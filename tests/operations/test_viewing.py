@@ -8,7 +8,7 @@ from PIL import Image
 from scripted_states import scripted_states
 
 from worldstate.cli.main import main
-from worldstate.operations.viewing.birds_eye import write_animation, write_birds_eye
+from worldstate.operations.viewing.state_figure import write_animation, write_birds_eye
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Measurement
-from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings
+from worldstate.operations.detectors.miss_rate_measurement import MIN_OVERLAP
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S, hop_stream
 from worldstate.operations.recordings.hop_table import HopTable, joined
@@ -159,10 +159,10 @@ def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFi
 
 def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Sequence[int]) -> BoolArray:
     """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
-    least = AbsenceSettings().min_overlap
     detected = _moving_boxes(query.detections, stamps_ns, query.settings.keep) if query.detections else []
     found = [
-        (overlaps(there, boxes) >= least).any() for there, boxes in zip(reference, detected, strict=True)
+        (overlaps(there, boxes) >= MIN_OVERLAP).any()
+        for there, boxes in zip(reference, detected, strict=True)
     ]
     return np.array(found, dtype=bool)
 

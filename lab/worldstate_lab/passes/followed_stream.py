@@ -28,8 +28,7 @@ from worldstate.core.filter import WorldFilter
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, CoEvidenceChannel, Measurement
-from worldstate.operations.labelling.street_passes import WatchedRecording, watched_recording
-from worldstate.operations.labelling.street_sound import HeardStreet
+from worldstate.operations.labelling.street_passes import HeardStreet, WatchedRecording, watched_recording
 from worldstate.state import Entity, WorldState
 from worldstate.state.context import Context
 

@@ -50,8 +50,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.cli.common.progress import progress_bar
     from worldstate.ground.errors import InvalidArgumentError
     from worldstate.ground.values import nanoseconds, seconds
-    from worldstate.operations.viewing.birds_eye import check_gif, write_animation, write_birds_eye
-    from worldstate.operations.viewing.state_figure import write_state_figure
+    from worldstate.operations.viewing.state_figure import (
+        check_gif,
+        write_animation,
+        write_birds_eye,
+        write_state_figure,
+    )
 
     asked = arguments.out, arguments.birds_eye, arguments.animate
     if not any(asked):

@@ -112,8 +112,7 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
 
     from worldstate.adapters.audio.open_sound import as_sound, open_sound
     from worldstate.adapters.files.model_file import read_model
-    from worldstate.operations.labelling.street_passes import watched_recording
-    from worldstate.operations.labelling.street_sound import heard_street
+    from worldstate.operations.labelling.street_passes import heard_street, watched_recording
 
     model = read_model(arguments.model)
     source, detections = camera_source(arguments, as_sound((path,)))

@@ -16,14 +16,18 @@ from worldstate.adapters.camera.video import VIDEO_NAME, Video
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
+from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.measurement.sector import Sector
 from worldstate.operations.figure_style import figure_file, legend_beside
 
 MakeDetector = Callable[[], Detector]
 
-# Sectors that clutter is counted in lie this far apart.
-_SECTOR_STEP_RAD = np.radians(5.0)
+# Inner edges of the bins of azimuth off the optical axis; they run from 0 to the edge of the view.
+_BINS_DEG = (10.0, 20.0, 30.0)
+# IoU from which on a reference box counts as found.
+MIN_OVERLAP = 0.3
+# Half the width of a query sector, in which clutter is counted, and how far apart the sectors lie.
+_HALF_WIDTH_RAD, _SECTOR_STEP_RAD = float(np.radians(10.0)), np.radians(5.0)
 # Clean frames that the scale of health is learned from, spread over the videos.
 _HEALTH_FRAMES = 10
 
@@ -34,14 +38,8 @@ class AbsenceSettings:
 
     Parameters
     ----------
-    bins_deg : tuple of float
-        Inner edges of the bins of azimuth off the optical axis; they run from 0 to the edge of the view.
     families : tuple of str
         What is staged.
-    min_overlap : float
-        IoU from which on a reference box counts as found.
-    half_width_rad : float
-        Half the width of a query sector, in which clutter is counted.
     warm_up : int
         First frames of each video that count for nothing: motion detectors learn the background in them.
     repeats : float
@@ -58,14 +56,11 @@ class AbsenceSettings:
 
     Examples
     --------
-    >>> AbsenceSettings().min_overlap
-    0.3
+    >>> AbsenceSettings().edges_deg(PinholeCamera())[:4]
+    (0.0, 10.0, 20.0, 30.0)
     """
 
-    bins_deg: tuple[float, ...] = (10.0, 20.0, 30.0)
     families: tuple[Family, ...] = FAMILIES
-    min_overlap: float = 0.3
-    half_width_rad: float = float(np.radians(10.0))
     warm_up: int = 10
     repeats: float = 3.0
     moving_only: bool = True
@@ -76,15 +71,13 @@ class AbsenceSettings:
     def __post_init__(self) -> None:
         if not self.families or not set(self.families) <= set(FAMILIES):
             raise InvalidArgumentError(f"families: expected some of {', '.join(FAMILIES)}")
-        in_range("min_overlap", self.min_overlap, 0.0, 1.0, open_low=True)
-        in_range("half_width_rad", self.half_width_rad, 0.0, np.pi / 2, open_low=True)
         in_range("warm_up", self.warm_up, 0, 100_000)
         in_range("repeats", self.repeats, 1.0, 1000.0)
 
     def edges_deg(self, camera: PinholeCamera) -> tuple[float, ...]:
         """Return the bin edges of a camera; the last one lies a degree outside its view."""
         edge = float(np.degrees(np.abs(camera.off_axis(camera.view_rad)).max())) + 1.0
-        return (0.0, *(deg for deg in self.bins_deg if 0.0 < deg < edge - 2.0), edge)
+        return (0.0, *(deg for deg in _BINS_DEG if 0.0 < deg < edge - 2.0), edge)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,12 +155,12 @@ def measure_absence(
         raise InvalidArgumentError("scenes: expected at least one video")
     tally = AbsenceTally(scenes[0].camera, chosen)
     for scene in scenes:
-        looks = [_Look(tally, make_detector(), "all", 0)]
-        for family in chosen.families:
-            looks += [_Look(tally, make_detector(), family, level) for level in range(1, len(LEVELS))]
+        staged = [(family, level) for family in chosen.families for level in range(1, len(LEVELS))]
+        looks = [(make_detector(), *one) for one in (("all", 0), *staged)]
         for number, frame in enumerate(scene.video.frames()):
-            for look in looks:
-                look.take(scene, number, frame, rng)
+            for detector, family, level in looks:
+                found = detector.detect(degrade(frame, family, LEVELS[level], rng))
+                tally.count(scene.reference, number, found, family, level)
             on_frame()
     if not tally.looks:
         raise InputFileError(scenes[0].reference.source, "expected moving objects in view, found none")
@@ -205,12 +198,12 @@ class AbsenceTally:
         families = slice(None) if level == 0 else self._settings.families.index(family)
         there = reference.frames[number]
         boxes = there.boxes_px[_counted(reference, number, self._settings)]
-        hit = overlaps(boxes, found.boxes_px) >= self._settings.min_overlap
+        hit = overlaps(boxes, found.boxes_px) >= MIN_OVERLAP
         bins = self._bins(boxes)
         n_bins = len(self.edges_deg) - 1
         self._looks[families, :, level] += np.bincount(bins, minlength=n_bins)
         self._misses[families, :, level] += np.bincount(bins, ~hit.any(axis=1), n_bins)
-        false = ~(overlaps(found.boxes_px, there.boxes_px) >= self._settings.min_overlap).any(axis=1)
+        false = ~(overlaps(found.boxes_px, there.boxes_px) >= MIN_OVERLAP).any(axis=1)
         false &= ~_inside(found.boxes_px, there.boxes_px)
         sectors, clutter = self._empty_sectors(there.boxes_px, found.boxes_px[false])
         self._sectors[families, level] += sectors
@@ -235,28 +228,13 @@ class AbsenceTally:
         """Count the sectors without a reference object, and those of them that a false detection touches."""
         objects, false = _azimuths(self._camera, there_px), _azimuths(self._camera, false_px)
         right, left = self._camera.view_rad
-        half, sectors, clutter = self._settings.half_width_rad, 0, 0
+        half, sectors, clutter = _HALF_WIDTH_RAD, 0, 0
         for centre in np.arange(right + half, left - half + 1e-9, _SECTOR_STEP_RAD):
             sector = Sector(float(centre), half)
             if not any(sector.touches(azimuth, width) for azimuth, width in objects):
                 sectors += 1
                 clutter += any(sector.touches(azimuth, width) for azimuth, width in false)
         return sectors, clutter
-
-
-@dataclass(frozen=True, slots=True)
-class _Look:
-    """One detector on the frames of a video at one level of one family."""
-
-    tally: AbsenceTally
-    detector: Detector
-    family: Family
-    level: int
-
-    def take(self, scene: LabelledVideo, number: int, frame: ImageArray, rng: np.random.Generator) -> None:
-        """Degrade a frame, look at it and count."""
-        found = self.detector.detect(degrade(frame, self.family, LEVELS[self.level], rng))
-        self.tally.count(scene.reference, number, found, self.family, self.level)
 
 
 def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> IntArray:
