@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -16,11 +15,6 @@ from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, W
 from worldstate.ground.serialisation import ADDED, FLAT, Keys, Layout, Probability, decode, encode
 from worldstate.ground.typing import FloatArray, IntArray
 from worldstate.ground.values import NotUsable
-
-
-class Light(StrEnum):
-    DAY = "day"
-    NIGHT = "night"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +43,6 @@ class Everything:
     count: int
     name: str
     moving: bool
-    light: Light
     answer: Literal["yes", "no"]
     looks: tuple[NotUsable | Bearing, ...]
     pair: Annotated[tuple[str, int], Keys("source", "stamp_ns")]
@@ -68,7 +61,6 @@ def everything(**changes):
         "count": 3,
         "name": "a",
         "moving": True,
-        "light": Light.NIGHT,
         "answer": "yes",
         "looks": (Bearing(0.1), NotUsable("dark")),
         "pair": ("camera", 7),
@@ -90,7 +82,6 @@ def test_every_kind_of_field_is_written_and_read_back():
     again = decode(Everything, written(), "file")
     assert encode(again) == encode(everything())
     assert again.looks == (Bearing(0.1), NotUsable("dark"))
-    assert again.light is Light.NIGHT
     assert (again.matrix.dtype, again.ids.dtype) == (np.float64, np.int64)
     assert list(written())[:2] == ["schema", "name"]
     assert written()["pair"] == {"source": "camera", "stamp_ns": 7}
@@ -117,7 +108,6 @@ def test_unknown_keys_are_ignored_and_what_was_added_later_may_be_missing():
         ("count", 1.0, r"file\.count: expected a whole number"),
         ("count", False, r"file\.count: expected a whole number"),
         ("moving", 1, r"file\.moving: expected true or false, got 1"),
-        ("light", "dusk", r"file\.light: expected one of day, night, got 'dusk'"),
         ("answer", "maybe", r"file\.answer: expected one of yes, no"),
         ("looks", [{"kind": "Bearing", "azimuth_rad": 1, "score": 2}], r"\[0\]\.score: expected a number"),
         ("looks", [{"kind": "Ghost"}], r"file\.looks\[0\]\.kind: expected one of NotUsable, Bearing"),

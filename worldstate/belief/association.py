@@ -20,7 +20,7 @@ FORBIDDEN = -1e6
 # Of pairing a parked with a moving object, nats: below the gate's 4 deviations, so that any free partner is
 # preferred, and finite, so that a parked car that drives off keeps its id.
 _PARKED_MISMATCH = -10.0
-_UNFORESEEN = 0.05  # Of who comes into view, whatever the sound had said of the time
+_UNFORESEEN = 0.05  # Of a vehicle that comes into view, whatever the sound had said of the time
 _FOUND = 0.95  # Of the looks at an entity in view
 _LEAST = 1e-300  # Keeps logarithms finite
 # All of five tracks and five measurements, or of three and twelve; their tables take .2 ms to read.
@@ -42,7 +42,7 @@ class Association:
     def handed_over(
         self, before: Sequence[Track], after: Sequence[Track], settings: FilterSettings
     ) -> dict[int, float]:
-        """Return the share of P(hidden) that stays on the side of every hand-over: of who may not be it."""
+        """Return, by side of a hand-over, the share of P(hidden) to keep: P(it was another vehicle)."""
         emerged = (i for i in self.found if after[i].seen and not before[i].seen)
         return {before[i].side: max(settings.handover_residual, 1.0 - self.chances[i]) for i in emerged}
 
@@ -52,8 +52,8 @@ def associated(
 ) -> Association:
     r"""Return whose the sightings are.
 
-    Every sighting is one of an entity in view, a hidden one that comes past an edge, or a vehicle that nobody
-    has heard; how much likelier than that, nats, they are one of
+    Every sighting is one of an entity in view, a hidden one that comes past an edge, or a vehicle that was
+    not heard; how much likelier than that, nats, they are one of
 
     .. math:: \log \frac{r p_D N(z; \theta, S)}{1 - r p_D} \frac{V}{u}, \qquad
               \log r\, [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)] \frac{V}{u}
@@ -76,7 +76,7 @@ def joint_association(log_ratios: FloatArray, detected: BoolArray) -> Associatio
 
     Shapes: log_ratios (measurements, tracks), FORBIDDEN outside the gate; detected (tracks,).
     """
-    # Within its gate a detected entity takes a measurement before that counts as somebody new; a maximum of
+    # Within its gate a detected entity takes a measurement before that counts as a new one; a maximum of
     # the two would be a tie of all poor pairs, which the order of measurements would settle.
     gated = log_ratios > FORBIDDEN
     scores = np.where(gated & detected, np.logaddexp(log_ratios, 0.0), log_ratios)
@@ -99,7 +99,7 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
     array([[0.6, 0.2]])
     """
     gated, chances = log_ratios > FORBIDDEN, np.zeros_like(log_ratios)
-    # Pairs that compete with nobody, which most are, all at once.
+    # Pairs that compete with no other, which most are, all at once.
     alone = gated & (gated.sum(axis=0) == 1) & (gated.sum(axis=1) == 1)[:, None]
     chances[alone] = np.exp(-np.logaddexp(0.0, -log_ratios[alone]))
     for rows, columns in _groups(gated & ~alone):
@@ -123,7 +123,7 @@ def propagated(log_ratios: FloatArray) -> FloatArray:
               \nu_{ji} = \frac{1}{1 + \sum_{i' \ne i} \mu_{i'j}}
 
     Source: J. Williams, R. Lau, "Approximate evaluation of marginal association probabilities with belief
-    propagation", IEEE Trans. Aerosp. Electron. Syst. 50, 2014, who prove that it converges.
+    propagation", IEEE Trans. Aerosp. Electron. Syst. 50, 2014, where it is proved to converge.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def _joint_events(rows: int, columns: int) -> IntArray | None:
 
 
 def _likeliest(scores: FloatArray) -> dict[int, int]:
-    """Return {column: row} of the largest sum of scores, where every row may be somebody new instead, at 0.
+    """Return {column: row} of the largest sum of scores, where every row may be a new entity instead, at 0.
 
     Examples
     --------
@@ -227,9 +227,9 @@ def _shared_class(track: Track, label: str) -> float:
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:
-    """Return how likely a hidden entity is near enough to its edge, against one of whom no time is known.
+    """Return how likely a hidden entity is near enough to its edge, against one of unknown time.
 
-    Who is believed seconds away from the edge is not the one who appears now.
+    A vehicle believed seconds away from the edge is not the one that appears now.
     """
     side, near_rad = site.sides[track.side], site.settings.edge_std_rad
     outwards = math.copysign(1.0, side.edge_azimuth_rad)

@@ -7,7 +7,7 @@ at azimuth a and speed v, it stands t seconds before line of sight at
 
 Metres are not in the sound, but the time to visible is; the mean is taken over its distribution and over
 what is not known of v / d. Of the variance a fifth is the place's: what is heard is how far behind the edge
-somebody is, and most of what is not known of the time is at which pace it comes.
+a vehicle is, and most of what is not known of the time is at which pace it comes.
 
 A hidden vehicle with a place comes into view when it passes its edge. With the edge of the occluder at
 azimuth a, the normal :math:`n = (-\sin a, \cos a)` of its line of sight and the velocity w relative to the
@@ -48,7 +48,7 @@ _IN_VIEW_STD = math.radians(20.0)
 
 
 def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float]:
-    """Return mean and standard deviation of the azimuth, radians, of who comes with these probabilities.
+    """Return mean and deviation of the azimuth, radians, of a vehicle that comes with these probabilities.
 
     Shapes: coming (9,), of the groups of `COMING_S`.
 
@@ -76,9 +76,9 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
 
 
 def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: MotionBelief) -> MotionBelief:
-    r"""Return the motion of who comes with these probabilities, or, with the rest of `share`, is in view.
+    r"""Return the motion of a vehicle that comes with these probabilities or, but for `share`, is in view.
 
-    Whoever is past the edge goes on as it came,
+    A vehicle past the edge goes on as it came,
 
     .. math:: \dot\theta = -\frac{v}{d} \cos^2\theta
 
@@ -102,7 +102,7 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
 
 # Slower towards the line of sight than so many standard deviations, and it may never cross it.
 _LEAST_DEVIATIONS = 2.0
-# m/s: of a velocity that nobody measured, which says nothing against coming.
+# m/s: of a velocity that was not measured, which says nothing against coming.
 _UNKNOWN_SPEED_STD = 3.0
 
 

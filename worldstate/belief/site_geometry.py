@@ -10,7 +10,7 @@ from worldstate.measurement import CameraLook, Look, Sector
 
 from .settings import FilterSettings
 
-# Who comes along a crossing street stands ahead, not abeam: at the default corner, up to 92 degrees.
+# A vehicle in a crossing street stands ahead, not abeam: at the default corner, up to 92 degrees.
 _WIDEST_RAD = math.radians(60.0)
 
 

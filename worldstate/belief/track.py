@@ -136,7 +136,7 @@ def _driven_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> tu
     for (i, _, _), place in zip(placed, after.each(), strict=True):
         track = tracks[i]
         if place.position_std_m <= _LOST_PLACE_M:
-            # No life time here: who keeps sending is there, and who does not is lost within seconds.
+            # No life time here: a sender that keeps sending is there, a silent one is lost within seconds.
             moved[i] = replace(track, place=place)
         else:
             motion = track.motion if track.seen else site.prior(track.side)

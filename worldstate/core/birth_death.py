@@ -19,7 +19,7 @@ from worldstate.state.entity import EventKind
 
 from .memory import Memory
 
-# Of two at one place; whoever is found by himself within it is somebody else.
+# Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
 
 
@@ -61,7 +61,7 @@ def merged_tracks(tracks: tuple[Track, ...], stamp_ns: int) -> tuple[tuple[Track
     """Return the tracks with those that have become one as one, and by the ids that end those that go on.
 
     Of two at one place, of the same class, one has just been found and the other not for a second. They go
-    on where the first is, as whoever was known earlier.
+    on where the first is, under the id that was known earlier.
     """
     left, into = list(tracks), dict[str, str]()
     found = [one for one in tracks if one.seen and one.last_seen_ns == stamp_ns]
@@ -173,7 +173,7 @@ def events_between(
 
 
 def halves_of_one(before: Memory, after: Memory) -> dict[str, str]:
-    """Return as whom those go on who were heard on the other side of one that has just come into view.
+    """Return the ids under which entities go on that were heard opposite to one that has just come into view.
 
     Within two seconds of that they have ended, or sound as if they were in view.
     """

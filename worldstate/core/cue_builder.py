@@ -27,7 +27,7 @@ def hidden_risks(memory: Memory, model: FilterModel) -> tuple[float, ...]:
     .. math:: r_k = P(hid_k \mid y_{1:t}), \qquad r_k = g(P(hid \mid y_{1:t}))\, P(k \mid hid, y_{1:t})
 
     with a sequence model, whose probabilities are calibrated and whose sides do not exclude each other, and
-    without one, by the map g of the policy. Whom messages announce is hidden at least as surely as they say.
+    without one, by the map g of the policy. An announced one is hidden at least as surely as messages say.
     """
     told = announced(memory.tracks, model.site)
     if memory.sequence is not None:
@@ -85,7 +85,7 @@ def _cue(
     within, interval_s = (None, None) if times is None else times
     closing_hz = motion.inverse_tta_hz if track is not None and track.approach_heard else None
     arrival_s = time_to_arrival(closing_hz, motion.inverse_tta_std_hz)
-    # Distance and speed of who has announced itself tell more than the sound.
+    # Distance and speed of an announced vehicle tell more than the sound.
     interval_s = (track and visible_in(track, model.site)) or interval_s
     return shared(
         direction=model.site.sides[k].label,
@@ -105,13 +105,13 @@ def _cue(
 
 
 def _times(kept: SequenceMemory | None, advisories: list[Advisory | None]) -> list[_Times | None]:
-    """Return the probabilities of coming into view, and the time to it where somebody is expected."""
+    """Return the probabilities of coming into view, and the time to it where a vehicle is expected."""
     if kept is None:
         return [None] * len(advisories)
     posterior = kept.posterior
     within = posterior.within()[0].tolist()
     soon = posterior.groups[0, :, :STATED].sum(axis=1) > 0.5
-    # The times are those of whoever comes: of a street where nobody does they would say nothing.
+    # The times are those of a vehicle that comes: in an empty street they would say nothing.
     stated = [told is not None or likely for told, likely in zip(advisories, soon.tolist(), strict=True)]
     intervals_s = posterior.time_to_visible_s()[0].tolist() if any(stated) else within
     names = [f"{end_s:g}" for end_s in HORIZONS_S]

@@ -33,9 +33,10 @@ from worldstate.state import Context, WorldState
 from .birth_death import published
 from .cue_builder import cues_of, hidden_risks
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
-from .memory import Memory, first_memory, priors_of
+from .memory import NEWS_HOLDS_NS, Memory, first_memory, priors_of
 from .relations import relations_at
 from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
+from .vision_update import vision_update
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
@@ -146,7 +147,7 @@ class WorldFilter:
             domain=memory.domain,
             no_sequence=memory.no_sequence,
             delivery=self._lag.delivery,
-            valid_until_ns=max((one.stamp_ns + step.NEWS_HOLDS_NS for one in sensors), default=None),
+            valid_until_ns=max((one.stamp_ns + NEWS_HOLDS_NS for one in sensors), default=None),
             sensors=sensors,
             searched=searched_views(memory, context),
             events=memory.events,
@@ -212,19 +213,25 @@ class WorldFilter:
             memory = step.advance(memory, measurement.stamp_ns, self._model)
         carried, model = memory, step.from_here(self._model, memory.ego)
         if isinstance(measurement, Odometry):
-            return step.chronicled(before, carried, step.update_odometry(memory, measurement), model)
-        if isinstance(measurement, PositionScan):
-            return step.chronicled(before, carried, step.update_positions(memory, measurement, model), model)
+            memory = step.update_odometry(memory, measurement)
+        elif isinstance(measurement, PositionScan):
+            memory = step.update_positions(memory, measurement, model)
+        else:
+            memory = self._perceived(memory, measurement, model)
+        return step.chronicled(before, carried, memory, model)
+
+    def _perceived(self, memory: Memory, measurement: Measurement, model: step.FilterModel) -> Memory:
+        """Return the memory after a measurement with its signature, its looks and its sequence."""
         measurement = step.where_nobody_hides(measurement, model.context)
         weight = step.sound_weight(memory, measurement, self.start_ns, self.settings)
         memory, measurement, looks = step.new_looks(memory, measurement, self.start_ns, self.settings)
         # Evidence first: association and births need the explanations of this very window.
         memory = step.update_evidence(memory, measurement, weight, model)
         for seen, look_weight in looks:
-            memory = step.update_sightings(memory, measurement, seen, look_weight, model)
+            memory = vision_update(memory, measurement, seen, look_weight, model.site)
         memory = step.update_advisories(memory, measurement, model)
         memory = step.update_sequence(memory, measurement, [seen for seen, _ in looks], model)
-        return step.chronicled(before, carried, step.update_entities(memory, measurement, model), model)
+        return step.update_entities(memory, measurement, model)
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery

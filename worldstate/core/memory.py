@@ -15,12 +15,14 @@ from worldstate.belief.explanation import AsLogs, BeliefLag, ExplanationBelief, 
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.track import Track
 from worldstate.ground.serialisation import ADDED, Count, Keys, written_as
-from worldstate.ground.values import NotUsable
+from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Event, Priors, Relation
 
 from .sequence_memory import SequenceMemory
 
+# An advisory lives in time: without news it ends, as that of a sequence does, after a second.
+NEWS_HOLDS_NS = nanoseconds(1.0)
 StampNs: TypeAlias = Annotated[int | None, Keys("stamp_ns")]
 
 
@@ -99,7 +101,7 @@ class Memory:
     looks: tuple[CountedLook, ...] = field(default=(), metadata=ADDED)
     bearing: Bearing | None = field(default=None, metadata=ADDED)  # Of the last measurement
     domain: DomainVerdict | None = field(default=None, metadata=ADDED)  # Of the last measurement
-    # Who comes into view and when; None without such a model, and why the last one could not say so.
+    # Vehicles that come into view, and when; None without such a model, and why the last one did not say it.
     sequence: SequenceMemory | None = field(default=None, metadata=ADDED)
     no_sequence: NotUsable | None = field(default=None, metadata=ADDED)
     heard_nats: float = field(default=0.0, metadata=ADDED)  # Log-odds of hidden in `instant` by sound alone

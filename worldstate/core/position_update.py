@@ -43,12 +43,12 @@ _GATE = 21.0
 _RADIO_AREA_M2 = 0.5 * math.pi * 100.0**2
 # m/s: slower is parked, as far as a radar or a positioning receiver can tell.
 _PARKED_MPS = 0.5
-# Which side of an edge somebody is on is asked of the mean position.
+# The side of an edge follows from the mean position.
 _SHARP_RAD = 1e-3
-# No statement is certain, and a refuted claim that is repeated can still turn out to be true: who was taken
+# No statement is certain, and a refuted claim that is repeated can still turn out to be true: what was taken
 # to be in view stood behind something that the context does not name.
 _MOST_EXISTENCE, _LEAST_EXISTENCE = 0.999, 1e-3
-# A bus of forged messages must not slow the step down: beyond these nobody new is taken.
+# A bus of forged messages must not slow the step down: beyond these no new one is taken.
 _MOST_ENTITIES = 128
 _BY_ALL = attrgetter("position_m", "covariance", "velocity_mps", "existence_probability", "classes")
 
@@ -81,7 +81,7 @@ def position_update(memory: Memory, scan: PositionScan, weight: float, site: Sit
 
 
 def _log_new(scan: PositionScan, site: SiteGeometry) -> float:
-    """Return the log density of objects that nobody knows of, 1/m^2."""
+    """Return the log density of unknown objects, 1/m^2."""
     searched = scan.searched
     area_m2 = _RADIO_AREA_M2
     if searched is not None:
@@ -92,11 +92,11 @@ def _log_new(scan: PositionScan, site: SiteGeometry) -> float:
 def _log_ratios(
     tracks: tuple[Track, ...], positions: tuple[Position, ...], scan: PositionScan, site: SiteGeometry
 ) -> FloatArray:
-    r"""Return how much likelier than somebody new every pair is, nats, shape (positions, tracks).
+    r"""Return how much likelier than a new object every pair is, nats, shape (positions, tracks).
 
     .. math:: \log \frac{r\, p_D\, N(z; H m, H P H^T + R)}{(1 - r p_D)\, N(z_v; 0, V + R_v)} \frac{A}{u}
 
-    The velocity enters by how much likelier it is than that of anybody, so that an entity without a place is
+    The velocity enters by how much likelier it is than that of any other, so that an entity without a place is
     scored in the same units, by its azimuth and range.
     """
     if not tracks or not positions:
@@ -151,7 +151,7 @@ def _polar(
     range_variance = variances[:, LOG_RANGE] + (noises[1] / range_m**2)[:, None]
     distance, log_azimuth = turned**2 / variance, -0.5 * np.log(2.0 * math.pi * variance)
     if line_of_sight:
-        # Who was only heard is found where it comes into view.
+        # An entity that was only heard is found where it comes into view.
         peak = 1.0 / (site.settings.edge_std_rad * math.sqrt(2.0 * math.pi))
         near = np.maximum(emergence_density(tracks, azimuth[:, None], site) / peak, 1e-300)
         distance = np.where(hidden, -2.0 * np.log(near), distance)
@@ -211,7 +211,7 @@ def _sighted(track: Track, stamp_ns: int, searched: SearchedSector) -> Track:
 
 def _told(track: Track, position: Position, scan: PositionScan) -> float:
     """Return the existence after a message."""
-    # Whoever lies in one message lies in the next: what a source repeats counts once.
+    # A sender that lies in one message lies in the next: what a source repeats counts once.
     if scan.source in track.sources:
         return track.existence
     odds = position.existence_probability / (1.0 - position.existence_probability)
@@ -262,7 +262,7 @@ def _missed(track: Track, existence: float, searched: SearchedSector | None) -> 
 def _born(
     position: Position, scan: PositionScan, births: list[int], sighted: int, site: SiteGeometry
 ) -> Track:
-    """Return an entity that nobody knew of, hidden where a message places it behind an occluder."""
+    """Return a new entity, hidden where a message places it behind an occluder."""
     x, y = position.position_m
     side, behind = site.hiding_side(math.atan2(y, x), _SHARP_RAD)
     hidden = scan.searched is None and behind >= 0.5

@@ -17,7 +17,7 @@ from .memory import Memory
 
 _HOLDS = 0.5  # The probability from which on a relation is said to hold
 _KEPT_NS = nanoseconds(5.0)  # Of a relation that has ended
-# Half the width of a lane in town; whoever is slower than a walk has no heading that tells its lane.
+# Half the width of a lane in town; below a walk the heading does not tell the lane.
 _HALF_LANE_M, _LEAST_SPEED_MPS = 1.6, 1.5
 _ALIKE = math.cos(math.radians(30.0))  # Of headings in one lane
 _LEAST_CROSSING_MPS = 0.3
@@ -79,7 +79,7 @@ def _comes(track: Track, memory: Memory) -> float:
 
 
 def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterator[Relation]:
-    r"""Yield who is next ahead in the lane of whom, and who will cross the path of the ego vehicle.
+    r"""Yield which entity is next ahead of which in a lane, and which will cross the path of the ego vehicle.
 
     With the heading u of b, its normal n and the offset d from b to a,
 
@@ -135,6 +135,6 @@ def _crosses(track: Track, ego_speed_mps: float) -> float:
     )
     (time_var, _), (_, ahead_var) = (slopes @ covariance @ slopes.T).tolist()
     soon = normal_share((_CONFLICT_S - time_s) / math.sqrt(time_var))
-    # Whoever may as well stand still or turn away has a deviation of its speed as large as that.
+    # An entity that may as well stand still or turn away has a deviation of its speed as large as that.
     comes = normal_share(abs(vy) / math.sqrt(covariance[3, 3]))
     return soon * comes * normal_share((x + closing * time_s) / math.sqrt(ahead_var))

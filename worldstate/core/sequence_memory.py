@@ -1,4 +1,4 @@
-"""What the filter believes of who comes into view and when: the sequence's reading with everything else."""
+"""Belief of the vehicles that come into view: the sequence's reading with looks, hand-overs and traffic."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -55,7 +55,7 @@ class ArrivalRate:
         return ArrivalRate(self.count * kept, self.watched_s * kept + (step_s if watched else 0.0))
 
     def shift_nats(self, usual_hz: float) -> float:
-        """Return by how much the log-odds of somebody coming differ from usual, in steps of .1 nats.
+        """Return by how much the log-odds of a vehicle coming differ from usual, in steps of .1 nats.
 
         Examples
         --------
@@ -69,16 +69,16 @@ class ArrivalRate:
 
 # In seconds what the alarm's threshold was set with in hops; less by the rounding of stamps.
 _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 300_000_000, 1_000_000_000, 5_000_000
-# A look says who is in view then, not who will be: multiplied into the belief hop by hop, looks at one
+# A look says what is in view then, not what will be: multiplied into the belief hop by hop, looks at one
 # vehicle outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
 _LOOK_NS = 500_000_000
-# A window and the smoothing of the alarm; then a follower is told like anybody. In dense traffic one in six
+# A window and the smoothing of the alarm; then a follower counts like any other. In dense traffic one in six
 # has another one right behind.
 _EXPLAINED_NS, _FOLLOWED = 1_300_000_000, 0.2
 _IN_VIEW_S = 6.0  # Two passages: before, it is the sound that tells whether it is still there
-_OTHERS = 0.1  # Who came into view from nowhere that is listened to
+_OTHERS = 0.1  # Vehicles in view from no side that is listened to
 _SEEN, _PAST = GROUPS.index("seen"), GROUPS.index("past")
-# States of those who come into view within three seconds.
+# States of vehicles that come into view within three seconds.
 _SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range(len(STATES))])
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
 
@@ -96,10 +96,12 @@ class SequenceMemory:
     recent: tuple[tuple[int, float, float], ...] = ()
     over_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When each side was last above the threshold
     looks: tuple[Look, ...] = ()  # The last one of each sensor, for as long as it holds
-    emerged_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When somebody last came into view from a side
-    # P(somebody has come into view from a side and no look has told), where no camera looks or none sees.
+    emerged_ns: tuple[int | None, ...] = (None,) * len(
+        SIDES
+    )  # When a vehicle last came into view from a side
+    # P(a vehicle has come into view from a side and no look has told), where no camera looks or none sees.
     unseen: tuple[Probability, ...] = field(default=(0.0,) * len(SIDES), metadata=ADDED)
-    # How often somebody has come into view past the edge of each side, while a camera looked.
+    # How often a vehicle has come into view past the edge of each side, while a camera looked.
     arrivals: tuple[ArrivalRate, ...] = field(default=(ArrivalRate(),) * len(SIDES), metadata=ADDED)
     stamp_ns: int = 0
 
@@ -138,7 +140,7 @@ class SequenceMemory:
         return self.posterior.groups[0, :, : len(COMING_S)]
 
     def emerged(self, sides: Collection[int], stamp_ns: int) -> "SequenceMemory":
-        """Return the memory after somebody came into view past the edge of some sides."""
+        """Return the memory after a vehicle came into view past the edge of some sides."""
         known = (stamp_ns if side in sides else ns for side, ns in enumerate(self.emerged_ns))
         unseen = (0.0 if side in sides else chance for side, chance in enumerate(self.unseen))
         arrivals = tuple(
@@ -157,7 +159,7 @@ class SequenceMemory:
         return [0.0 if context.priors else one.shift_nats(usual_hz) for one in self.arrivals]
 
     def _explained(self) -> FloatArray:
-        """Return log p(sound | one comes) of each side, given who has just come into view there, shape (2,).
+        """Return log p(sound | one comes) of each side, given a vehicle just come into view, shape (2,).
 
         The last seconds hold the sound of this vehicle while it was hidden; that another one follows it is
         rare. Onsets within six seconds of T0 fall from .17 to .08 an approach by this.
@@ -167,18 +169,18 @@ class SequenceMemory:
 
     @cached_property
     def hidden(self) -> HiddenBelief:
-        """Whoever comes into view within eight seconds is hidden; who came unseen is there as it sounds.
+        """A vehicle that comes into view within eight seconds is hidden; an unseen one is as it sounds.
 
-        What sounds in view, or as if it had left the view into the other side, is one who may have come into
-        view unseen, or somebody of whom nothing is known. As few as explain it: a vehicle that may have come
+        What sounds in view, or as if it had left the view into the other side, is one that may have come into
+        view unseen, or a vehicle of which nothing is known. As few as explain it: one that may have come
         from either side is one, of the likelier side, and two only as far as both chances exceed one.
         """
         groups, unseen = self.posterior.groups[0], _as_few(np.array(self.unseen))
         coming = np.minimum(self.coming.sum(axis=1), 1.0)
         there = groups[:, _SEEN] + groups[::-1, _PAST]
-        # P(this one | somebody is there), each of them with a chance of its own.
-        somebody = 1.0 - (1.0 - unseen).prod() * (1.0 - _OTHERS)
-        emerged = np.minimum(there * unseen / somebody, 1.0 - coming)
+        # P(this one | a vehicle is there), each of them with a chance of its own.
+        present = 1.0 - (1.0 - unseen).prod() * (1.0 - _OTHERS)
+        emerged = np.minimum(there * unseen / present, 1.0 - coming)
         return HiddenBelief(tuple(coming.tolist()), tuple(emerged.tolist()))
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
@@ -191,7 +193,7 @@ class SequenceMemory:
 
         .. math:: t_j = L_j - L_{j-1}
 
-        with L of both sides after the prior, the sequence, every look, and who has just come into view.
+        with L of both sides after the prior, the sequence, every look, and a vehicle just come into view.
         """
         after = self.log_odds(context)
         terms = np.diff(list(after.values()), axis=0, prepend=np.zeros((1, len(SIDES))))
@@ -207,7 +209,7 @@ class SequenceMemory:
         if nats.any():
             pieces = pieces | {"usual traffic": -nats[:, None] * COMES}
         told = np.cumsum([np.zeros_like(self.sides.belief), *pieces.values()], axis=0)
-        # States and groups count alike: those who come soon behind somebody come soon.
+        # States and groups count alike: a vehicle that comes soon behind another comes soon.
         before = states_of(self.prior(context), self.share)
         weights = np.concatenate([before[None], self.sides.belief * np.exp(told)])
         soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
@@ -237,7 +239,7 @@ def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context)
 
 
 def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
-    r"""Return the chances that somebody has come into view unseen, after a step.
+    r"""Return the chances that a vehicle has come into view unseen, after a step.
 
     .. math:: u \leftarrow \max(u\, e^{-dt / \tau},\ P(T \le .5))
     """
@@ -262,7 +264,7 @@ def informed(
         return None
     # The chain of the hops since then was taken when the belief was carried here.
     sides = next_belief(kept.sides, said, np.eye(len(STATES)))
-    # Whoever has come into view is seen there but for a miss; who is seen was handed over.
+    # A vehicle that has come into view is seen there but for a miss; one that is seen was handed over.
     missed = math.prod(look.answer.miss_rate for look in looks if not isinstance(look.answer, Unqueried))
     held = {look.sensor: look for look in (*kept.looks, *looks)}
     kept = replace(

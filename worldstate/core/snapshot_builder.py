@@ -28,9 +28,8 @@ from worldstate.ground import FloatArray, seconds
 from worldstate.state import Classification, Context, Entity, SearchedView, SensorHealth, Visibility
 from worldstate.state.sensor import Ego
 
-from .memory import CountedLook, Memory
+from .memory import NEWS_HOLDS_NS, CountedLook, Memory
 from .sequence_memory import SequenceMemory
-from .step import NEWS_HOLDS_NS
 
 # Beyond two seconds vehicles at junctions have turned or braked.
 _AFTER_S = np.array([1.0, 2.0])
@@ -77,7 +76,7 @@ _ROUNDING = 1e-9
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
 # Of what is published: numbers in full precision take twice as long to write.
 _DIGITS = 9
-# A look that misses more than it finds tells little of who is not there.
+# A look that misses more than it finds tells little of absence.
 _MOSTLY_MISSED = 0.5
 
 

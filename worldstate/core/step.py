@@ -22,7 +22,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import Track, hidden_share, predict_tracks, turned
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
-from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sector
+from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan
 from worldstate.state import Context
 from worldstate.state.context import seen_from
 
@@ -37,18 +37,16 @@ from .birth_death import (
     published,
     surviving,
 )
-from .memory import CountedLook, Instant, Memory, SourceRule, priors_of
+from .memory import NEWS_HOLDS_NS, CountedLook, Instant, Memory, SourceRule, priors_of
 from .position_update import position_update
 from .relations import relations_at
 from .sequence_memory import carried, informed
-from .vision_update import log_co_evidence, vision_update
+from .vision_update import log_co_evidence
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
-# An advisory lives in time: without news it ends, as that of a sequence does, after a second.
-NEWS_HOLDS_NS = nanoseconds(1.0)
 _MOST_CERTAIN = 0.999  # Of a message
-_NOBODY = 1e-12  # Of a group of those who come, where nobody can: shares of none at all are not defined
+_NONE = 1e-12  # Of a coming group where no vehicle can come: shares of none at all are not defined
 _NO_LOOK = Unqueried("sound alone")
 
 
@@ -105,7 +103,7 @@ def update_odometry(memory: Memory, told: Odometry) -> Memory:
 
 
 def where_nobody_hides(measurement: Measurement, context: Context) -> Measurement:
-    """Return a measurement of which nothing says that somebody is hidden where nothing hides anybody."""
+    """Remove the evidence for hidden vehicles on sides without an occluder."""
     is_open = np.array([not one.hides for one in context.occluders])
     if not is_open.any():
         return measurement
@@ -115,7 +113,7 @@ def where_nobody_hides(measurement: Measurement, context: Context) -> Measuremen
     if not isinstance(reading, SequenceReading):
         return measurement
     groups = reading.groups.copy()
-    groups[is_open] = np.maximum(groups[is_open] * (np.arange(len(GROUPS)) >= len(COMING_S)), _NOBODY)
+    groups[is_open] = np.maximum(groups[is_open] * (np.arange(len(GROUPS)) >= len(COMING_S)), _NONE)
     groups /= groups.sum(axis=1, keepdims=True)
     return replace(measurement, sequence=replace(reading, groups=groups))
 
@@ -226,19 +224,8 @@ def _with_hand_overs(
     return replace(signature, visible=max([signature.visible, *before])) if before else signature
 
 
-def update_sightings(
-    memory: Memory, measurement: Measurement, seen: CameraLook, weight: float, model: FilterModel
-) -> Memory:
-    """Return the memory after detections, missed detections and hand-overs of one camera."""
-    others = list[Sector]()
-    if seen.look.sector_rad is not None:
-        recent = (one for one in memory.looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
-        others = [Sector.between(*one.sector_rad) for one in recent if one.sector_rad is not None]
-    return vision_update(memory, measurement, seen, weight, model.site, others)
-
-
 def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> Memory:
-    """Return the memory after the positions of a radar or a radio: entities, and who is announced hidden."""
+    """Return the memory after the positions of a radar or a radio: entities, and announced hidden ones."""
     settings, last = model.site.settings, _last_look(memory, scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     weight = min(elapsed_s / settings.look_interval_s, 1.0)
@@ -246,7 +233,7 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     memory = replace(memory, looks=_with_look(memory, _scan_look(scan)), seq=memory.seq + 1)
     chances = announced(memory.tracks, model.site)
     if not any(chances):
-        # Whoever has come into view, or is gone, ends the rule of the source that announced it.
+        # An entity that has come into view, or is gone, ends the rule of the source that announced it.
         return replace(memory, rules=tuple(one for one in memory.rules if one.source != scan.source))
     memory = memory.explained(partial(ExplanationBelief.at_least, hidden=chances))
     if scan.searched is not None:
@@ -313,7 +300,7 @@ def _ruled(
 def update_sequence(
     memory: Memory, measurement: Measurement, looks: Iterable[CameraLook], model: FilterModel
 ) -> Memory:
-    """Return the memory after what a sequence model and the cameras say of who comes into view, and when."""
+    """Return the memory after what a sequence model and the cameras say of vehicles that come into view."""
     said, site = measurement.sequence, model.site
     told = [site.in_sight(one) for one in looks if not isinstance(one.look.answer, Unqueried)]
     refused = said if isinstance(said, NotUsable) else None
@@ -354,7 +341,7 @@ def advisory_ends_ns(memory: Memory) -> tuple[int | None, ...]:
 def heard_ends_ns(memory: Memory) -> tuple[int | None, ...]:
     """Return for each side when its advisory by what is heard and seen ends.
 
-    Who will read a sequence waits for it: the first second of single windows was counted in no budget.
+    None before the first sequence: the first second of single windows was counted in no budget.
     """
     sequence, hidden = memory.sequence, memory.explanation.hidden
     if memory.no_sequence == TOO_FEW:
@@ -380,7 +367,7 @@ def _rule_ends_ns(memory: Memory, announced: int | None = None) -> int | None:
 
     That of a source that is silent for a second has ended.
     """
-    # A rule that announces nobody hears, which is asked for with None.
+    # A rule that announces no vehicle hears, which is asked for with None.
     rules = (one for one in memory.rules if one.alarm and announced in (one.announced or (None,)))
     ends_ns = (one.stamp_ns + NEWS_HOLDS_NS for one in rules)
     return max((end_ns for end_ns in ends_ns if end_ns >= memory.stamp_ns), default=None)

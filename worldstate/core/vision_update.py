@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
-from typing import Any
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from worldstate.ground import FloatArray, seconds
 from worldstate.measurement import CameraLook, Look, Measurement, Sector, Sighting
 
 from .birth_death import after_look
-from .memory import Memory
+from .memory import NEWS_HOLDS_NS, Memory
 
 # Of (theta_dot rad/s, rho 1/s) at the first sighting: a car at 50 km/h passing at 15 m has .9 rad/s, two
 # deviations. A parked one has none, but zero would make the covariance singular.
@@ -53,38 +52,54 @@ def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
 
 
 def vision_update(
-    memory: Memory,
-    measurement: Measurement,
-    seen: CameraLook,
-    weight: float,
-    site: SiteGeometry,
-    others: Sequence[Sector] = (),
+    memory: Memory, measurement: Measurement, seen: CameraLook, weight: float, site: SiteGeometry
 ) -> Memory:
-    """Return the memory after one look: detections, missed detections and hand-overs.
-
-    For an entity where only `others` have looked, their answer holds.
-    """
+    """Return the memory after one look: detections, missed detections and hand-overs."""
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
     sightings, view = tuple(sorted(seen.sightings, key=_BY_ALL)), site.view(seen.look)
     tracks, whose = memory.tracks, associated(memory.tracks, sightings, view, site)
-    found, after = whose.found, []
+    found, after, others = whose.found, list[Track](), _other_views(memory, seen.look)
     turned, rates = _turned(tracks, sightings, found, site), _rates(measurement.co_evidence, site.settings)
     for i, track in enumerate(tracks):
         answer = _searched(track, measurement, seen.look, view)
         existence = _existence(track, whose.chances[i], answer, weight, rates)
-        if i in found and track.seen:
-            after.append(_sighted(turned[i], sightings[found[i]], existence, measurement, site))
-        elif i in found:
-            after.append(_handed_over(turned[i], sightings[found[i]], measurement, site))
+        if i in found:
+            if not track.seen:
+                known = max(track.existence, site.settings.sighting_existence)
+                existence = after_sighting(known, *rates)
+            after.append(_found(turned[i], sightings[found[i]], existence, measurement, site))
         elif answer is _OUTSIDE and any(one.touches(track.motion.azimuth_rad) for one in others):
+            # Where only other cameras have looked, their answer holds.
             after.append(track)
         else:
             left = _has_left(track, answer, measurement.stamp_ns, site)
             after.append(_not_sighted(track, existence, _OUTSIDE if left else answer))
     unheard = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
-    fresh = [_born(one, measurement, memory.sighted + n, site) for n, one in enumerate(unheard)]
-    memory = replace(memory, sighted=memory.sighted + len(fresh))
-    return after_look(memory, (*after, *fresh), whose, measurement.stamp_ns, site)
+    existence = after_sighting(site.settings.sighting_existence, *rates)
+    for number, one in enumerate(unheard, start=memory.sighted):
+        fresh = Track(
+            id=entity_id(site.settings.stream, "visible", number),
+            side=0,
+            seen=False,
+            existence=existence,
+            motion=_motion_at(one, None),
+            labels=(),
+            moving=one.moving,
+            sources=(),
+            created_ns=measurement.stamp_ns,
+            updated_ns=measurement.stamp_ns,
+        )
+        after.append(_found(fresh, one, existence, measurement, site))
+    memory = replace(memory, sighted=memory.sighted + len(unheard))
+    return after_look(memory, after, whose, measurement.stamp_ns, site)
+
+
+def _other_views(memory: Memory, look: Look) -> list[Sector]:
+    """Return where cameras with a sector of their own looked in the last second."""
+    if look.sector_rad is None:
+        return []
+    recent = (one for one in memory.looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
+    return [Sector.between(*one.sector_rad) for one in recent if one.sector_rad is not None]
 
 
 def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
@@ -96,36 +111,25 @@ def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
 
 
 def _found(
-    track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry, **changes: Any
+    track: Track, sighting: Sighting, existence: float, measurement: Measurement, site: SiteGeometry
 ) -> Track:
-    """Return an associated track with width, sources and time stamps updated, and more changes."""
+    """Return a track after a sighting of its own; one that was not seen before takes its side and class."""
     miss, _ = _rates(measurement.co_evidence, site.settings)
+    seen_as = ((sighting.label, sighting.score),)
     return replace(
         track,
+        side=track.side if track.seen else site.nearest_side(sighting.azimuth_rad),
+        seen=True,
+        existence=existence,
+        labels=relabelled(track.labels, seen_as) if track.seen else seen_as,
         moving=sighting.moving,
-        width_rad=sighting.width_rad,
         sources=merged(track.sources, "vision"),
         updated_ns=measurement.stamp_ns,
         last_seen_ns=measurement.stamp_ns,
         answer="visible",
         miss_rate=None if isinstance(measurement.co_evidence, Unqueried) else miss,
-        **changes,
+        width_rad=sighting.width_rad,
     )
-
-
-def _sighted(
-    track: Track, sighting: Sighting, existence: float, measurement: Measurement, site: SiteGeometry
-) -> Track:
-    labels = relabelled(track.labels, ((sighting.label, sighting.score),))
-    return _found(track, sighting, measurement, site, existence=existence, labels=labels)
-
-
-def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
-    """Return a hidden entity after its hand-over: same id, azimuth and side of the sighting."""
-    known = max(track.existence, site.settings.sighting_existence)
-    existence = after_sighting(known, *_rates(measurement.co_evidence, site.settings))
-    changes = {"side": site.nearest_side(sighting.azimuth_rad), "labels": ((sighting.label, sighting.score),)}
-    return _found(track, sighting, measurement, site, existence=existence, seen=True, **changes)
 
 
 def _turned(
@@ -155,7 +159,7 @@ def _turned(
 def _searched(track: Track, measurement: Measurement, look: Look, view: Sector) -> CoEvidence:
     """Return the answer that speaks of a track: of the sector of a sound, or of all that the sensor sees.
 
-    Of whoever is in view the look itself: by the miss rate of a sector half outside the image, vehicles that
+    Of an entity in view the look itself: by the miss rate of a sector half outside the image, vehicles that
     have gone stay for up to two seconds.
     """
     if not track.detected:
@@ -195,35 +199,17 @@ def _existence(
     if not track.detected:
         return missed
     if not isinstance(answer, Unqueried):
-        # Who may still be behind the corner is missed there for certain.
+        # An entity that may still be behind the corner is missed there for certain.
         hidden = 0.0 if track.seen else track.behind
         missed = after_empty_look(missed, hidden + (1.0 - hidden) * answer.miss_rate**weight)
     return missed + chance * (after_sighting(track.existence, *rates) - missed)
 
 
 def _not_sighted(track: Track, existence: float, answer: CoEvidence) -> Track:
-    # Present speaks of whoever is in view.
+    # Present speaks of any entity in view.
     if isinstance(answer, Absent) or (track.detected and isinstance(answer, Present)):
         return replace(track, existence=existence, answer="absent", miss_rate=answer.miss_rate)
     return replace(track, existence=existence, answer="unqueried", miss_rate=None)
-
-
-def _born(sighting: Sighting, measurement: Measurement, number: int, site: SiteGeometry) -> Track:
-    existence = site.settings.sighting_existence
-    unseen = Track(
-        id=entity_id(site.settings.stream, "visible", number),
-        side=site.nearest_side(sighting.azimuth_rad),
-        seen=True,
-        existence=existence,
-        motion=_motion_at(sighting, None),
-        labels=((sighting.label, sighting.score),),
-        moving=sighting.moving,
-        sources=("vision",),
-        created_ns=measurement.stamp_ns,
-        updated_ns=measurement.stamp_ns,
-    )
-    existence = after_sighting(existence, *_rates(measurement.co_evidence, site.settings))
-    return _found(unseen, sighting, measurement, site, existence=existence)
 
 
 def _motion_at(sighting: Sighting, before: MotionBelief | None) -> MotionBelief:

@@ -5,9 +5,7 @@ import sys
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from enum import Enum
 from functools import cache
-from operator import attrgetter
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -213,9 +211,6 @@ def _plan(hint: Hint) -> Plan:
         return _record(hint)
     if origin is Literal:
         return _as_is, _checked(_text, Check(f"one of {', '.join(args)}", args.__contains__))
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        named = Check(f"one of {', '.join(hint)}", set(hint).__contains__)
-        return attrgetter("value"), _then(_checked(_text, named), hint)
     if origin in (Union, types.UnionType):
         return _union(args)
     if origin is tuple:

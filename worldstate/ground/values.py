@@ -23,7 +23,7 @@ NANOSECONDS_PER_SECOND = 1_000_000_000
 class NotUsable:
     """An estimate that was asked for and cannot be given, with the reason.
 
-    It is neither zero nor missing: whoever fuses it must marginalise the quantity.
+    It is neither zero nor missing: a fusion must marginalise the quantity.
 
     Parameters
     ----------

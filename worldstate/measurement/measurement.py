@@ -94,7 +94,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One search of a sensor through all that it sees: it counts once, whoever carries it.
+    """One search of a sensor through all that it sees: it counts once, whatever carries it.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ class Measurement:
     kinds : tuple of (str, float)
         Classes of what is heard with their probabilities, sorted by name; empty where nothing tells.
     sequence : SequenceReading, NotUsable or None
-        What the last seconds say of who comes into view, and when; None of a modality that has no such model.
+        What the last seconds say of vehicles that come into view; None of a modality that has no such model.
     source : str
         Name of the modality.
     fault : str or None

@@ -9,7 +9,7 @@ from worldstate.ground import InvalidArgumentError, finite_array, in_range, inte
 
 from .sector import Sector
 
-# Bounds of what is taken: farther away nobody matters within the times that the filter speaks of, and beyond
+# Bounds of what is taken: farther away nothing matters within the times that the filter speaks of, and beyond
 # these deviations a covariance is singular to rounding or says nothing.
 _FARTHEST_M, _FASTEST_MPS = 1e4, 200.0
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-6, 1e6
@@ -80,7 +80,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class SearchedSector:
-    """Where a sensor has looked: whoever stands there in line of sight it would have found.
+    """Where a sensor has looked: what stands there in line of sight it would have found.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class SearchedSector:
     detection_probability : float
         Probability that it detects a road user there in one scan, in [0, 1).
     clutter_rate : float
-        Probability that a detection is of nobody, in (0, 1).
+        Probability that a detection is of nothing, in (0, 1).
 
     Examples
     --------
@@ -131,7 +131,7 @@ class PositionScan:
         At most 128.
     searched : SearchedSector or None
         What a sensor in line of sight has searched: an empty scan of it is evidence of absence. None of
-        messages, which come round corners, and say nothing of who sends none.
+        messages, which come round corners, and say nothing of vehicles that send none.
     latency_s : float
         How long before its stamp the scan was taken.
 

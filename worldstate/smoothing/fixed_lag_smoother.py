@@ -30,7 +30,7 @@ from .observations import (
     crossing,
 )
 
-# Of (theta, theta_dot, rho) of an entity that nobody has told anything of: anywhere, passing or closing at
+# Of (theta, theta_dot, rho) of an entity of which nothing is known: anywhere, passing or closing at
 # up to the rates of a vehicle some ten metres away.
 _START_STD = (1.5, 0.7, 0.7)
 _BLOCK_NS = 1_000_000_000
@@ -363,7 +363,7 @@ class FixedLagSmoother:
     def _node(self, one: _Entity, stamp_ns: int) -> f.Node:
         """Return the state nearest to a stamp, with the ego as it was then."""
         # A state in between would need the motion between its neighbours taken out of the graph. Over half a
-        # hop white acceleration moves nobody by more than a centimetre.
+        # hop white acceleration moves no vehicle by more than a centimetre.
         nearest = one.stamps_ns[min(bisect_left(one.stamps_ns, stamp_ns), len(one.stamps_ns) - 1)]
         before = one.stamps_ns[max(bisect_left(one.stamps_ns, stamp_ns) - 1, 0)]
         if abs(stamp_ns - before) < abs(nearest - stamp_ns):

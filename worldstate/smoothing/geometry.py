@@ -14,9 +14,9 @@ import numpy as np
 from worldstate.belief.kinematics.motion import LEAST_Q
 from worldstate.ground.typing import FloatArray
 
-# Nobody comes nearer to the ego than this; at 0 bearings have no derivative.
+# No entity comes nearer to the ego than this; at 0 bearings have no derivative.
 _NEAREST_SQUARE_M2 = 0.25
-# exp overflows where approach rates that contradict each other drive log r, which nobody measures.
+# exp overflows where approach rates that contradict each other drive log r, which is not measured.
 _FARTHEST_LOG_M = math.log(1e4)
 
 

@@ -20,7 +20,7 @@ def _parameters() -> Any:
     parameters = gtsam.ISAM2Params()
     # Otherwise every factor that was ever marginalised keeps its slot: 4432 after 1500 steps, not 44.
     parameters.findUnusedFactorSlots = True
-    # Squared by Cholesky, a pose known to 1e-4 rad beside a range that nobody measures is indeterminate.
+    # Squared by Cholesky, a pose known to 1e-4 rad beside a range that is not measured is indeterminate.
     parameters.setFactorization("QR")
     return parameters
 

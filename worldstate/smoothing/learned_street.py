@@ -127,7 +127,7 @@ class LearnedStreet:
             )
 
     def detection(self, azimuth_rad: float) -> float:
-        """Return the probability that the camera reports who stands at an azimuth."""
+        """Return the probability that the camera reports a vehicle at an azimuth."""
         at = _bin(azimuth_rad)
         return 1.0 - (_USUAL_MISSES + self.missed[at]) / (_USUAL_LOOKS + self.looks[at])
 

@@ -94,7 +94,7 @@ class PastEdge:
     detection_probability : float
         Of an entity in line of sight, in (0, 1).
     clutter_rate : float
-        Probability that a detection is of nobody, in (0, 1).
+        Probability that a detection is of nothing, in (0, 1).
 
     Examples
     --------
@@ -141,7 +141,7 @@ class SmoothingSettings:
     Parameters
     ----------
     lag_s : float
-        How long states stay in the graph, s: longer than anybody is heard before he is seen.
+        How long states stay in the graph, s: longer than a vehicle is heard before it is seen.
     acceleration_psd : float
         Density of the white acceleration, m^2/s^3.
     robust_k : float

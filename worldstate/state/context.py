@@ -8,7 +8,7 @@ from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
 _LEAST_STD_RAD, _FASTEST_HZ, _FASTEST_EGO_MPS = 1e-4, 100.0, 100.0
-_PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: who comes past it is in view
+_PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: a vehicle that comes past it is in view
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +108,12 @@ class Occluder:
     edge_std_rad : float
         Standard deviation of the edge.
     pace_hz : float
-        Speed of who comes behind it over the distance of their lane, 1/s: how fast the tangent of their
+        Speed of vehicles behind it over the distance of their lane, 1/s: how fast the tangent of their
         azimuth falls.
     assumed : bool
-        Whether this is the corner of a usual junction, since nobody said what stands here.
+        Whether this is the corner of a usual junction, since it is not known what stands here.
     hides : bool
-        Whether it hides anybody: not on an open road, and no longer once the ego vehicle is past it. Who is
+        Whether it hides vehicles: not on an open road, and no longer once the ego vehicle is past it. What is
         heard from this side is then in view, or outside of the camera's view, never hidden.
     corner_m : (float, float) or None
         Its corner in the map frame, metres; with it the edge moves as the ego vehicle does.
@@ -183,7 +183,7 @@ def corner_at(
 ) -> Occluder:
     r"""Return the occluder whose corner stands at a place.
 
-    Who comes along the crossing lane, ``crossing_m`` ahead, is seen past the corner once
+    A vehicle in the crossing lane, ``crossing_m`` ahead, is seen past the corner once
 
     .. math:: \tan\theta \le \tan a = y_c / x_c
 
@@ -240,7 +240,7 @@ def corner_at(
 
 
 def open_side(direction: str, side: int) -> Occluder:
-    """Return an approach side on which nothing hides anybody: an open road; `side` is 1 left, -1 right.
+    """Return an approach side without an occluder: an open road; `side` is 1 left, -1 right.
 
     Examples
     --------
@@ -258,8 +258,8 @@ def seen_from(
     .. math:: a' = \operatorname{atan2}(y_c - y, x_c - x) - \psi, \qquad
               \sigma_{a'}^2 = \sigma_a^2 + \sigma_{xy}^2 / r^2 + \sigma_\psi^2
 
-    One whose corner nobody told in metres stands wherever the ego vehicle is. One that it has passed hides
-    nobody any more.
+    One whose corner is not given in metres stands wherever the ego vehicle is. One that it has passed hides
+    nothing any more.
 
     Examples
     --------
@@ -289,7 +289,7 @@ def seen_from(
 
 
 def _hidden_behind(ahead_m: float, beside_m: float, pace_hz: float) -> tuple[float, float]:
-    """Return azimuth and deviation of who comes in two seconds, give or take one, behind a corner."""
+    """Return azimuth and deviation of a vehicle that comes in two (+- 1) seconds, behind a corner."""
     slope = abs(beside_m) / ahead_m
     near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
     # Of a corner far away or at hand the second makes no difference.

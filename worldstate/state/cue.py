@@ -44,8 +44,8 @@ class EvidenceTerms:
     Parameters
     ----------
     hypothesis : {"coming", "hidden", "announced"}
-        Somebody comes into view from this side within three seconds, by the alarm of a sequence model;
-        somebody is hidden on any side, by the sustained rule; or by the rule of messages alone.
+        A vehicle comes into view from this side within three seconds, by the alarm of a sequence model;
+        a vehicle is hidden on any side, by the sustained rule; or by the rule of messages alone.
     terms_nats : mapping of str to float
         By what was said: the prior, the sequence or the window, each sensor's look, what has just come into
         view, messages; each given those before it, so that they add up.
@@ -73,7 +73,7 @@ class RiskCue:
     .. math:: r_k = P(hid_k \mid y_{1:t}) \quad\text{or}\quad
               r_k = g(P(hid \mid y_{1:t}))\, P(k \mid hid, y_{1:t})
 
-    With a sequence model r_k is the calibrated probability that somebody comes into view from there within
+    With a sequence model r_k is the calibrated probability that a vehicle comes into view from there within
     eight seconds; sides do not exclude each other. Without one g is the calibrated monotone map of the
     policy, and the risks of all directions add up to that of a hidden road user at all.
 
@@ -104,11 +104,11 @@ class RiskCue:
     horizon_s : float or None
         Best time to visible where one is stated, else time to arrival of that entity; None where unknown.
     within : mapping of str to float, or None
-        Probability that somebody comes into view from there within so many seconds ("0.5", "1", "2", "3");
+        Probability that a vehicle comes into view from there within so many seconds ("0.5", "1", "2", "3");
         None without a sequence model.
     time_to_visible_s : (float, float, float) or None
         Low, best and high; the interval holds nine of ten. None where no advisory names the direction and it
-        is likelier than not that nobody comes within five seconds.
+        is likelier than not that none comes within five seconds.
     sector_rad : (float, float) or None
         Where it is in nine of ten cases: from this azimuth to the left until that one.
     evidence : EvidenceTerms or None

@@ -167,7 +167,7 @@ class Event:
     entity_id : str
         Whose.
     into : str or None
-        As whom a merged one goes on; None of all other kinds.
+        Under which id a merged one goes on; None of all other kinds.
 
     Examples
     --------
@@ -195,7 +195,7 @@ class Relation:
     kind : str
         ``"occluded_by"``, ``"approaching_from"`` and ``"emerged_from"`` lead to an occluder,
         ``"approaching"`` and ``"conflicts_with_ego_path"`` (on the path ahead of it within five seconds) to
-        the ego vehicle, ``"same_lane"`` and ``"in_front_of"`` to whom an entity is next ahead of, the ego
+        the ego vehicle, ``"same_lane"`` and ``"in_front_of"`` to what an entity is next ahead of, the ego
         vehicle or another entity; these three are told of entities with a position.
     probability : float
         Probability that it holds, given that both ends exist.

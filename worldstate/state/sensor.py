@@ -42,7 +42,7 @@ class SearchedView:
     Parameters
     ----------
     sensor : str
-        Who looked.
+        The one that looked.
     stamp_ns : int
         When, ns.
     found : bool

@@ -137,7 +137,7 @@ def polar_motion(
     """Return the belief in modified polar coordinates, to first order."""
     x, y, vx, vy = np.moveaxis(belief.mean, -1, 0)
     vx, r = vx - ego_speed_mps, np.hypot(x, y)
-    # Moved out to the nearest distance; who is at the array itself is taken to be ahead of it.
+    # Moved out to the nearest distance; an entity at the array itself is taken to be ahead of it.
     farther = _NEAREST_M / np.clip(r, 1e-9, _NEAREST_M)
     x, y = np.where(r > 1e-9, x * farther, _NEAREST_M), y * farther
     square = x * x + y * y

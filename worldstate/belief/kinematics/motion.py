@@ -173,7 +173,7 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: float | Float
     start = belief.mean.copy()
     if step_s > 0.0:
         start[..., RADIAL_RATE] = np.maximum(start[..., RADIAL_RATE], -_CLOSEST_SHARE / step_s)
-    # Clipped before exp: approach rates that contradict each other drive log r, which nobody measures, so far
+    # Clipped before exp: approach rates that contradict each other drive log r, which is not measured, so far
     # that exp overflows.
     range_m = np.exp(np.clip(belief.mean[..., LOG_RANGE], math.log(NEAREST_M), math.log(FARTHEST_M)))
     flow = jacobian(start, step_s)
