@@ -235,15 +235,6 @@ class SourceEvidence:
 
 
 @dataclass(frozen=True, slots=True)
-class LaggedBelief:
-    """A belief that shares no samples with the present window, and the evidence of other sources since."""
-
-    stamp_ns: int
-    belief: ExplanationBelief
-    log_likelihoods: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
 class BeliefLag:
     r"""Past beliefs over one window W; the update starts from the one that is W old.
 
@@ -253,7 +244,7 @@ class BeliefLag:
     --------
     >>> belief = ExplanationBelief.from_priors(2, 0.2, 0.3, 0.5)
     >>> lag = BeliefLag(((0, belief),))
-    >>> lag.base("acoustic", 10**9, window_ns=10**9).stamp_ns
+    >>> lag.base("acoustic", 10**9, window_ns=10**9)[0]
     0
     """
 
@@ -266,15 +257,15 @@ class BeliefLag:
     beliefs: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
     heard: tuple[SourceEvidence, ...] = ()  # Most recent evidence of each source, sorted by its name
 
-    def base(self, source: str, stamp_ns: int, window_ns: int) -> LaggedBelief:
-        """Return the newest belief that is a window old, or the oldest there is."""
+    def base(self, source: str, stamp_ns: int, window_ns: int) -> tuple[int, ExplanationBelief, FloatArray]:
+        """Return the newest belief that is a window old, its time, ns, and the evidence of others since."""
         old = [past for past in self.beliefs if past[0] <= stamp_ns - window_ns + SLACK_NS]
         since_ns, belief = old[-1] if old else self.beliefs[0]
         others = np.zeros(belief.k + 2)
         for other in self.heard:
             if other.source != source and other.stamp_ns > since_ns:
                 others += other.log_likelihoods
-        return LaggedBelief(since_ns, belief, others)
+        return since_ns, belief, others
 
     def add(self, heard: SourceEvidence, belief: ExplanationBelief, window_ns: int) -> "BeliefLag":
         """Return the lag with one more posterior, without those that no later window needs."""

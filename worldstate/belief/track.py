@@ -175,13 +175,13 @@ def follow_places(tracks: Sequence[Track], site: SiteGeometry) -> tuple[Track, .
     if not places:
         return tuple(tracks)
     polar = polar_motion(CartesianBelief.stacked(places), site.ego_speed_mps, site.ego_yaw_rate_rad_s)
-    motions = iter(polar.each())
-    return tuple(track if track.place is None else _followed(track, next(motions), site) for track in tracks)
-
-
-def _followed(track: Track, motion: MotionBelief, site: SiteGeometry) -> Track:
-    behind = site.sides[track.side].behind(motion.azimuth_rad, motion.azimuth_std_rad)
-    return replace(track, motion=motion, behind=behind)
+    motions, followed = iter(polar.each()), list(tracks)
+    for i, track in enumerate(tracks):
+        if track.place is not None:
+            motion = next(motions)
+            behind = site.sides[track.side].behind(motion.azimuth_rad, motion.azimuth_std_rad)
+            followed[i] = replace(track, motion=motion, behind=behind)
+    return tuple(followed)
 
 
 def relabelled(

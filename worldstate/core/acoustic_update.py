@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldstate.belief.explanation import HiddenBelief
 from worldstate.belief.kinematics.motion import (
     MotionBelief,
     log_azimuth_likelihood,
@@ -40,7 +39,9 @@ def acoustic_update(
     if weight <= 0.0 or silent or not at:
         return memory
     updated, tracks, sides = list(memory.tracks), [memory.tracks[i] for i in at], memory.sides
-    sounding = [_sounding(track, sides, memory.explanation.visible) for track in tracks]
+    visible = memory.explanation.visible
+    # P(this entity is the source of this window's sound)
+    sounding = [visible * one.existence if one.seen else sides.existence(one.side) for one in tracks]
     motion = MotionBelief.stacked([track.motion for track in tracks])
     if not isinstance(bearing, NotUsable):
         paths = [_path(bearing.std_rad, hidden_share(track, sides), settings) for track in tracks]
@@ -93,8 +94,3 @@ def _path(std_rad: float, share: float, settings: FilterSettings) -> tuple[float
     own_rad = min(std_rad, settings.line_of_sight_std_rad)
     astray = (std_rad**2 - own_rad**2) / _ANYWHERE_RAD2
     return own_rad, min(max(1.0 - astray, 0.0), settings.line_of_sight_path_probability)
-
-
-def _sounding(track: Track, sides: HiddenBelief, visible: float) -> float:
-    """Return the probability that this entity is the source of this window's sound."""
-    return visible * track.existence if track.seen else sides.existence(track.side)

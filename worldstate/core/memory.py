@@ -133,13 +133,19 @@ class Memory:
 
 def first_memory(context: Context, start_ns: int) -> Memory:
     """Return the memory of a filter that has measured nothing."""
-    directions, explanation = context.directions, _first_explanation(context)
+    k, priors = len(context.directions), context.priors
+    # Without priors the filter starts as if it had waited for ever: neither alarmed nor sure of an empty
+    # street.
+    if priors is None:
+        explanation = ExplanationBelief.settled(k, context.rates.values_hz)
+    else:
+        explanation = ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)
     return Memory(
         stamp_ns=start_ns,
         explanation=explanation,
         lag=BeliefLag(((start_ns, explanation),)),
-        births=(0,) * len(directions),
-        handover_ns=(None,) * len(directions),
+        births=(0,) * k,
+        handover_ns=(None,) * k,
     )
 
 
@@ -148,12 +154,3 @@ def priors_of(explanation: ExplanationBelief) -> Priors:
     # A sum of exponentials may exceed one by rounding, which readers of a snapshot refuse.
     values = (explanation.hidden_total, explanation.visible, explanation.none)
     return Priors(*(min(value, 1.0) for value in values))
-
-
-def _first_explanation(context: Context) -> ExplanationBelief:
-    k, priors = len(context.directions), context.priors
-    # Without priors the filter starts as if it had waited for ever: neither alarmed nor sure of an empty
-    # street.
-    if priors is None:
-        return ExplanationBelief.settled(k, context.rates.values_hz)
-    return ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)

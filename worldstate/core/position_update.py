@@ -80,15 +80,6 @@ def position_update(memory: Memory, scan: PositionScan, weight: float, site: Sit
     return after_look(memory, follow_places(after, site), whose, scan.stamp_ns, site)
 
 
-def _log_new(scan: PositionScan, site: SiteGeometry) -> float:
-    """Return the log density of unknown objects, 1/m^2."""
-    searched = scan.searched
-    area_m2 = _RADIO_AREA_M2
-    if searched is not None:
-        area_m2 = max(searched.sector.half_width_rad * searched.range_m**2, 1.0)
-    return math.log(site.settings.unheard_probability / area_m2)
-
-
 def _log_ratios(
     tracks: tuple[Track, ...], positions: tuple[Position, ...], scan: PositionScan, site: SiteGeometry
 ) -> FloatArray:
@@ -96,7 +87,7 @@ def _log_ratios(
 
     .. math:: \log \frac{r\, p_D\, N(z; H m, H P H^T + R)}{(1 - r p_D)\, N(z_v; 0, V + R_v)} \frac{A}{u}
 
-    The velocity enters by how much likelier it is than that of any other, so that an entity without a place is
+    The velocity enters by how much likelier it is than that of another, so that an entity without a place is
     scored in the same units, by its azimuth and range.
     """
     if not tracks or not positions:
@@ -112,7 +103,11 @@ def _log_ratios(
         scores[:, others] = _polar([tracks[i] for i in others], z, noise, scan.searched is not None, site)
     found = 0.0 if scan.searched is None else scan.searched.detection_probability
     existence = np.array([track.existence for track in tracks]).clip(_LEAST_EXISTENCE, _MOST_EXISTENCE)
-    ratios = scores + np.log(existence * (found or 1.0)) - np.log1p(-existence * found) - _log_new(scan, site)
+    area_m2 = _RADIO_AREA_M2
+    if scan.searched is not None:
+        area_m2 = max(scan.searched.sector.half_width_rad * scan.searched.range_m**2, 1.0)
+    log_new = math.log(site.settings.unheard_probability / area_m2)
+    ratios = scores + np.log(existence * (found or 1.0)) - np.log1p(-existence * found) - log_new
     return np.where(scores > FORBIDDEN, ratios, FORBIDDEN)
 
 

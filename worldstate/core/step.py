@@ -199,11 +199,11 @@ def update_evidence(memory: Memory, measurement: Measurement, weight: float, mod
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
     settings, source, stamp_ns = model.site.settings, measurement.source, measurement.stamp_ns
     window_ns = nanoseconds(settings.window_s)
-    base = memory.lag.base(source, stamp_ns, window_ns)
-    prior = base.belief.predict(model.context.rates.values_hz, stamp_ns - base.stamp_ns)
+    base_ns, belief, others = memory.lag.base(source, stamp_ns, window_ns)
+    prior = belief.predict(model.context.rates.values_hz, stamp_ns - base_ns)
     answer = log_co_evidence(measurement.co_evidence, len(model.site.sides))
     signature = _with_hand_overs(measurement.signature, memory.handover_ns, stamp_ns - window_ns)
-    explanation = prior.update(signature, answer + base.log_likelihoods)
+    explanation = prior.update(signature, answer + others)
     # -inf would stay for the length of the lag and cannot be written as JSON.
     own = np.maximum(signature.log_likelihoods + answer, LOG_FLOOR)
     evidence = SourceEvidence(source, stamp_ns, tuple(own.tolist()))

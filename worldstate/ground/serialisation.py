@@ -226,17 +226,13 @@ def _plan(hint: Hint) -> Plan:
 
 def _annotated(hint: Hint, notes: tuple[object, ...]) -> Plan:
     if isinstance(notes[0], Via):
-        return _via(notes[0])
+        note, (write, read) = notes[0], _plan(notes[0].hint)
+        return lambda value: write(note.write(value)), _then(read, note.read)
     if isinstance(notes[0], Keys):
         names = notes[0].names
         return _keyed(names, get_args(hint) if len(names) > 1 else (hint,))
     write, read = _plan(hint)
     return write, _checked(read, notes[0]) if isinstance(notes[0], Check) else read
-
-
-def _via(note: Via) -> Plan:
-    write, read = _plan(note.hint)
-    return lambda value: write(note.write(value)), _then(read, note.read)
 
 
 def _as_is(value: Any) -> Any:

@@ -351,14 +351,11 @@ class FixedLagSmoother:
     def _go_on(self, one: _Entity, stamp_ns: int) -> None:
         """Add the next state of an entity, reached at constant velocity."""
         last_ns = one.stamps_ns[-1]
-        before, step_s = self._state_node(one, last_ns), seconds(stamp_ns - last_ns)
+        key, step_s = one.keys[last_ns], seconds(stamp_ns - last_ns)
+        before = f.Node(key, self._graph.value(key), one.anchor_m)
         state = moved(before.state, step_s)
         after = f.Node(self._add_state(one, stamp_ns, state), state, one.anchor_m)
         self._graph.add(f.motion_factor(before, after, step_s, f.motion_noise(self.settings, step_s)))
-
-    def _state_node(self, one: _Entity, stamp_ns: int) -> f.Node:
-        key = one.keys[stamp_ns]
-        return f.Node(key, self._graph.value(key), one.anchor_m)
 
     def _node(self, one: _Entity, stamp_ns: int) -> f.Node:
         """Return the state nearest to a stamp, with the ego as it was then."""

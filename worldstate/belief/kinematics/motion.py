@@ -79,15 +79,11 @@ def process_noise(
     acceleration_psd: float | FloatArray, range_m: float | FloatArray, step_s: float
 ) -> FloatArray:
     r"""Return Q, shape (..., 4, 4), of a white acceleration: at range r it turns and closes by a/r."""
-    q = np.asarray(acceleration_psd / np.square(range_m))
-    return q[..., None, None] * _unit_noise(step_s)
-
-
-def _unit_noise(t: float) -> FloatArray:
-    twice, once, rate = t**3 / 3.0, t**2 / 2.0, t
-    return np.array(
+    twice, once, rate = step_s**3 / 3.0, step_s**2 / 2.0, step_s
+    unit = np.array(
         [[twice, once, 0.0, 0.0], [once, rate, 0.0, 0.0], [0.0, 0.0, rate, once], [0.0, 0.0, once, twice]]
     )
+    return np.asarray(np.asarray(acceleration_psd / np.square(range_m))[..., None, None] * unit)
 
 
 def _checked_covariance(row: FloatArray) -> FloatArray:
