@@ -17,7 +17,7 @@ from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STA
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
-from worldstate_lab.streets.simulated_windows import simulated_windows
+from worldstate_lab.streets.simulated_windows import simulated_window_pair
 from worldstate_lab.trials.classification import (
     Classifiers,
     classified,
@@ -246,7 +246,7 @@ def test_simulated_training_windows_are_kept_and_are_of_other_recordings(tmp_pat
     again, _ = windows_from_simulation(tmp_path, 1, per_approach=1, sites=("SA1",))
     assert path.stat().st_mtime_ns == written
     assert np.array_equal(first.features, again.features)
-    of_the_seed = simulated_windows(1, 1, sites=("SA1",))
+    of_the_seed, _ = simulated_window_pair(1, 1, sites=("SA1",))
     assert not np.isclose(first.features[:, None, 0], of_the_seed.features[None, :, 0]).any()
     assert "other recordings" in said
 

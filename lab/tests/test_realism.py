@@ -24,7 +24,7 @@ from worldstate_lab.streets.simulated_windows import (
     RATE_HZ,
     WindowPlan,
     permuted_array,
-    simulated_windows,
+    simulated_window_pair,
     window_features,
     windows_of_recording,
 )
@@ -243,7 +243,7 @@ def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
 
     monkeypatch.setattr("worldstate_lab.streets.simulated_windows.simulate_recording", rendered)
     monkeypatch.setattr("worldstate_lab.streets.simulated_windows.window_features", feature)
-    table = simulated_windows(20, 1, sites=("SA1", "DA1"))
+    table, _ = simulated_window_pair(20, 1, sites=("SA1", "DA1"))
     assert table.labels[:6].tolist() == ["left", "front", "right", "front", "none", "none"]
     assert len(np.unique(table.recordings)) == 160
     hidden = np.array([found[0] for found in ends.values()])

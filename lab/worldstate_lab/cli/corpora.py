@@ -19,9 +19,8 @@ say SIMULATED, and the rows of the published corpora are listed with the command
 """
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
 from worldstate.operations.figure_style import BLUE, ORANGE, RED, figure_file, legend_beside
+from worldstate_lab.report.table import plain
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, hear_clips
 from worldstate_lab.signatures.fisher_profile import draw_band_profile
 from worldstate_lab.signatures.signature_study import (
@@ -52,20 +52,6 @@ if TYPE_CHECKING:
 
 
 CHANCE = 0.5  # Of both figures: a row whose interval holds it has separated nothing
-
-
-def study_values(study: SignatureStudy) -> dict[str, Any]:
-    """Return the study as JSON-able values; a ratio of two constants, which is infinite, is None."""
-    profile = None
-    if study.profile is not None:
-        values = {name: np.asarray(value).tolist() for name, value in asdict(study.profile).items()}
-        profile = {name: [one if np.isfinite(one) else None for one in row] for name, row in values.items()}
-    return {
-        "simulated": study.simulated,
-        "rows": [asdict(row) for row in study.rows],
-        "profile": profile,
-        "left_out": list(study.left_out),
-    }
 
 
 def study_lines(study: SignatureStudy) -> list[str]:
@@ -165,8 +151,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     corpora, stated = (published_corpora(arguments), []) if given else _simulated(arguments, simulation)
     with progress_bar("measuring", len(QUESTIONS)) as bar:
         study = signature_study(*corpora, draws, bar.advance)
-    report = study_values(study) | {"assumptions": stated}
-    lines = [*stated, *study_lines(study), *_left_out(study.left_out)]
+    report = plain(study) | {"assumptions": stated}
+    lines = [*stated, *study_lines(study)]
+    if study.left_out:
+        lines += ["", f"left out: {len(study.left_out)} clips; the first: {study.left_out[0]}"]
     if arguments.out is not None:
         write_report(arguments.out / NAMES[0], report)
         write_text(arguments.out / NAMES[1], "\n".join(lines) + "\n")
@@ -196,9 +184,3 @@ def _simulated(arguments: argparse.Namespace, rng: np.random.Generator) -> tuple
         corpora = simulated_corpora(arguments.recordings, rng, arguments.jobs, bar.advance)
     stated = ["SIMULATED sound: no published corpus was given", *(one.assumptions() for one in STREETS)]
     return corpora, stated
-
-
-def _left_out(problems: tuple[str, ...]) -> list[str]:
-    if not problems:
-        return []
-    return ["", f"left out: {len(problems)} clips; the first: {problems[0]}"]

@@ -39,8 +39,13 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
     "impacts": ("steps", "rain"),
     "birds": ("birds",),
 }
+# What a guard has not heard, and the kinds that it judges: nothing, every kind, every family of several.
+EXAMS: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = (
+    ("nothing", (), (*STREET, *FOREIGN, *SIGNALS)),
+    *((kind, (kind,), (kind,)) for kind in FOREIGN),
+    *((family, kinds, kinds) for family, kinds in FAMILIES.items() if len(kinds) > 1),
+)
 _FOREIGN, _SIGNAL = 1.0, 2.0
-GUARDS = 1 + len(FOREIGN) + sum(len(kinds) > 1 for kinds in FAMILIES.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,43 +62,27 @@ class GuardShares:
 
 def guard_exam(rows: SoundRows, advance: Callable[[], object] = lambda: None) -> list[GuardShares]:
     """Judge every kind by a guard that knows all kinds, by one without it, and by one without its family."""
-    found = _judged(rows, "nothing", (), (*STREET, *FOREIGN, *SIGNALS), advance)
-    for kind in FOREIGN:
-        found += _judged(rows, kind, (kind,), (kind,), advance)
-    for family, kinds in FAMILIES.items():
-        if len(kinds) > 1:
-            found += _judged(rows, family, kinds, kinds, advance)
-    return found
-
-
-def _judged(
-    rows: SoundRows,
-    name: str,
-    without: Collection[str],
-    kinds: Collection[str],
-    advance: Callable[[], object],
-) -> list[GuardShares]:
-    verdicts = _verdicts(rows, without, kinds)
-    advance()
     found = []
-    for kind in kinds:
-        here = rows.kinds == kind
-        by_site = [
-            float((verdicts[here & (rows.sites == one)] > 0).mean()) for one in np.unique(rows.sites[here])
-        ]
-        if not by_site:
-            continue
-        found.append(
-            GuardShares(
-                without=name,
-                kind=kind,
-                hops=int(here.sum()),
-                foreign=float((verdicts[here] == _FOREIGN).mean()),
-                signal=float((verdicts[here] == _SIGNAL).mean()),
-                worst_site=max(by_site) if kind in STREET else min(by_site),
-            )
-        )
+    for name, without, kinds in EXAMS:
+        verdicts = _verdicts(rows, without, kinds)
+        found += [_shares(rows, verdicts, name, kind) for kind in kinds if (rows.kinds == kind).any()]
+        advance()
     return found
+
+
+def _shares(rows: SoundRows, verdicts: FloatArray, without: str, kind: str) -> GuardShares:
+    here = rows.kinds == kind
+    by_site = [
+        float((verdicts[here & (rows.sites == one)] > 0).mean()) for one in np.unique(rows.sites[here])
+    ]
+    return GuardShares(
+        without=without,
+        kind=kind,
+        hops=int(here.sum()),
+        foreign=float((verdicts[here] == _FOREIGN).mean()),
+        signal=float((verdicts[here] == _SIGNAL).mean()),
+        worst_site=max(by_site) if kind in STREET else min(by_site),
+    )
 
 
 def _verdicts(rows: SoundRows, without: Collection[str], kinds: Collection[str]) -> FloatArray:
@@ -121,9 +110,9 @@ def _verdicts(rows: SoundRows, without: Collection[str], kinds: Collection[str])
 
 def _code(guard: DomainGuard, measures: FloatArray) -> float:
     verdict = guard.judge(measures)
-    return (
-        _SIGNAL if isinstance(verdict, WarningSignal) else _FOREIGN if isinstance(verdict, Foreign) else 0.0
-    )
+    if isinstance(verdict, WarningSignal):
+        return _SIGNAL
+    return _FOREIGN if isinstance(verdict, Foreign) else 0.0
 
 
 NAMES = ("foreign_sounds.json", "foreign_sounds.txt")
@@ -155,7 +144,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         raise InvalidArgumentError(f"NPZ: expected streams of {SITES} sites or more, got {', '.join(sites)}")
     # One microphone is heard: of which array it is the middle makes no difference that a level would not.
     rows = guard_rows(ovad_array(), streams, np.random.default_rng(arguments.seed), arguments.sounds)
-    with progress_bar("training guards", GUARDS) as bar:
+    with progress_bar("training guards", len(EXAMS)) as bar:
         found = guard_exam(rows, bar.advance)
     lines = [f"{'kind':14}{'guard without':16}{'hops':>7}{'foreign':>9}{'signal':>8}{'worst site':>12}"]
     lines += [

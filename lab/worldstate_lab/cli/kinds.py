@@ -128,13 +128,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("--junctions", type=int, default=16, metavar="N", help="drawn ones (default: %(default)s)")
-    add(
-        "--passes",
-        type=int,
-        default=2,
-        metavar="N",
-        help="of each kind at each of them (default: %(default)s)",
-    )
+    of_each = "of each kind at each of them (default: %(default)s)"
+    add("--passes", type=int, default=2, metavar="N", help=of_each)
     add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="that were listened to")
     add("--seed", type=int, default=0, help="who drives how (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")

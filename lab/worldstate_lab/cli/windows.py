@@ -94,7 +94,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def _evaluate_method(
     arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
 ) -> tuple[Figures, list[Predictions]]:
-
     row = row_of(arguments.method, arguments.protocol, arguments.reference)
     passes = _passes(arguments, whole, table, row)
     detail = report(table, passes[row]) if row == "baseline" else {}
@@ -110,6 +109,8 @@ def _passes(
     in_range("--seeds", arguments.seeds, 1, 10_000)
     in_range("--jobs", arguments.jobs, 1, 256)
     afar = arguments.protocol == "transfer"
+    if afar and arguments.group != "dynamic":
+        raise InvalidArgumentError("--protocol transfer: expected --group dynamic, static is learned from")
     names = (row, *rows_beside(row, arguments.protocol, arguments.reference))
     methods = list(dict.fromkeys(ROWS[name].method for name in names))
     with progress_bar("evaluating", arguments.seeds * len(methods)) as bar:
@@ -119,7 +120,7 @@ def _passes(
             arguments.protocol,
             seeds=arguments.seeds,
             alpha=arguments.alpha,
-            train=_standing(whole, arguments) if afar else None,
+            train=whole.group("static") if afar else None,
             simulated=read_beside(arguments, table),
             jobs=arguments.jobs,
             on_pass=bar.advance,
@@ -129,19 +130,11 @@ def _passes(
 def _evaluate_model(
     arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
 ) -> tuple[Figures, list[Predictions]]:
-
     predictions = predict_held_out(
         read_model(arguments.model), table, arguments.alpha, arguments.reference, np.random.default_rng(0)
     )
     figures = _origin(arguments, "model", "held-out", 1) | report(table, [predictions])
     return figures, [predictions[1.0]]
-
-
-def _standing(whole: FeatureTable, arguments: argparse.Namespace) -> FeatureTable:
-
-    if arguments.group != "dynamic":
-        raise InvalidArgumentError("--protocol transfer: expected --group dynamic, static is learned from")
-    return whole.group("static")
 
 
 def _origin(arguments: argparse.Namespace, method: str, protocol: str, seeds: int) -> Figures:

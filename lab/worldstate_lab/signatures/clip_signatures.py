@@ -86,8 +86,7 @@ class ClipSignatures:
 
     def select(self, chosen: BoolArray | IndexArray) -> "ClipSignatures":
         """Return these rows."""
-        names = ("energy", "kinds", "microphones", "recordings", "sites", "splits")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
 
 @cache

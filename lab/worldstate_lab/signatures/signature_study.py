@@ -228,7 +228,7 @@ def _rows(
 
 @dataclass(frozen=True, slots=True)
 class _Question:
-    """What a row asks: who is to be told from background, by what, learned where, heard where."""
+    """What a row asks: what is to be told from background, by what, learned where, heard where."""
 
     by: By
     train: Corpus
@@ -288,13 +288,12 @@ class _Corpora:
         if missing:
             return replace(row, note=NOWHERE if question.kind == ELECTRIC else command(*names))
         scored = self._scores(question)
-        return replace(row, note=TOO_FEW) if scored is None else self._measured(row, scored, question.kind)
-
-    def _measured(self, row: SignatureRow, scored: _Scored, kind: str) -> SignatureRow:
-        measure, scores = FIGURES[row.figure], scored.of(kind)
+        if scored is None:
+            return replace(row, note=TOO_FEW)
+        measure, scores = FIGURES[row.figure], scored.of(question.kind)
         value = measure(scores)
         if np.isnan(value):
-            return replace(row, note=f"no clip of {kind}")
+            return replace(row, note=f"no clip of {question.kind}")
         low, high = interval(measure, scores, self.rng)
         worst = scores.worst_site if measure is area else None
         note = scored.split + (f"; worst site {worst[0]} {worst[1]:.3f}" if worst else "")

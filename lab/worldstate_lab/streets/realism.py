@@ -241,10 +241,8 @@ def allowed_span(figure: str, spans: Sequence[Span]) -> Span | None:
     """
     if not spans or figure.startswith(_NO_VERDICT):
         return None
-    low, high = min(span[0] for span in spans), max(span[1] for span in spans)
-    return 0.0 if figure.startswith(LOWER_IS_NEARER) else low, 1.0 if figure.startswith(
-        HIGHER_IS_NEARER
-    ) else high
+    low = 0.0 if figure.startswith(LOWER_IS_NEARER) else min(span[0] for span in spans)
+    return low, 1.0 if figure.startswith(HIGHER_IS_NEARER) else max(span[1] for span in spans)
 
 
 def median_figures(real: FeatureTable, simulated: Mapping[str, FeatureTable]) -> list[RealismRow]:
@@ -282,20 +280,15 @@ def side_rows(real: FeatureTable, simulated: Mapping[str, FeatureTable]) -> list
         span = (min(known.values()), max(known.values())) if known else None
         allowed = allowed_span("side", [span] if span else [])
         for way in _WAYS if simulated else ("real to real",):
-            ours = {
-                name: _with_mean(side_accuracy(*_in_order(way, real, table), without_site_mean=adapted))
-                for name, table in simulated.items()
-            }
+            ours = {}
+            for name, table in simulated.items():
+                train, test = ({"real": real, "simulated": table}[word] for word in way.split(" to "))
+                ours[name] = _with_mean(side_accuracy(train, test, without_site_mean=adapted))
             for site in known:
                 figure = f"side, {way}{said}"
                 found = {name: by_site[site] for name, by_site in ours.items() if site in by_site}
                 rows.append(RealismRow(figure, site, known[site], span, None, allowed, found))
     return rows
-
-
-def _in_order(way: str, real: FeatureTable, simulated: FeatureTable) -> tuple[FeatureTable, FeatureTable]:
-    train, test = ({"real": real, "simulated": simulated}[word] for word in way.split(" to "))
-    return train, test
 
 
 def _with_mean(by_site: Mapping[str, float]) -> dict[str, float]:

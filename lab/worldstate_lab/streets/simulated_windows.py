@@ -62,21 +62,6 @@ class WindowPlan:
     seed: np.random.SeedSequence
 
 
-def simulated_windows(
-    per_approach: int,
-    seed: int,
-    *,
-    sites: Sequence[str] = SITES,
-    jobs: int = 1,
-    levels: Preset | None = None,
-    progress: Callable[[], None] = lambda: None,
-) -> FeatureTable:
-    """Simulate windows of junctions."""
-    return simulated_window_pair(
-        per_approach, seed, sites=sites, jobs=jobs, levels=levels, progress=progress
-    )[0]
-
-
 def simulated_window_pair(
     per_approach: int,
     seed: int,

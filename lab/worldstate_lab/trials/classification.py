@@ -22,7 +22,7 @@ from worldstate.operations.training.training import TrainingSettings, fit_ensemb
 from worldstate.simulation.scene.junction import SITES
 from worldstate.simulation.scene.presets import DEFAULT_PRESET, preset
 from worldstate_lab.features.published_classifier import PublishedClassifier
-from worldstate_lab.streets.simulated_windows import LAYOUT, simulated_windows
+from worldstate_lab.streets.simulated_windows import LAYOUT, simulated_window_pair
 
 from .pass_cache import origin_of
 from .takes import TakeList
@@ -209,10 +209,10 @@ def windows_from_simulation(
     if not path.is_file():
         # Apart from the seeds that recordings are made with: no window is one of a tested recording.
         apart = int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])
-        write_features(
-            path,
-            simulated_windows(per_approach, apart, sites=sites, jobs=jobs, levels=levels, progress=progress),
+        windows, _ = simulated_window_pair(
+            per_approach, apart, sites=sites, jobs=jobs, levels=levels, progress=progress
         )
+        write_features(path, windows)
     # Rendered at a quarter of the rate, with the bins of the full one: the feature is that of OVAD's array.
     table = replace(read_features(path), domain=ovad_domain(sites))
     return table, f"{len(table)} simulated windows of the same junctions, other recordings"

@@ -88,11 +88,6 @@ class BenchReport:
     peers: Mapping[str, float]  # Median of each peer that is installed; empty where none is
     ratios: Mapping[str, float]  # Cost of the peer over ours on the same work: see `settings`
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        stages = {name: {"median_ms": median, "p99_ms": p99} for name, (median, p99) in self.stages.items()}
-        return {**encode(self), "stages": stages}
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -112,7 +107,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             runs.append(_one_round(street, noise))
             bar.advance()
     report = _report(runs, kernels)
-    return CommandResult(report.to_dict(), table={}, lines=report_lines(report))
+    stages = {name: {"median_ms": median, "p99_ms": p99} for name, (median, p99) in report.stages.items()}
+    return CommandResult({**encode(report), "stages": stages}, table={}, lines=report_lines(report))
 
 
 def report_lines(report: BenchReport) -> list[str]:
