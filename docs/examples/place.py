@@ -1,8 +1,7 @@
 """A place behind the corner, for known walls and array: python docs/examples/place.py."""
 
 import numpy as np
-from worldstate_lab.places.place_filter import PlaceFilter
-from worldstate_lab.places.place_measurements import PlaceMeasurements
+from worldstate_lab.places.place_filter import PlaceFilter, PlaceMeasurements
 from worldstate_lab.places.spectrum_model import SpectrumModel, StreetWalls
 
 from worldstate import WorldFilter, WorldState

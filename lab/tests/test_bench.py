@@ -3,8 +3,16 @@
 import json
 
 import numpy as np
-from worldstate_lab.benchmarks.cost_of_evidence import PARTS, _adapter, _guard, _sequence, _windows
-from worldstate_lab.benchmarks.cost_of_stages import GOAL, MORE, RATE_HZ
+from worldstate_lab.benchmarks.hop_costs import (
+    GOAL,
+    MORE,
+    PARTS,
+    RATE_HZ,
+    _adapter,
+    _guard,
+    _sequence,
+    _windows,
+)
 from worldstate_lab.cli.bench.cost import EVERYTHING, BenchReport, _front_end_times, _source, report_lines
 from worldstate_lab.cli.main import main
 

@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from worldstate_lab.cli.place import followed_places
 from worldstate_lab.places.junctions import WALLS, place_models, simulated_pass
-from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter
-from worldstate_lab.places.place_measurements import PlaceMeasurements
-from worldstate_lab.places.sound_paths import StreetWalls, sound_paths
-from worldstate_lab.places.spectrum_model import SpectrumModel
+from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter, PlaceMeasurements
+from worldstate_lab.places.spectrum_model import SpectrumModel, StreetWalls, sound_paths
 
 from worldstate.frontend import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError

@@ -131,7 +131,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     of_each = "of each kind at each of them (default: %(default)s)"
     add("--passes", type=int, default=2, metavar="N", help=of_each)
     add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="that were listened to")
-    add("--seed", type=int, default=0, help="who drives how (default: %(default)s)")
+    add("--seed", type=int, default=0, help="of vehicles and drives (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--report", type=Path, metavar="JSON", help="write what was found")
 

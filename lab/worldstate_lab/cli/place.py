@@ -28,10 +28,8 @@ from worldstate_lab.places.junctions import (
     read_spectra,
     simulated_pass,
 )
-from worldstate_lab.places.place_filter import PlaceEstimate, PlaceFilter
-from worldstate_lab.places.place_measurements import PlaceMeasurements
-from worldstate_lab.places.sound_paths import StreetWalls
-from worldstate_lab.places.spectrum_model import RayModel
+from worldstate_lab.places.place_filter import PlaceEstimate, PlaceFilter, PlaceMeasurements
+from worldstate_lab.places.spectrum_model import RayModel, StreetWalls
 
 _NAME = re.compile(r"(Site[12])_([LR])_(\d+)_Trial\d+")
 

@@ -4,7 +4,7 @@ A simulated car nears blind corners in a closed loop while the states of recorde
 vehicles cross as they did and do not mind it. Three planners drive the same car under the same stopping law:
 one knows nothing and brakes for whom it sees, one assumes a vehicle behind both corners at every time, and
 one assumes it only from a chance of the state on, which is set on streams of other seeds (`--set-on`).
-Printed are collisions, braking that nobody made necessary, and time.
+Printed are collisions, braking that no vehicle made necessary, and time.
 """
 
 import argparse
@@ -42,7 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("streams", type=Path, nargs="+", metavar="NPZ", help="streams with and without approaches")
     set_on = parser.add_mutually_exclusive_group(required=True)
-    of_others = "streams of other seeds: one step below the largest chance up to which nobody is hit there"
+    of_others = "streams of other seeds: a step below the largest chance up to which no vehicle is hit there"
     set_on.add_argument("--set-on", type=Path, nargs="+", metavar="NPZ", help=of_others)
     chance = "chance within three seconds from which on a vehicle is assumed"
     set_on.add_argument("--threshold", type=float, metavar="P", help=chance)
@@ -92,7 +92,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _believed(arguments: argparse.Namespace, paths: list[Path]) -> list[BelievedStream]:
-
     follow = partial(believed_stream, model=read_model(arguments.model), cache=arguments.cache)
     found = []
     with progress_bar("following", len(paths)) as bar:

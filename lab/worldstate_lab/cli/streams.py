@@ -2,8 +2,8 @@
 
 Streams that were listened to, as `worldstate model make` keeps them, go through the filter hop by hop, with
 boxes of a camera drawn from their truth. Printed for every junction and for all: approaches warned of and how
-early, onsets an hour where nobody comes, whether both of two are found, whether a vehicle keeps its identity
-when it comes into view, what is warned of after it has passed, and how true times and bearings are.
+early, onsets an hour where no vehicle comes, whether both of two are found, whether a vehicle keeps its
+identity when it comes into view, what is warned of after it has passed, and how true times and bearings are.
 
 The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
 """
@@ -35,7 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--camera", choices=("all", "cars", "none", "dies"), default="all", help=cameras)
     add(
         "--sides", action=argparse.BooleanOptionalAction, default=True,
-        help="learn what either arm sounds like from whoever comes into view (default: on)",
+        help="learn what either arm sounds like from vehicles that come into view (default: on)",
     )  # fmt: skip
     add("--seed", type=int, default=0, help="of the camera's misses (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")

@@ -66,7 +66,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_table_options(parser)
     add_choice(parser, "--method", "", "worldstate", "baseline")
-    add_choice(parser, "--protocol", "who is held out", "cv", "lojo", "transfer")
+    add_choice(parser, "--protocol", "what is held out", "cv", "lojo", "transfer")
     add_choice(parser, "--reference", "what windows are compared with", "run", "cold", "curated")
     add("--model", type=Path, help="evaluate this model file; no cross-validation")
     only = "CSV file with a column ID: only recordings of these windows"

@@ -28,8 +28,7 @@ from worldstate.simulation.dataset.recording import simulate_recording
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.settings import SimulationSettings
 
-from .sound_paths import StreetWalls
-from .spectrum_model import SpectrumModel
+from .spectrum_model import SpectrumModel, StreetWalls
 
 N_AZIMUTHS = 180
 AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, N_AZIMUTHS))  # Of the columns, left positive

@@ -82,7 +82,7 @@ class Roadside:
     far_rate: float  # Distant vehicles in ten seconds
     speed_kmh: tuple[float, float]
     distance_m: tuple[float, float]  # Of the lanes from the microphone
-    kinds: tuple[str, ...]  # Who drives past in every recording
+    kinds: tuple[str, ...]  # Of the vehicles that pass in every recording
     windshield_db: float = 0.0  # What it takes from the simulator's wind
     official_split: bool = False  # Every second recording is for training
 

@@ -30,13 +30,14 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Complex64Array, Float32Array
-from worldstate_lab.benchmarks.cost_of_evidence import evidence_times, peer_times
-from worldstate_lab.benchmarks.cost_of_stages import (
+from worldstate_lab.benchmarks.hop_costs import (
     AZIMUTHS_RAD,
     GOAL,
     NFFT,
     RATE_HZ,
     SRP_BINS,
+    evidence_times,
+    peer_times,
     srp_beams,
     stage_times,
 )
