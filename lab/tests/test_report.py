@@ -25,7 +25,7 @@ from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate_lab.evaluation.front_end_study import front_end_study
 from worldstate_lab.evaluation.paper_values import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, ProtocolRun
-from worldstate_lab.evaluation.report.approach_timeline import ApproachTimeline, approach_figure
+from worldstate_lab.evaluation.report.approach_timeline import approach_figure
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.panels import roc_curve
 from worldstate_lab.evaluation.report.study_sections import signature_values
@@ -38,7 +38,7 @@ from worldstate_lab.report.results import keep_results, read_results
 from worldstate_lab.report.table import Figure, Table, Value
 from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 from worldstate_lab.trials.takes import Take, TakeList
-from worldstate_lab.trials.trial import Trial
+from worldstate_lab.trials.trial import Decisions, Trial
 
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.metrics.roc import auroc
@@ -296,11 +296,9 @@ def test_a_model_that_was_not_made_for_the_sound_has_rows_without_numbers(evalua
 
 def test_an_approach_without_video_is_drawn_without_images_and_says_so():
     times = 1.0 + 0.1 * np.arange(20)
-    figure = approach_figure(
-        ApproachTimeline(
-            "a", times, np.linspace(0, 1, 20), 0.5, 0.02, times > 1.5, np.array([2.0, 2.01]), 1.9
-        )
-    )
+    boxes = HopTable({"time_s": np.array([0.5, 2.0, 2.01]), "moving": np.ones(3, bool)})
+    said = Decisions.of(times, times > 1.5, score=np.linspace(0, 1, 20), threshold=np.array([0.5]))
+    figure = approach_figure("a", Trial(HopTable({"time_s": times}, "a", "left", 1.9), boxes), said)
     assert "left out" in figure.caption
     # The boxes of one image are counted at its hop, each once.
     assert sum(row[3] for row in figure.rows) == 2

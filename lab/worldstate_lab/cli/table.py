@@ -64,8 +64,6 @@ SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5
 # Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`.
 PASSAGES = 6
-# What two evaluations must have in common for their figures to be comparable.
-COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
 # Where the work is done and what is printed of it.
 _NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "scheduler", "against", "seeds")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
@@ -128,7 +126,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             stage_streams=arguments.stage_streams,
         ),
     )
-    save_scores(arguments.out, found.scores, COMPARABLE)
+    save_scores(arguments.out, found.scores)
     compared = _compared(arguments)
     report = _report(found, compared)
     write_report(arguments.out / "evaluation.json", report)

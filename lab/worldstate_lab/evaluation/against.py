@@ -1,15 +1,12 @@
 """What an evaluation leaves on disk to be compared with, and the comparison of two of them."""
 
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from worldstate.abduction.cueing.calibration_error import BINS
 from worldstate.adapters.files.npz_file import load_npz, save_npz
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
@@ -18,25 +15,17 @@ from worldstate.ground.typing import AnyArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
 
-from .reduction import BEARING_COLUMNS, HORIZONS_S
+from .reduction import BEARING_COLUMNS
 from .scores import COUNTS, Score, Scored, paired_on
 
-FOLDER = "scores"
-# Of the arrays; counts that a later version adds are another version.
-VERSION = 1
-MAX_BYTES = 512 << 20
+NAME = "scores.npz"
+# Of the arrays and of what figures mean: counts that a later version adds are another version.
+VERSION = 2
+MAX_BYTES = 4 << 30
 # Of the names of recordings that an error spells out.
 _TOLD = 3
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SavedScore:
-    """One method under one protocol, as it was written."""
-
-    protocol: str
-    method: str
-    settings: Mapping[str, Any]  # What two evaluations must have in common to be compared
-    score: Score
+Key = tuple[str, str]  # Protocol and method
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,39 +43,25 @@ class Comparison:
 _PLAIN = tuple(one.name for one in fields(Score) if one.name not in ("recordings", "counts", "bearings"))
 
 
-def save_scores(
-    folder: Path, scores: Mapping[str, Mapping[str, Score]], settings: Mapping[str, Any]
-) -> list[Path]:
-    """Write every score, by protocol and by method, in place of those of an earlier evaluation.
-
-    `settings`, ready for JSON, is what a comparison refuses to differ in.
-    """
-    # In a folder of its own, in which whatever is no score of this evaluation may be removed.
-    into = folder / FOLDER
-    into.mkdir(parents=True, exist_ok=True)
-    every = [
-        SavedScore(protocol, method, settings, score)
-        for protocol, methods in scores.items()
-        for method, score in methods.items()
+def save_scores(folder: Path, scores: Mapping[str, Mapping[str, Score]]) -> None:
+    """Write every score, by protocol and by method, in place of those of an earlier evaluation."""
+    every = [(protocol, method, one) for protocol, some in scores.items() for method, one in some.items()]
+    heads = [
+        {"protocol": protocol, "method": method, "recordings": [asdict(row) for row in score.recordings]}
+        for protocol, method, score in every
     ]
-    names = [
-        f"{i:03d}-{_file_part(one.protocol)}-{_file_part(one.method)}.npz" for i, one in enumerate(every)
-    ]
-    for name, one in zip(names, every, strict=True):
-        save_npz(into / name, _arrays(one))
-    # A method that is no longer asked must not be compared as if it were.
-    for stale in set(into.glob("*.npz")) - {into / name for name in names}:
-        stale.unlink()
-    return [into / name for name in names]
+    arrays = {"": np.array(json.dumps({"version": VERSION, "counts": COUNTS, "scores": heads}))}
+    for number, (_, _, score) in enumerate(every):
+        arrays |= {f"{number} {name}": values for name, values in _arrays(score).items()}
+    save_npz(folder / NAME, arrays)
 
 
-def load_scores(folder: Path) -> dict[tuple[str, str], SavedScore]:
+def load_scores(folder: Path) -> dict[Key, Score]:
     """Read what `save_scores` wrote, by protocol and method."""
-    paths = sorted((folder / FOLDER).glob("*.npz"))
-    if not paths:
-        raise InputFileError(folder, f"expected a finished evaluation, with the folder {FOLDER} in it")
-    read = [load_npz(path, "scores of an evaluation", MAX_BYTES, _reader(path)) for path in paths]
-    return {(one.protocol, one.method): one for one in read}
+    path = folder / NAME
+    if not path.is_file():
+        raise InputFileError(folder, f"expected a finished evaluation, with {NAME} in it")
+    return load_npz(path, "scores of an evaluation", MAX_BYTES, _reader(path))
 
 
 def compare(ours: Path, other: Path, rng: np.random.Generator, draws: int = DRAWS) -> tuple[Comparison, ...]:
@@ -95,7 +70,7 @@ def compare(ours: Path, other: Path, rng: np.random.Generator, draws: int = DRAW
     Raises
     ------
     InvalidArgumentError
-        If they were set differently, or share no method under any protocol, or no recording.
+        If they share no method under any protocol, or no recording.
     """
     a, b = load_scores(ours), load_scores(other)
     both = [key for key in a if key in b]
@@ -104,25 +79,17 @@ def compare(ours: Path, other: Path, rng: np.random.Generator, draws: int = DRAW
             f"{folder} has {_some(map(' / '.join, one))}" for folder, one in ((ours, a), (other, b))
         )
         raise InvalidArgumentError(f"expected a method under one protocol in both evaluations: {told}")
-    for key in both:
-        _check_settings(a[key], b[key])
-    compared = tuple(_compare(a[key], b[key], rng, draws) for key in both)
+    compared = tuple(_compare(key, a[key], b[key], rng, draws) for key in both)
     if not any(one.shared for one in compared):
-        raise InvalidArgumentError(_nothing_shared([(a[key].score, b[key].score) for key in both]))
+        raise InvalidArgumentError(_nothing_shared([(a[key], b[key]) for key in both]))
     return compared
 
 
-def _compare(a: SavedScore, b: SavedScore, rng: np.random.Generator, draws: int) -> Comparison:
-    rows, others = _shared_rows(a.score, b.score)
+def _compare(key: Key, a: Score, b: Score, rng: np.random.Generator, draws: int) -> Comparison:
+    rows, others = _shared_rows(a, b)
     # Strata of the shared recordings alone: a stratum that lost some is drawn at the size that is left.
-    strata = [a.score.draw_strata[row] for row in rows]
-    samples = stratified_draws(strata, rng, draws)
-    return Comparison(
-        protocol=a.protocol,
-        method=a.method,
-        shared=len(rows),
-        differences=paired_on(a.score, b.score, rows, others, samples),
-    )
+    samples = stratified_draws([a.draw_strata[row] for row in rows], rng, draws)
+    return Comparison(*key, len(rows), paired_on(a, b, rows, others, samples))
 
 
 def _shared_rows(a: Score, b: Score) -> tuple[IndexArray, IndexArray]:
@@ -135,18 +102,8 @@ def _shared_rows(a: Score, b: Score) -> tuple[IndexArray, IndexArray]:
     return rows[:, 0], rows[:, 1]
 
 
-def _check_settings(a: SavedScore, b: SavedScore) -> None:
-    names = sorted(a.settings.keys() | b.settings.keys())
-    differing = [name for name in names if a.settings.get(name) != b.settings.get(name)]
-    if differing:
-        told = "; ".join(
-            f"{name} is {a.settings.get(name)}, not {b.settings.get(name)}" for name in differing
-        )
-        raise InvalidArgumentError(f"{a.protocol} / {a.method}: expected the same settings, but {told}")
-
-
 def _nothing_shared(pairs: list[tuple[Score, Score]]) -> str:
-    """Say why no recording is in both: other names, or the same names with other content."""
+    """Return why no recording is in both: other names, or the same names with other content."""
     ours, other = ({(r.site, r.name) for pair in pairs for r in pair[i].recordings} for i in (0, 1))
     same = sorted(ours & other)
     if same:
@@ -155,54 +112,39 @@ def _nothing_shared(pairs: list[tuple[Score, Score]]) -> str:
     return "expected shared recordings, but one has {} and the other {}".format(*told)
 
 
-def _file_part(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9.]+", "-", name)[:60]
-
-
 def _some(names: Iterable[str]) -> str:
     every = list(names)
     return ", ".join(every[:_TOLD]) + (f" and {len(every) - _TOLD} more" if len(every) > _TOLD else "")
 
 
-def _arrays(saved: SavedScore) -> dict[str, AnyArray]:
-    """Return the arrays of a score by name, what is no array as JSON under the empty one."""
-    score = saved.score
-    head = {
-        "version": VERSION,
-        "protocol": saved.protocol,
-        "method": saved.method,
-        "settings": dict(saved.settings),
-        "counts": list(score.counts),
-        "recordings": [asdict(one) for one in score.recordings],
-    }
+def _arrays(score: Score) -> dict[str, AnyArray]:
     bearings = [
         np.column_stack([np.full(len(table), seed), *(table.columns[name] for name in BEARING_COLUMNS)])
         for seed, table in enumerate(score.bearings)
     ]
     plain = {name: getattr(score, name) for name in _PLAIN}
-    counts, samples = np.array(list(score.counts.values())), np.concatenate(bearings)
-    return {"": np.array(json.dumps(head)), **plain, "counts": counts, "bearings": samples}
+    return {**plain, "counts": np.array(list(score.counts.values())), "bearings": np.concatenate(bearings)}
 
 
-def _reader(path: Path) -> Callable[[dict[str, AnyArray]], SavedScore]:
-    def read(arrays: dict[str, AnyArray]) -> SavedScore:
+def _reader(path: Path) -> Callable[[dict[str, AnyArray]], dict[Key, Score]]:
+    def read(arrays: dict[str, AnyArray]) -> dict[Key, Score]:
         head = json.loads(str(arrays.pop("")))
         if head["version"] != VERSION or head["counts"] != list(COUNTS):
             raise SchemaVersionError(path, f"expected scores of version {VERSION}, got {head['version']}")
-        recordings = tuple(decode(Scored, one, "recordings") for one in head["recordings"])
-        return SavedScore(head["protocol"], head["method"], head["settings"], _score(recordings, arrays))
+        scores = {}
+        for number, one in enumerate(head["scores"]):
+            recordings = tuple(decode(Scored, row, "recordings") for row in one["recordings"])
+            names = (*_PLAIN, "counts", "bearings")
+            own = {name: arrays[f"{number} {name}"] for name in names}
+            scores[one["protocol"], one["method"]] = _score(recordings, own)
+        return scores
 
     return read
 
 
 def _score(recordings: tuple[Scored, ...], arrays: dict[str, AnyArray]) -> Score:
     counts, samples = arrays.pop("counts"), arrays.pop("bearings")
-    seeds = counts.shape[1]
     check_shape("counts", counts.shape, (len(COUNTS), None, len(recordings)))
-    check_shape("bins", arrays["bins"].shape, (seeds, 2, len(recordings), BINS, 3))
-    calm = sum(one.label == "none" for one in recordings)
-    pairs = (len(recordings) - calm, calm)
-    check_shape("wins", arrays["wins"].shape, (seeds, len(HORIZONS_S), *pairs))
-    tables = [samples[samples[:, 0] == seed, 1:] for seed in range(seeds)]
+    tables = [samples[samples[:, 0] == seed, 1:] for seed in range(counts.shape[1])]
     bearings = tuple(HopTable(dict(zip(BEARING_COLUMNS, table.T, strict=True))) for table in tables)
     return Score(recordings, dict(zip(COUNTS, counts, strict=True)), bearings=bearings, **arrays)

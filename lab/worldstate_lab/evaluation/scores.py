@@ -32,7 +32,7 @@ from worldstate_lab.trials.trial import Decisions, Trial
 Interval = tuple[float, float]
 
 _HOURS = HOP_S / SECONDS_PER_HOUR
-_RATIOS = {name: (*kind.counts, kind.unit) for name, kind in FIGURES.items() if kind.counts}
+_RATIOS = {name: (*kind.counts, kind.unit) for name, kind in FIGURES.items() if any(kind.counts)}
 # What one recording adds; a count that it does not have is zero.
 COUNTS = (
     *dict.fromkeys(name for ratio in _RATIOS.values() for name in ratio[:2]),
@@ -167,9 +167,10 @@ class Score:
         """Return the worst junction and its value, of figures with a better and a worse end."""
         sites = self.by_site()
         return {
-            name: worst_group({site: figures[name] for site, figures in sites.items()}, kind.worse)
+            name: worst_group({site: one[name] for site, one in sites.items()}, worse)
+            for worse in ("low", "high")
             for name, kind in FIGURES.items()
-            if kind.worse
+            if kind.worse == worse
         }
 
     @property

@@ -7,7 +7,6 @@ from typing import Self
 import numpy as np
 
 from worldstate.adapters.camera.box_linking import gated_pairs, overlaps
-from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
 # The state of SORT (Bewley et al., 2016): middle, area and aspect ratio of a box, and how fast the first
@@ -18,27 +17,13 @@ _Q = np.diag([1.0, 1.0, 1.0, 1.0, 0.01, 0.01, 0.0001])
 _R = np.diag([1.0, 1.0, 10.0, 10.0])
 _P = np.diag([10.0] * 4 + [10_000.0] * 3)
 _TINY = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class OcSortSettings:
-    """The settings of OC-SORT, at their published values."""
-
-    min_score: float = 0.6  # Boxes below it are not looked at
-    max_age: int = 30  # Images without a box that a track survives: 3 s at 10 Hz
-    min_hits: int = 3  # Images with a box, one after the other, that make a track certain
-    min_iou: float = 0.3  # Of a box and the one it is taken for
-    inertia: float = 0.2  # Weight of the direction of motion in the association
-    delta_t: int = 3  # Images over which that direction is read
-    # The authors' code applies the box that ends a gap twice, the first time as the end of the replayed
-    # trajectory, and so did every use of OC-SORT. False applies it once, as the paper has it.
-    twice: bool = True
-
-    def __post_init__(self) -> None:
-        in_range("min_score", self.min_score, 0.0, 1.0)
-        in_range("min_iou", self.min_iou, 0.0, 1.0)
-        in_range("max_age", self.max_age, 0, 1 << 16)
-        in_range("delta_t", self.delta_t, 1, 1 << 16)
+# The published settings.
+MIN_SCORE = 0.6  # Boxes below it are not looked at
+MAX_AGE = 30  # Images without a box that a track survives: 3 s at 10 Hz
+MIN_HITS = 3  # Images with a box, one after the other, that make a track certain
+MIN_IOU = 0.3  # Of a box and the one it is taken for
+INERTIA = 0.2  # Weight of the direction of motion in the association
+DELTA_T = 3  # Images over which that direction is read
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,8 +52,7 @@ class OcSort:
     (-1, False, [40.0, 9.0, 140.0, 89.0])
     """
 
-    def __init__(self, settings: OcSortSettings | None = None) -> None:
-        self._settings = settings or OcSortSettings()
+    def __init__(self) -> None:
         self._tracks: list[_Track] = []
         self._born = self._steps = 0
 
@@ -77,40 +61,40 @@ class OcSort:
         self._steps += 1
         for track in self._tracks:
             track.predict()
-        used = np.flatnonzero(scores >= self._settings.min_score)
+        used = np.flatnonzero(scores >= MIN_SCORE)
         boxes, taken = boxes_px[used], {}
         pairs = self._associate(boxes, scores[used])
         for i, j in pairs:
-            self._tracks[i].observe(boxes[j], self._settings)
+            self._tracks[i].observe(boxes[j])
             taken[self._tracks[i].number] = int(used[j])
         for j in np.setdiff1d(np.arange(len(used)), [j for _, j in pairs]):
             taken[self._born] = int(used[j])
             self._tracks.append(_Track.at(boxes[j], self._born))
             self._born += 1
-        self._tracks = [track for track in self._tracks if track.unseen <= self._settings.max_age]
+        self._tracks = [track for track in self._tracks if track.unseen <= MAX_AGE]
         return [self._told(track, taken.get(track.number, -1)) for track in self._tracks]
 
     def _told(self, track: "_Track", detection: int) -> TrackedBox:
         # The first images are exempt from the wait, or a recording would begin with a blind spot.
-        early = self._steps <= self._settings.min_hits
-        certain = detection >= 0 and (track.streak >= self._settings.min_hits or early)
+        early = self._steps <= MIN_HITS
+        certain = detection >= 0 and (track.streak >= MIN_HITS or early)
         track.known |= certain
         box = track.last_px if detection >= 0 else track.belief.box_px
         return TrackedBox(track.number, box, detection, certain, track.known)
 
     def _associate(self, boxes: FloatArray, scores: FloatArray) -> list[tuple[int, int]]:
         """Return pairs of track and box: by prediction and direction first, then by the last box seen."""
-        tracks, least = self._tracks, self._settings.min_iou
+        tracks = self._tracks
         predicted = np.array([track.belief.box_px for track in tracks]).reshape(-1, 4)
         overlap = overlaps(predicted, boxes)
-        toward = [track.consistency(boxes, self._settings.delta_t) for track in tracks]
-        weight = self._settings.inertia * scores * np.array(toward).reshape(overlap.shape)
-        pairs = _matched(overlap, weight, least)
+        toward = [track.consistency(boxes) for track in tracks]
+        weight = INERTIA * scores * np.array(toward).reshape(overlap.shape)
+        pairs = _matched(overlap, weight)
         # A vehicle that braked is where it was seen, not where it was predicted.
         idle = np.setdiff1d(np.arange(len(tracks)), [i for i, _ in pairs])
         free = np.setdiff1d(np.arange(len(boxes)), [j for _, j in pairs])
         last = np.array([tracks[i].last_px for i in idle]).reshape(-1, 4)
-        again = _matched(overlaps(last, boxes[free]), 0.0, least)
+        again = _matched(overlaps(last, boxes[free]), 0.0)
         return pairs + [(int(idle[i]), int(free[j])) for i, j in again]
 
 
@@ -176,29 +160,29 @@ class _Track:
         self.age += 1
         self.unseen += 1
 
-    def observe(self, box_px: FloatArray, settings: OcSortSettings) -> None:
+    def observe(self, box_px: FloatArray) -> None:
         if self.seen:
-            self.direction = _direction(self._earlier(settings.delta_t), box_px)
+            self.direction = _direction(self._earlier(), box_px)
         if self.frozen is not None:
             self.belief = self._replayed(self.frozen, box_px)
-        if self.frozen is None or settings.twice:
-            self.belief = self.belief.update(_measured(box_px))
+        # As in the authors' code, the box that ends a gap counts twice: here, and in the replay before.
+        self.belief = self.belief.update(_measured(box_px))
         self.frozen, self.unseen, self.last_px = None, 0, box_px
         self.streak += 1
         self.seen[self.age] = box_px
-        self.seen = {age: box for age, box in self.seen.items() if age >= self.age - settings.delta_t}
+        self.seen = {age: box for age, box in self.seen.items() if age >= self.age - DELTA_T}
 
-    def consistency(self, boxes: FloatArray, delta_t: int) -> FloatArray:
+    def consistency(self, boxes: FloatArray) -> FloatArray:
         r"""Return :math:`(\pi/2 - \Delta\theta) / \pi`, how well each box lies in the track's direction."""
         if self.direction is None:
             return np.zeros(len(boxes))
-        toward = _direction(self._earlier(delta_t), boxes)
+        toward = _direction(self._earlier(), boxes)
         return np.asarray(0.5 - np.arccos(np.clip(toward @ self.direction, -1.0, 1.0)) / np.pi)
 
-    def _earlier(self, delta_t: int) -> FloatArray:
-        """Box of `delta_t` images ago, else the first one after it."""
+    def _earlier(self) -> FloatArray:
+        """Box of `DELTA_T` images ago, else the first one after it."""
         ages = sorted(self.seen)
-        return self.seen[next((age for age in ages if age >= self.age - delta_t), ages[-1])]
+        return self.seen[next((age for age in ages if age >= self.age - DELTA_T), ages[-1])]
 
     def _replayed(self, belief: _Belief, box_px: FloatArray) -> _Belief:
         """Filter the gap again along the straight line from the last box to this one, in middle and size."""
@@ -230,7 +214,7 @@ def _direction(start_px: FloatArray, end_px: FloatArray) -> FloatArray:
     return np.asarray(apart / (np.linalg.norm(apart, axis=-1, keepdims=True) + _TINY))
 
 
-def _matched(overlap: FloatArray, weight: FloatArray | float, least: float) -> list[tuple[int, int]]:
+def _matched(overlap: FloatArray, weight: FloatArray | float) -> list[tuple[int, int]]:
     """Return the assignment of the largest sum of overlap and weight, without pairs that hardly overlap."""
     cost = -(overlap + weight)
-    return [(i, j) for i, j in gated_pairs(cost, overlap >= least, cost).tolist()]
+    return [(i, j) for i, j in gated_pairs(cost, overlap >= MIN_IOU, cost).tolist()]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -59,32 +59,14 @@ class Decisions:
     threshold: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @classmethod
-    def of(
-        cls,
-        time_s: FloatArray,
-        alarm: BoolArray,
-        *,
-        side: IntArray | None = None,
-        bearing_rad: FloatArray | None = None,
-        score: FloatArray | None = None,
-        risk: FloatArray | None = None,
-        visible_s: FloatArray | None = None,
-        tracks: HopTable | None = None,
-        threshold: FloatArray | None = None,
-    ) -> "Decisions":
+    def of(cls, time_s: FloatArray, alarm: BoolArray, **stated: Any) -> "Decisions":
         """Return the decisions of a method that states only some of the columns."""
         n = len(time_s)
-        unknown = np.full(n, np.nan)
+        unknown = dict.fromkeys(("bearing_rad", "score", "risk"), np.full(n, np.nan))
+        columns = {"side": np.zeros(n, np.int64), "visible_s": np.full((n, 3), np.nan), **unknown}
+        tracks = HopTable.of_rows(TRACK_COLUMNS, ())
         return cls(
-            time_s,
-            np.asarray(alarm, bool),
-            np.zeros(n, np.int64) if side is None else side,
-            unknown if bearing_rad is None else bearing_rad,
-            unknown if score is None else score,
-            unknown if risk is None else risk,
-            np.full((n, 3), np.nan) if visible_s is None else visible_s,
-            HopTable.of_rows(TRACK_COLUMNS, ()) if tracks is None else tracks,
-            np.empty(0) if threshold is None else threshold,
+            **{"time_s": time_s, "alarm": np.asarray(alarm, bool), "tracks": tracks, **columns, **stated}
         )
 
 

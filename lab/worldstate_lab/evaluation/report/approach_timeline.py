@@ -1,5 +1,7 @@
 """One approach end to end: three camera images above, statistic, threshold, advisory and camera below."""
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,12 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import open_video, opencv
-from worldstate.ground.typing import BoolArray, FloatArray, ImageArray
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
+from worldstate.ground.errors import WorldstateError
+from worldstate.ground.typing import FloatArray, ImageArray
 from worldstate.operations.figure_style import BLUE, GREEN, PURPLE, RED
+from worldstate.operations.metrics.approach_table import alarm_outcome
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.evaluation.evaluation import ALPHA, Evaluation
+from worldstate_lab.evaluation.protocols import STATIC
+from worldstate_lab.report.pages import Section
 from worldstate_lab.report.table import Figure
+from worldstate_lab.trials.trial import Decisions, Trial
 
+from .measured_values import PROPOSED
 from .panels import legend_below
 
 if TYPE_CHECKING:
@@ -37,79 +46,99 @@ class ApproachImage:
     column_px: float | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ApproachTimeline:
-    """What the figure shows of one recording, one row a hop; `seen_s` are the times of moving boxes."""
-
-    title: str
-    time_s: FloatArray
-    statistic: FloatArray
-    threshold: float
-    alpha: float
-    alarm: BoolArray
-    seen_s: FloatArray
-    t0_s: float
+def approach_section(found: Evaluation) -> Section:
+    """Return the timeline of the detected approach whose lead is the median one, filmed ones preferred."""
+    title, run = "One approach end to end", found.runs[STATIC.name]
+    answers = run.decisions[PROPOSED][0]
+    leads = leads_s(run.trials, [answers])
+    pairs = [(t, s) for t, s in zip(run.trials, answers, strict=True) if not t.hazard_free]
+    detected = np.flatnonzero(np.isfinite(leads))
+    videos = {take.name: take.path / VIDEO_NAME for take in found.takes.static}
+    filmed = np.array([i for i in detected if videos[pairs[i][0].name].is_file()], np.intp)
+    chosen = filmed if filmed.size else detected
+    if not chosen.size:
+        return Section(title, ("No approach was detected by the proposed method.",))
+    middle = chosen[np.argsort(leads[chosen], kind="stable")[(chosen.size - 1) // 2]]
+    trial, said = pairs[middle]
+    # Without OpenCV, or with a video that cannot be read, the rest of the figure stays.
     images: tuple[ApproachImage, ...] = ()
+    with suppress(WorldstateError):
+        images = _approach_images(videos[trial.name], trial)
+    name = f"Approach {trial.name} at {trial.site}, from the {trial.label}"
+    figure = approach_figure(f"{name}: lead {leads[middle]:.1f} s (paper's: 2.3 s)", trial, said, images)
+    text = f"The approach with the median lead of the {detected.size} that {PROPOSED} detects."
+    return Section(title, (text,), (figure,))
 
 
-def approach_figure(approach: ApproachTimeline) -> Figure:
+def leads_s(trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> FloatArray:
+    """Return the lead of every approach and seed, NaN where it was not detected."""
+    leads = [
+        alarm_outcome(said.time_s, said.alarm, trial.t0_s).lead_s
+        for answers in passes
+        for trial, said in zip(trials, answers, strict=True)
+        if not trial.hazard_free
+    ]
+    return np.array([lead or np.nan for lead in leads])
+
+
+def approach_figure(
+    title: str, trial: Trial, said: Decisions, images: Sequence[ApproachImage] = ()
+) -> Figure:
     """Draw an approach as the paper's timeline figure does; without images their row is left out."""
+    # Before the first hop a parked car cannot be told from a moving one.
+    moving = trial.boxes.moving.astype(bool) & (trial.boxes.time_s >= said.time_s[0])
+    seen_s = trial.boxes.time_s[moving]
 
     def draw(canvas: "Canvas") -> None:
-        rows = 2 if approach.images else 1
-        grid = canvas.add_gridspec(rows, max(len(approach.images), 1), height_ratios=(0.62, 1.0)[-rows:])
-        for i, image in enumerate(approach.images):
+        rows = 2 if images else 1
+        grid = canvas.add_gridspec(rows, max(len(images), 1), height_ratios=(0.62, 1.0)[-rows:])
+        for i, image in enumerate(images):
             _draw_image(canvas.add_subplot(grid[0, i]), image)
-        _draw_statistic(canvas.add_subplot(grid[rows - 1, :]), approach)
+        _draw_statistic(canvas.add_subplot(grid[rows - 1, :]), trial.t0_s, said, seen_s)
         legend_below(canvas, columns=5)
 
-    # A box that came between two hops belongs to the later one, which is the first to know of it.
-    seen = np.bincount(
-        np.searchsorted(approach.time_s - 1e-6, approach.seen_s), minlength=approach.time_s.size + 1
-    )
-    columns = approach.time_s, approach.statistic, approach.alarm, seen[: approach.time_s.size]
+    # A box that came between two hops belongs to the later one, which is the first to have it.
+    at = np.searchsorted(said.time_s - 1e-6, seen_s)
+    boxes = np.bincount(at, minlength=said.time_s.size + 1)[: said.time_s.size]
     camera = (
         "Above: camera images; the dashed box is the vehicle as the camera reports it, the dotted line the "
         "direction in which it is hidden. "
-        if approach.images
+        if images
         else "The recording has no video that could be read, so the row of camera images is left out. "
     )
     return Figure(
         "approach_timeline",
-        approach.title,
+        title,
         f"{camera}Below: hazard statistic at the end of each 1-s window, threshold, advisory, moving boxes "
         "of the camera, and line-of-sight entry T0.",
         draw,
         ("time_s", "statistic", "advisory", "moving_boxes"),
-        [(float(t), float(s), int(on), int(n)) for t, s, on, n in zip(*columns, strict=True)],
-        size_in=(9.0, 5.4 if approach.images else 3.4),
+        [
+            (float(t), float(s), int(on), int(n))
+            for t, s, on, n in zip(said.time_s, said.score, said.alarm, boxes, strict=True)
+        ],
+        size_in=(9.0, 5.4 if images else 3.4),
     )
 
 
-def approach_images(video: Path, boxes: HopTable, truth: HopTable, t0_s: float) -> tuple[ApproachImage, ...]:
+def _approach_images(video: Path, trial: Trial) -> tuple[ApproachImage, ...]:
     """Read the three images of an approach: hidden, just after T0, and at the pass.
 
-    `boxes` and `truth` are those of a `Trial`. The pass is the image with the highest moving box.
+    The pass is the image with the highest moving box.
     """
-    moving = boxes.moving.astype(bool) & (boxes.time_s >= t0_s) if len(boxes) else np.zeros(0, bool)
-    rows = np.flatnonzero(moving)
-    heights = boxes.box_px[rows, 3] - boxes.box_px[rows, 1] if rows.size else np.zeros(0)
-    first_s, pass_s = (
-        (float(boxes.time_s[rows[0]]), float(boxes.time_s[rows[heights.argmax()]]))
-        if rows.size
-        else (t0_s + 0.3, t0_s + 1.0)
-    )
-    moments = {
-        max(t0_s - HIDDEN_S, 0.0): "hidden",
-        first_s: "first seen" if rows.size else "after $T_0$",
-        pass_s: "at the pass",
-    }
+    boxes, t0_s = trial.boxes, trial.t0_s
+    rows = np.flatnonzero(boxes.moving.astype(bool) & (boxes.time_s >= t0_s))
+    first_s, pass_s, first = t0_s + 0.3, t0_s + 1.0, "after $T_0$"
+    if rows.size:
+        highest = rows[(boxes.box_px[rows, 3] - boxes.box_px[rows, 1]).argmax()]
+        first_s, pass_s, first = float(boxes.time_s[rows[0]]), float(boxes.time_s[highest]), "first seen"
+    moments = {max(t0_s - HIDDEN_S, 0.0): "hidden", first_s: first, pass_s: "at the pass"}
     opened = open_video(video)
     wanted = {round(time_s * opened.frame_rate_hz): (time_s, what) for time_s, what in moments.items()}
     found = []
     for number, image in enumerate(opened.frames()):
         if number in wanted:
-            found.append(_image(image, *wanted[number], boxes, truth))
+            found.append(_image(image, *wanted[number], boxes, trial.truth))
         if number >= max(wanted):
             break
     return tuple(found)
@@ -173,18 +202,19 @@ def _draw_image(axes: "Axes", shown: ApproachImage) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def _draw_statistic(axes: "Axes", approach: ApproachTimeline) -> None:
-    axes.plot(approach.time_s, approach.statistic, color=BLUE, label="statistic $s(t)$")
-    label = rf"$\gamma(\alpha={approach.alpha:g})$"
-    if np.isfinite(approach.threshold):
-        axes.axhline(approach.threshold, color=BLUE, linestyle=":", label=label)
+def _draw_statistic(axes: "Axes", t0_s: float, said: Decisions, seen_s: FloatArray) -> None:
+    axes.plot(said.time_s, said.score, color=BLUE, label="statistic $s(t)$")
+    label = rf"$\gamma(\alpha={ALPHA:g})$"
+    if np.isfinite(said.threshold).all():
+        axes.axhline(float(said.threshold[0]), color=BLUE, linestyle=":", label=label)
     # Advisory and boxes stand above the range of the statistic, where they cover nothing of it.
-    top = max(1.0, float(np.nanmax(approach.statistic, initial=0.0)))
-    bars = [(t, _HOP_S) for t in approach.time_s[approach.alarm]]
+    top = max(1.0, float(np.nanmax(said.score, initial=0.0)))
+    bars = [(t, _HOP_S) for t in said.time_s[said.alarm]]
     axes.broken_barh(bars, (1.05 * top, 0.1 * top), color=GREEN, lw=0, label="advisory")
-    heights = np.full(approach.seen_s.size, 1.22 * top)
-    axes.plot(approach.seen_s, heights, "|", color=PURPLE, ms=9, label="moving box of the camera")
-    axes.axvline(approach.t0_s, color="black", linestyle="--", linewidth=1.2, label="$T_0$")
+    axes.plot(
+        seen_s, np.full(seen_s.size, 1.22 * top), "|", color=PURPLE, ms=9, label="moving box of the camera"
+    )
+    axes.axvline(t0_s, color="black", linestyle="--", linewidth=1.2, label="$T_0$")
     axes.set(xlabel="time (s)", ylabel="statistic", ylim=(-0.03 * top, 1.32 * top))
     axes.set_yticks(np.linspace(0.0, top, 5))
-    axes.set_xlim(0.0, float(approach.time_s[-1]) + _HOP_S)
+    axes.set_xlim(0.0, float(said.time_s[-1]) + _HOP_S)

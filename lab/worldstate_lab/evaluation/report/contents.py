@@ -18,6 +18,7 @@ from worldstate_lab.report.table import Cell, Table
 from worldstate_lab.signatures.signature_study import SignatureStudy
 from worldstate_lab.trials.hearing import data_fingerprint
 
+from .approach_timeline import approach_section
 from .degradation_section import awareness_figures, degradation_section, sweep_values
 from .measured_values import MeasuredValues
 
@@ -36,7 +37,7 @@ def evaluation_document(
     sections = [
         _data_section(found),
         *((warning.table_i(measured), warning.budget_section(measured)) if static else ()),
-        *((warning.cueing_section(measured, panels), warning.approach_section(found)) if static else ()),
+        *((warning.cueing_section(measured, panels), approach_section(found)) if static else ()),
         study.front_end_section(measured),
         study.approach_rate_section(measured),
         study.transfer_section(measured),

@@ -1,15 +1,10 @@
 """Sections on warnings: Table I, budgets and false alarms, calibrated cueing, one approach, differences."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.camera.video import VIDEO_NAME
-from worldstate.ground.errors import WorldstateError
-from worldstate.ground.typing import FloatArray
-from worldstate.operations.metrics.approach_table import alarm_outcome
-from worldstate_lab.evaluation.evaluation import ALPHA, Evaluation
+from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import FIGURES
 from worldstate_lab.evaluation.paper_values import paper_value
 from worldstate_lab.evaluation.protocols import STATIC
@@ -20,7 +15,7 @@ from worldstate_lab.report.pages import Section
 from worldstate_lab.report.table import Cell, Figure, Table, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
-from .approach_timeline import ApproachImage, ApproachTimeline, approach_figure, approach_images
+from .approach_timeline import leads_s
 from .measured_values import PROPOSED, MeasuredValues, score_values
 from .panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
 from .recording_panels import lead_figure
@@ -73,7 +68,7 @@ def table_i(measured: MeasuredValues) -> Section:
         "folds.",
     )
     run = measured.found.runs[STATIC.name]
-    every = {name: _leads_s(run.trials, passes) for name, passes in run.decisions.items() if name in _LEADS}
+    every = {name: leads_s(run.trials, passes) for name, passes in run.decisions.items() if name in _LEADS}
     leads = {method: lead for method, lead in every.items() if np.isfinite(lead).any()}
     stated = {method: paper_value(STATIC.name, method, "lead_s") for method in leads}
     text = (
@@ -96,17 +91,6 @@ _LEADS = (
     "+ site adaptation",
     "world-state advisory",
 )
-
-
-def _leads_s(trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> FloatArray:
-    """Lead of every approach and seed, NaN where it was not detected."""
-    leads = [
-        alarm_outcome(said.time_s, said.alarm, trial.t0_s).lead_s
-        for answers in passes
-        for trial, said in zip(trials, answers, strict=True)
-        if not trial.hazard_free
-    ]
-    return np.array([lead or np.nan for lead in leads])
 
 
 def budget_section(measured: MeasuredValues) -> Section:
@@ -209,49 +193,6 @@ def _points(measured: MeasuredValues) -> list[OperatingPoint]:
         for method in shown
         if method in measured.found.scores[STATIC.name]
     ]
-
-
-def approach_section(found: Evaluation) -> Section:
-    """Return the timeline of the detected approach whose lead is the median one, filmed ones preferred."""
-    run = found.runs[STATIC.name]
-    answers = run.decisions[PROPOSED][0]
-    leads = _leads_s(run.trials, [answers])
-    pairs = [(t, s) for t, s in zip(run.trials, answers, strict=True) if not t.hazard_free]
-    detected = np.flatnonzero(np.isfinite(leads))
-    filmed = np.array([i for i in detected if _video(found, pairs[i][0]).is_file()], np.intp)
-    chosen = filmed if filmed.size else detected
-    if not chosen.size:
-        return Section("One approach end to end", ("No approach was detected by the proposed method.",))
-    middle = chosen[np.argsort(leads[chosen], kind="stable")[(chosen.size - 1) // 2]]
-    trial, said = pairs[middle]
-    # Before the first hop a parked car cannot be told from a moving one.
-    moving = trial.boxes.moving.astype(bool) & (trial.boxes.time_s >= said.time_s[0])
-    timeline = ApproachTimeline(
-        f"Approach {trial.name} at {trial.site}, from the {trial.label}: lead {leads[middle]:.1f} s "
-        "(paper's: 2.3 s)",
-        said.time_s,
-        said.score,
-        float(said.threshold[0]),
-        ALPHA,
-        said.alarm,
-        trial.boxes.time_s[moving],
-        trial.t0_s,
-        _images(found, trial),
-    )
-    text = f"The approach with the median lead of the {detected.size} that {PROPOSED} detects."
-    return Section("One approach end to end", (text,), (approach_figure(timeline),))
-
-
-def _video(found: Evaluation, trial: Trial) -> Path:
-    return next(take.path for take in found.takes.static if take.name == trial.name) / VIDEO_NAME
-
-
-def _images(found: Evaluation, trial: Trial) -> tuple[ApproachImage, ...]:
-    # Without OpenCV, or with a video that cannot be read, the rest of the figure still says what it says.
-    try:
-        return approach_images(_video(found, trial), trial.boxes, trial.truth, trial.t0_s)
-    except WorldstateError:
-        return ()
 
 
 def tracking_section(measured: MeasuredValues) -> Section:
