@@ -44,7 +44,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.files.atomic import write_text
     from worldstate.cli.common.progress import sound_bar
     from worldstate.frontend.stream import FrontEnd
-    from worldstate.operations.recordings.bearing_track import track_bearings, write_bearings_figure
+    from worldstate.operations.recordings.bearing_track import (
+        bearings_csv,
+        track_bearings,
+        write_bearings_figure,
+    )
 
     check_outputs(arguments, "out", figures=("figure",))
     sound, array = sound_and_array(arguments)
@@ -54,14 +58,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         with sound_bar(audio) as bar:
             track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
         silent = list(audio.silent_channels)
-    write_text(arguments.out, track.csv())
+    write_text(arguments.out, bearings_csv(track))
     if arguments.figure is not None:
         write_bearings_figure(track, arguments.figure, path_of(sound).name)
     summary = {
         "out": str(arguments.out),
         "array": stance(array),
         "band_hz": list(settings.srp_band_hz),
-        "hops": len(track.time_s),
+        "hops": len(track),
         "silent_channels": silent,
     }
     return CommandResult(summary)

@@ -23,7 +23,8 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
-from worldstate.operations.recordings.bearing_track import BearingTrack, track_bearings
+from worldstate.operations.recordings.bearing_track import track_bearings
+from worldstate.operations.recordings.hop_table import HopTable
 
 # What is looked for: clocks that were started by hand, brackets that were put on by eye.
 LARGEST_OFFSET_S, LARGEST_YAW_DEG = 1.0, 15.0
@@ -77,7 +78,7 @@ def heard_passes(source: Source, margin_s: float) -> list[HeardPass]:
     return found
 
 
-def _bearings(source: Source) -> BearingTrack:
+def _bearings(source: Source) -> HopTable:
     with open_sound(source.sound, source.array.n_microphones, strict=False) as audio:
         settings = source.settings.front_end(source.array, audio.sample_rate_hz)
         return track_bearings(audio, FrontEnd(source.array, audio.sample_rate_hz, settings))

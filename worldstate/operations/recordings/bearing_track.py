@@ -1,7 +1,6 @@
 """The bearing of every hop of a recording, without a model."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,40 +10,33 @@ from worldstate.frontend.direction.music import count_sources
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import seconds
 from worldstate.operations.figure_style import figure_file
+
+from .hop_table import HopTable
 
 # Bins whose covariance is decomposed to count sources: evenly out of the band.
 _BINS = 12
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BearingTrack:
-    """One row a hop.
+# Of the table as text: middle of the sound that the bearing was read from; azimuth, left positive; its
+# standard deviation; peak-to-median ratio, 1 in silence; plane waves in the second that the hop ends in.
+_FORMS = {"time_s": ".3f", "azimuth_deg": ".2f", "std_deg": ".2f", "prominence": ".3f", "sources": ".0f"}
+
+
+def bearings_csv(track: HopTable) -> str:
+    """Return the table as text.
 
     Examples
     --------
-    >>> track = BearingTrack(np.array([1.0]), np.array([20.0]), np.array([3.4]), np.array([2.0]), None)
-    >>> print(track.csv(), end="")
+    >>> columns = {"time_s": 1.0, "azimuth_deg": 20.0, "std_deg": 3.4, "prominence": 2.0}
+    >>> print(bearings_csv(HopTable({name: np.array([one]) for name, one in columns.items()})), end="")
     time_s,azimuth_deg,std_deg,prominence
     1.000,20.00,3.40,2.000
     """
-
-    time_s: FloatArray  # Middle of the sound that the bearing was read from
-    azimuth_deg: FloatArray  # Left positive
-    std_deg: FloatArray
-    prominence: FloatArray  # Peak-to-median ratio, >= 1; 1 in silence
-    sources: FloatArray | None  # Plane waves in the second that the hop ends in
-
-    def csv(self) -> str:
-        """Return the table."""
-        head = "time_s,azimuth_deg,std_deg,prominence"
-        columns = [self.time_s, self.azimuth_deg, self.std_deg, self.prominence]
-        form = "{:.3f},{:.2f},{:.2f},{:.3f}"
-        if self.sources is not None:
-            head, form, columns = head + ",sources", form + ",{:.0f}", [*columns, self.sources]
-        return "\n".join([head, *(form.format(*row) for row in zip(*columns, strict=True)), ""])
+    columns = [[f"{value:{_FORMS[name]}}" for value in column] for name, column in track.columns.items()]
+    return "\n".join([",".join(track.columns), *map(",".join, zip(*columns, strict=True)), ""])
 
 
 def track_bearings(
@@ -53,20 +45,17 @@ def track_bearings(
     *,
     count: bool = False,
     on_second: Callable[[], None] = lambda: None,
-) -> BearingTrack:
+) -> HopTable:
     """Read the bearing of every hop of an open recording, and count the sources of every second."""
     rows: list[tuple[float, ...]] = []
     for block in audio.blocks(audio.sample_rate_hz):
-        sources = _sources_in(block, front_end) if count else 0
-        rows += [(*_row(frame), float(sources)) for frame in front_end.process(block)]
+        sources = (_sources_in(block, front_end),) if count else ()
+        rows += [(*_row(frame), *sources) for frame in front_end.process(block)]
         on_second()
-    time_s, azimuth, std, prominence, sources_of = np.array(rows, dtype=np.float64).reshape(-1, 5).T
-    return BearingTrack(
-        time_s, np.degrees(azimuth), np.degrees(std), prominence, sources_of if count else None
-    )
+    return HopTable.of_rows(tuple(_FORMS)[: 5 if count else 4], rows)
 
 
-def write_bearings_figure(track: BearingTrack, path: Path, title: str) -> None:
+def write_bearings_figure(track: HopTable, path: Path, title: str) -> None:
     """Draw azimuth over time with its standard deviation, darker where more prominent."""
     with figure_file(path, 9.0, 3.6) as figure:
         axes = figure.subplots()
@@ -80,7 +69,7 @@ def write_bearings_figure(track: BearingTrack, path: Path, title: str) -> None:
 
 def _row(frame: AcousticFrame) -> Iterable[float]:
     time_s = seconds(frame.stamp_ns) - frame.bearing_age_s
-    return time_s, frame.bearing_rad, frame.bearing_std_rad, frame.prominence
+    return time_s, np.degrees(frame.bearing_rad), np.degrees(frame.bearing_std_rad), frame.prominence
 
 
 def _sources_in(block: Float32Array, front_end: FrontEnd) -> int:
