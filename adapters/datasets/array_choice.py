@@ -72,12 +72,26 @@ def named_array(path: Path) -> Path | None:
     return next((root / ARRAY_NAME for root in roots if (root / ARRAY_NAME).is_file()), None)
 
 
-def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
-    """Return the array that a sound file is taken to be of, if it has as many channels."""
+def check_channels(path: Path, array: MicrophoneArray) -> None:
+    """Refuse a sound file of which no array is named and that has other channels than the one assumed.
+
+    Raises
+    ------
+    InputFileError
+        Then; the message says how to go on.
+    """
     with open_audio(path, strict=False) as audio:
         if audio.channels != array.n_microphones:
-            wanted = f"expected --array, or {ARRAY_NAME} beside it, for its {audio.channels} channels"
-            problem = f"{wanted}; {array.name} has {array.n_microphones}"
-            raise InputFileError(path, problem)
+            wanted = f"expected --array FILE, or {ARRAY_NAME} beside it, for its {audio.channels} channels"
+            other = f"{array.name}, the array of the model, has {array.n_microphones}"
+            ways = (
+                "With it `worldstate array bearings` needs no model; `worldstate model make` makes one for it"
+            )
+            raise InputFileError(path, f"{wanted}; {other}. {ways}")
+
+
+def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
+    """Return the array that a sound file is taken to be of, if it has as many channels."""
+    check_channels(path, array)
     _LOG.warning("%s: no array is named; taken as %s, %d microphones", path, array.name, array.n_microphones)
     return array

@@ -27,7 +27,9 @@ def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int
     try:
         server = foxglove.start_server(name="worldstate", port=port, context=context)
     except (RuntimeError, OverflowError) as error:
-        raise InvalidArgumentError(f"--live: expected a free port, got {port} ({error})") from error
+        raise InvalidArgumentError(
+            f"--export foxglove: expected a free port, got {port} ({error})"
+        ) from error
     channels: dict[str, foxglove.Channel] = {}
     begun_s: float | None = None
 

@@ -59,12 +59,12 @@ def odas_socket(address: str) -> Iterator[Callable[[WorldState], None]]:
     """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's line."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
-        raise InvalidArgumentError(f"--odas: expected HOST:PORT, got {address}")
+        raise InvalidArgumentError(f"--export odas: expected HOST:PORT, got {address}")
     tracks = OdasTracks()
     try:
         connection = socket.create_connection((host, int(port)), timeout=10.0)
     except OSError as error:
         # It has no file name, by which the command would name it.
-        raise InvalidArgumentError(f"--odas: expected a listener at {address} ({error})") from error
+        raise InvalidArgumentError(f"--export odas: expected a listener at {address} ({error})") from error
     with connection:
         yield lambda state: connection.sendall((tracks.line(state) + "\n").encode())

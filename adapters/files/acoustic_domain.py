@@ -20,12 +20,8 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import IndexArray
 
-from .array_match import array_difference, microphone_order
+from .array_match import TRAIN, WAY_OUT, matched_order
 from .model_file import Model
-
-# Only `run` goes on with a model of another array; the other commands have no such option to name.
-TRAIN = "Make a model for it (commission; of recordings extract-features, train)"
-WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
 
 UNFIT = "the model says that it is unfit for use"
 
@@ -64,14 +60,7 @@ def check_array(domain: ModelDomain, array: MicrophoneArray, way_out: str = TRAI
     OutOfDomainError
         If the microphones stand elsewhere; the message names the array, the difference and the way out.
     """
-    order = microphone_order(domain.positions_m, array)
-    if order is None:
-        difference = array_difference(domain.positions_m, array)
-        made_for = f"{domain.array}, {len(domain.positions_m)} microphones"
-        raise OutOfDomainError(
-            f"{array.name}: not the array of the model ({made_for}): {difference}. {way_out}"
-        )
-    return order
+    return matched_order(array_of(domain), array, way_out)
 
 
 def array_of(domain: ModelDomain) -> MicrophoneArray:

@@ -5,10 +5,14 @@ from itertools import permutations, product
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import FloatArray, IndexArray
 
 # Array files give millimetres; half a wavelength at the top of the feature's band is 114 mm.
 TOLERANCE_M = 1e-3
+# Only `run` and `live` go on with a model of another array; the other commands have no such option to name.
+TRAIN = "Make a model for it (worldstate model make; of recordings model features, model fit)"
+WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
 _UNITS = {1.0: "", 1e-3: "looks like millimetres", 1e-2: "looks like centimetres"}
 _LEAST_TURN_DEG = 0.5
 
@@ -57,6 +61,28 @@ def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:
     return "; ".join(
         filter(None, (f"microphones up to {1e3 * largest_m:.0f} mm elsewhere", _cause(expected, found)))
     )
+
+
+def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
+    """Return the channels of `array` in the order of the one that a model was made for.
+
+    Raises
+    ------
+    OutOfDomainError
+        If the microphones stand elsewhere; the message names the array, the difference and the way out.
+
+    Examples
+    --------
+    >>> pair = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
+    >>> matched_order(pair, pair)
+    array([0, 1])
+    """
+    order = microphone_order(made_for.positions_m, array)
+    if order is None:
+        difference = array_difference(made_for.positions_m, array)
+        model = f"{made_for.name}, {made_for.n_microphones} microphones"
+        raise OutOfDomainError(f"{array.name}: not the array of the model ({model}): {difference}. {way_out}")
+    return order
 
 
 def _centred(positions_m: FloatArray) -> FloatArray:

@@ -61,8 +61,8 @@ def read_bag(path: Path, topics: BagTopics | None = None) -> BagInput:
     chosen = topics or BagTopics()
     with open_bag(path) as bag, refused_as_file(path):
         sound = sound_of_bag(bag, chosen.audio)
-        seen = bag.topic("--detections-topic", chosen.detections, DETECTIONS)
-        driven = bag.topic("--odometry-topic", chosen.odometry, ODOMETRY)
+        seen = bag.topic("--topic detections=", chosen.detections, DETECTIONS)
+        driven = bag.topic("--topic odometry=", chosen.odometry, ODOMETRY)
         detections = None if seen is None else _detections(bag, seen)
         return BagInput(sound, _array(bag), detections, None if driven is None else _ego(bag, driven))
 
@@ -76,7 +76,7 @@ def needed_array(path: Path, array: MicrophoneArray | None) -> MicrophoneArray:
 
 def sound_of_bag(bag: BagReader, topic: str | None) -> BagSound:
     """Return the sound of a bag; refuse one without."""
-    heard = bag.needed_topic("--audio-topic", topic, *AUDIO_KINDS)
+    heard = bag.needed_topic("--topic audio=", topic, *AUDIO_KINDS)
     return BagSound(bag.path, heard, first_stamp(bag, heard))
 
 

@@ -1,4 +1,4 @@
-"""The sensors of a vehicle in one file: its array, its cameras, where they are, how their clocks differ."""
+"""The sensors of a vehicle in one file: its array, its cameras and what they reported, odometry, model."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -7,17 +7,44 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
 from worldstate.adapters.files.array_file import checked_array, read_array
 from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.text_file import read_json, refused_as_file
+from worldstate.adapters.files.text_file import read_json, read_record, refused_as_file
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, decode
 
 from .mounting import Mounting
 
 MOST_CAMERAS = 32
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSetup:
+    """What belongs to a camera beside its lens: what its detector reported, and what of it counts.
+
+    Parameters
+    ----------
+    detections : Path, optional
+        What was detected in its images, as `read_any_detections` reads it.
+    image_rate_hz : float, optional
+        Images a second, where they carry no stamp; 10 where not given.
+    miss_rates : Path, optional
+        How often its detector misses, as `load_miss_rates` reads it.
+    boxes : DetectionFilter
+        Which boxes count.
+    labels : tuple of str
+        Classes of its detector, where that is an ONNX model.
+    """
+
+    detections: Path | None = None
+    image_rate_hz: float | None = None
+    miss_rates: Path | None = None
+    boxes: DetectionFilter = field(default_factory=DetectionFilter)
+    labels: tuple[str, ...] = ("car",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +56,31 @@ class CarSensors:
 
     Parameters
     ----------
-    array : MicrophoneArray
-        Turned as it is mounted.
+    array : MicrophoneArray or None
+        Turned as it is mounted; None where the file names none.
     cameras : mapping of str to PinholeCamera
         By name, in the order of the file; positions relative to the array.
+    setups : mapping of str to CameraSetup
+        What belongs to each of the cameras.
+    model, odometry, engine_rpm : Path, optional
+        Model file, motion of the vehicle and speed of its engine.
+    firings_per_turn : float
+        Of that engine: half its cylinders.
+    measurements : mapping of str to Path
+        What other sensors recorded, such as a radar, by the name of the part that reads it.
+    crossing_m : float
+        Metres ahead of the lane in which other stacks find a vehicle that is only heard.
     """
 
-    array: MicrophoneArray
-    cameras: Mapping[str, PinholeCamera]
+    array: MicrophoneArray | None
+    cameras: Mapping[str, PinholeCamera] = field(default_factory=dict)
+    setups: Mapping[str, CameraSetup] = field(default_factory=dict)
+    model: Path | None = None
+    odometry: Path | None = None
+    engine_rpm: Path | None = None
+    firings_per_turn: float = 2.0
+    measurements: Mapping[str, Path] = field(default_factory=dict)
+    crossing_m: float = 9.0
 
     def camera(self, name: str | None = None) -> PinholeCamera | None:
         """Return a camera by its name; without one the first, None where there is none.
@@ -60,7 +104,10 @@ def read_car(path: str | Path) -> CarSensors:
     "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "position_m": [1.9, 0, 1.3]}]}``.
     The array has a ``"file"`` as `read_array` reads it, beside the car file, or ``"positions_m"``; it is
     mounted at ``"position_m"`` with ``"yaw_deg"``, ``"pitch_deg"`` and ``"roll_deg"`` (`Mounting`). Cameras
-    are as `read_camera` reads them, with a ``"name"``.
+    are as `read_camera` reads them, with a ``"name"`` and the keys of `CameraSetup`: ``"detections"``,
+    ``"image_rate_hz"``, ``"miss_rates"``, ``"classes"``, ``"min_score"``, ``"min_box_px"`` and ``"labels"``.
+    ``"model"``, ``"odometry"``, ``"engine": {"rpm", "firings_per_turn"}``, ``"measurements": {NAME: FILE}``
+    and ``"crossing_m"`` are those of `CarSensors`. Every key is optional; files lie beside the car file.
 
     Parameters
     ----------
@@ -113,13 +160,27 @@ def write_aligned(
     with refused_as_file(path):
         record = decode(_CarFile, read_json(path, "a car file"), "car")
     here, there = Path(path).absolute().parent, Path(out).absolute().parent
-    if record.array.file is not None and here != there and not Path(record.array.file).is_absolute():
-        raise InputFileError(out, f"expected a file in {here}, where {record.array.file} is")
+    file = None if record.array is None else record.array.file
+    if file is not None and here != there and not Path(file).is_absolute():
+        raise InputFileError(out, f"expected a file in {here}, where {file} is")
     document: Any = read_json(path, "a car file")
     one = next(each for each in document["cameras"] if camera is None or each["name"] == camera)
     one["stamp_offset_s"] = round((one.get("stamp_offset_s") or 0.0) + offset_s, 4)
     one["yaw_deg"] = round((one.get("yaw_deg") or 0.0) + yaw_deg, 3)
     write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def read_camera_setup(path: str | Path) -> tuple[PinholeCamera, CameraSetup]:
+    """Read a camera from JSON as `read_camera` does, with the keys that a car file has for it.
+
+    Raises
+    ------
+    InputFileError
+        As `read_camera`.
+    """
+    with refused_as_file(path):
+        record = read_record(_CameraEntry, path, "camera")
+        return record.camera(), record.setup(Path(path).parent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,26 +206,81 @@ class _ArrayRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class _CameraEntry(CameraRecord):
+    """What a car file holds of a camera."""
+
+    detections: str | None = None
+    image_rate_hz: float | None = None
+    miss_rates: str | None = None
+    classes: tuple[str, ...] = field(default=("car", "motorcycle"), metadata=ADDED)
+    min_score: float = field(default=0.75, metadata=ADDED)
+    min_box_px: float = field(default=100.0, metadata=ADDED)
+    labels: tuple[str, ...] = field(default=("car",), metadata=ADDED)
+
+    def setup(self, folder: Path) -> CameraSetup:
+        """Return what belongs to the camera, its files in a folder."""
+        rate_hz = self.image_rate_hz
+        return CameraSetup(
+            _beside(folder, self.detections),
+            None if rate_hz is None else in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True),
+            _beside(folder, self.miss_rates),
+            DetectionFilter(frozenset(self.classes), self.min_score, self.min_box_px),
+            self.labels,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Engine:
+    """What a car file holds of its engine."""
+
+    rpm: str
+    firings_per_turn: float = field(default=2.0, metadata=ADDED)
+
+
+@dataclass(frozen=True, slots=True)
 class _CarFile:
     """What a car file holds."""
 
-    array: _ArrayRecord
-    cameras: tuple[CameraRecord, ...] = field(default=(), metadata=ADDED)
+    array: _ArrayRecord | None = None
+    cameras: tuple[_CameraEntry, ...] = field(default=(), metadata=ADDED)
     name: str | None = None
+    model: str | None = None
+    odometry: str | None = None
+    engine: _Engine | None = None
+    measurements: Mapping[str, str] = field(default_factory=dict, metadata=ADDED)
+    crossing_m: float = field(default=9.0, metadata=ADDED)
 
     def car(self, path: Path) -> CarSensors:
         """Return the car, its origin moved to the array."""
         if len(self.cameras) > MOST_CAMERAS:
             got = len(self.cameras)
             raise InvalidArgumentError(f"car.cameras: expected at most {MOST_CAMERAS}, got {got}")
-        array, cameras = self.array.array(path), {}
+        folder, engine = path.parent, self.engine
+        array, cameras, setups = None if self.array is None else self.array.array(path), {}, {}
         for number, record in enumerate(self.cameras):
             where = f"car.cameras[{number}]"
             if not record.name or record.name in cameras:
                 raise InvalidArgumentError(f"{where}.name: expected one of its own, got {record.name!r}")
             with _placed_at(where):
-                cameras[record.name] = _relative(record, self.array.position_m)
-        return CarSensors(array, cameras)
+                origin_m = (0.0, 0.0, 0.0) if self.array is None else self.array.position_m
+                cameras[record.name] = _relative(record, origin_m)
+                setups[record.name] = record.setup(folder)
+        firings = 2.0 if engine is None else engine.firings_per_turn
+        return CarSensors(
+            array,
+            cameras,
+            setups,
+            model=_beside(folder, self.model),
+            odometry=_beside(folder, self.odometry),
+            engine_rpm=None if engine is None else folder / engine.rpm,
+            firings_per_turn=in_range("car.engine.firings_per_turn", firings, 0.1, 100.0),
+            measurements={name: folder / file for name, file in self.measurements.items()},
+            crossing_m=in_range("car.crossing_m", self.crossing_m, 1.0, 100.0),
+        )
+
+
+def _beside(folder: Path, file: str | None) -> Path | None:
+    return None if file is None else folder / file
 
 
 def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:
@@ -193,4 +309,4 @@ def _check_keys(given: object, where: str, known: set[str]) -> None:
     _check_keys(given.get("array"), "car.array", {one.name for one in fields(_ArrayRecord)})
     cameras = given.get("cameras")
     for number, camera in enumerate(cameras if isinstance(cameras, list) else ()):
-        _check_keys(camera, f"car.cameras[{number}]", {one.name for one in fields(CameraRecord)})
+        _check_keys(camera, f"car.cameras[{number}]", {one.name for one in fields(_CameraEntry)})

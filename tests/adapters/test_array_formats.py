@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.cli.common.array_options import stance
+from worldstate.cli.common.inputs import stance
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.settings import default_band_hz
 

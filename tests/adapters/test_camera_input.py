@@ -14,7 +14,7 @@ from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.listen import listen, open_source
-from worldstate.cli.common.camera_options import given_detections
+from worldstate.cli.common.sensors import given_sensors
 from worldstate.cli.main import PROGRAM, main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
@@ -120,11 +120,15 @@ def test_images_that_carry_no_stamp_come_at_the_rate_that_is_said(tmp_path, caps
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps(rows))
     words = ["a.wav", "--detections", str(boxes)]
-    parser = PROGRAM.parser("run")
-    at_30 = given_detections(parser.parse_args([*words, "--image-rate", "30"]), None)
-    assert at_30.stamps_ns[45] == 1_500_000_000
-    assert given_detections(parser.parse_args(words), None) == boxes
-    assert main(["run", "a.wav", "--image-rate", "30"]) == 2
-    assert "--image-rate: expected --detections with it" in capsys.readouterr().err
-    assert main(["run", *words, "--image-rate", "0"]) == 2
-    assert "frame_rate_hz" in capsys.readouterr().err
+    lens = {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}
+
+    def reported(camera: dict) -> object:
+        (tmp_path / "camera.json").write_text(json.dumps(lens | camera))
+        arguments = PROGRAM.parser("run").parse_args([*words, "--camera", str(tmp_path / "camera.json")])
+        return given_sensors(arguments).detections(arguments)
+
+    assert reported({"image_rate_hz": 30}).stamps_ns[45] == 1_500_000_000
+    assert reported({}) == boxes
+    (tmp_path / "camera.json").write_text(json.dumps(lens | {"image_rate_hz": 0}))
+    assert main(["run", *words, "--camera", str(tmp_path / "camera.json")]) == 2
+    assert "camera.image_rate_hz" in capsys.readouterr().err

@@ -314,10 +314,9 @@ def test_bad_input_of_the_command_is_one_line(tmp_path, capsys):
         assert main(["model", "detector", str(path), "--out", str(tmp_path / "beta.json")]) == 2
         captured = capsys.readouterr()
         assert str(path.name) in captured.err
-    assert (
-        main(["model", "detector", str(text), "--detector", "onnx", "--out", str(tmp_path / "b.json")]) == 2
-    )
-    assert "--onnx-model" in capsys.readouterr().err
+    out = ["--out", str(tmp_path / "b.json")]
+    assert main(["model", "detector", str(text), "--detector", "onnx", *out]) == 2
+    assert "FILE.onnx" in capsys.readouterr().err
     assert not (tmp_path / "beta.json").exists()
 
 

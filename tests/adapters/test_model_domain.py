@@ -293,7 +293,7 @@ def windows(seed: int = 0) -> FeatureTable:
     rng = np.random.default_rng(seed)
     labels = np.array(["front", "left", "none", "right"] * 15)
     keys = np.array([str(i) for i in range(60)])
-    sites = np.array(["SA1", "SB2"] * 30)
+    sites = np.repeat(["SA1", "SB2"], 30)
     return FeatureTable(rng.random((60, 60)) + 0.1, labels, keys, sites, keys, (None,) * 60)
 
 

@@ -127,7 +127,7 @@ def test_array_and_signature_of_ones_own_measure(own_parts, tmp_path):
 def test_nothing_is_imported_that_was_not_named(package, log, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(package)
     monkeypatch.delitem(sys.modules, "own_parts", raising=False)
-    assert main(["log", "replay", str(log), "--autoware", str(tmp_path / "a.jsonl")]) == 0
+    assert main(["log", "replay", str(log), "--export", f"autoware={tmp_path / 'a.jsonl'}"]) == 0
     assert "own_parts" not in sys.modules
     assert installed("worldstate.exporters") == ["table"]
 
@@ -137,11 +137,11 @@ def test_a_name_that_nobody_brings_is_refused_with_those_that_are_there(
 ):
     replay, run = ["log", "replay", str(log)], ["run", str(approach.folder)]
     for options, said in (
-        ([*replay, "--export", "sheet=a.csv"], "worldstate.exporters (table), got 'sheet'"),
+        ([*replay, "--export", "sheet=a.csv"], "rosbag-sqlite3, table), got 'sheet'"),
         ([*replay, "--export", "table"], "--export: expected NAME=TARGET, got 'table'"),
         ([*run, "--measurements", "radar=a"], "worldstate.measurements (v2x), got 'radar'"),
         ([*run, "--measurements", f"v2x={tmp_path / 'none.jsonl'}"], "none.jsonl: No such file"),
-        ([*run, "--detector", "yolo"], "worldstate.detectors (motion, knn, onnx, moving-columns), got"),
+        ([*run, "--detector", "yolo"], "worldstate.detectors (motion, knn, FILE.onnx, moving-columns), got"),
     ):
         assert main(options) == 2, options
         assert said in " ".join(capsys.readouterr().err.split()), options

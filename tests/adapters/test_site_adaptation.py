@@ -179,8 +179,8 @@ def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model):
 
 def test_run_has_the_switch(approach, capsys):
     peaks = []
-    for option in (["--site-adaptation"], ["--no-site-adaptation"], ["--forgetting", "5"]):
+    for option in ([], ["--site-memory", "0"], ["--site-memory", "5"]):
         assert main(["run", str(approach.folder), *option, "--json"]) == 0
         peaks.append(json.loads(capsys.readouterr().out)["peak_risk"])
     assert all(0.0 <= peak <= 1.0 for peak in peaks)
-    assert main(["run", str(approach.folder), "--forgetting", "-1"]) == 2
+    assert main(["run", str(approach.folder), "--site-memory", "-1"]) == 2

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jsonschema
@@ -12,7 +13,7 @@ import pytest
 import soundfile
 
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.cli.main import FORMER, PROGRAM, STUDIES, main
+from worldstate.cli.main import FORMER, FORMER_OPTIONS, PROGRAM, STUDIES, main
 from worldstate.state import snapshot_schema
 
 
@@ -40,6 +41,71 @@ def test_all_commands_stand_on_one_screen_with_their_words(capsys):
     assert shown == {*PROGRAM.commands} - {"completion"}
     assert main(["array", "--help"]) == 0
     assert "array bounds" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["run", "live"])
+def test_help_holds_what_a_first_user_needs_and_help_all_the_rest(command, capsys):
+    parser, brief = PROGRAM.parser(command), help_of(f"{command} --help", capsys)
+    assert len(brief.splitlines()) <= 60
+    everything = help_of(f"{command} --help-all", capsys)
+    assert len(everything.splitlines()) > 100
+    assert all(option in everything for option in parser._option_string_actions)
+    assert {"--array", "--car"} <= {*parser.first} <= {*parser._option_string_actions}
+    if command == "run":
+        assert len([one for one in parser._option_string_actions if one not in ("-h", "--help")]) <= 30
+
+
+@pytest.mark.parametrize("option", FORMER_OPTIONS)
+def test_an_option_that_is_gone_names_what_stands_in_its_place(option, capsys):
+    assert main(["run", "some.wav", f"{option}=1"]) == 2
+    line = one_line_of(capsys)
+    successor = re.findall(r"--[a-z-]+|pcm:", FORMER_OPTIONS[option])
+    assert FORMER_OPTIONS[option] in line and successor
+    known = PROGRAM.parser("run")._option_string_actions
+    assert all(one in known or one == "pcm:" for one in successor)
+
+
+WRONG = """
+import sys
+import time
+from worldstate.cli.main import main
+code = main(sys.argv[1:])
+heavy = [one for one in sys.modules if one.split(".")[0] in ("scipy", "matplotlib", "rich")]
+front = [one for one in sys.modules if one.startswith("worldstate.frontend.") and ".array" not in one]
+print(code, heavy, front, "worldstate.adapters.files.model_file" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], ("expected --array FILE", "4 channels", "array bearings", "model make")),
+        (["--array", "mics.csv"], ("not the array of the model", "4 microphones", "--uncalibrated")),
+        (["--figure", "f.png"], ("worldstate[plot]",)),
+        (["--export", "mcap=f.mcap"], ("worldstate[mcap]",)),
+    ],
+)
+def test_a_wrong_call_is_answered_without_what_listens(options, said, tmp_path):
+    soundfile.write(tmp_path / "own.wav", np.random.default_rng(0).normal(0, 0.1, (50_000, 4)), 48000)
+    (tmp_path / "mics.csv").write_text("0,0.2,0\n0,0.05,0\n0.05,-0.1,0\n0,-0.25,0\n")
+    missing = "f." in "".join(options)
+    blocked = "import sys; sys.modules.update(matplotlib=None, mcap=None)\n" if missing else ""
+    command = [sys.executable, "-c", blocked + WRONG, "run", "own.wav", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout == ("2 ['matplotlib'] [] False\n" if blocked else "2 [] [] False\n")
+    assert len(done.stderr.splitlines()) == 1
+    assert all(words in done.stderr for words in said)
+
+
+def test_progress_is_a_line_where_there_is_no_terminal(monkeypatch, capsys):
+    from worldstate.cli.common import progress
+
+    monkeypatch.setattr(progress, "EVERY_S", 0.01)
+    monkeypatch.setitem(sys.modules, "rich", None)
+    with progress.progress_bar("working", 4) as bar:
+        bar.advance()
+        time.sleep(0.2)
+    assert "worldstate: working: 25 % after 0 s" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("former", FORMER)
@@ -106,7 +172,7 @@ def test_too_few_channels_names_both_counts(tmp_path, capsys):
 
 def test_unknown_budget_names_the_ones_there_are(tmp_path, capsys):
     sound = tmp_path / "sound.wav"
-    sound.write_bytes(b"")
+    soundfile.write(sound, np.random.default_rng(0).normal(0, 0.1, (50_000, 56)), 48000)
     assert main(["run", str(sound), "--alpha", "0.33"]) == 2
     assert "0.02" in one_line_of(capsys)
 

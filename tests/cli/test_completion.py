@@ -36,7 +36,7 @@ def complete(script: str, *words: str) -> list[str]:
         (["worldstate", "sim", "make", "--traffic", "b"], ["busy"]),
         (["worldstate", "array", "check", "some.wav", "--dur"], ["--duration", "--duration-error"]),
         (["worldstate", "run", "a.wav", "--uncal"], ["--uncalibrated"]),
-        (["worldstate", "run", "--format", "s"], ["s16", "s24", "s32"]),
+        (["worldstate", "run", "--array-axes", "b"], ["base_link"]),
         (["worldstate", "completion", ""], ["bash"]),
         (["worldstate", "live", "--uncalibrated", "--save-s"], ["--save-state"]),
         # Left to the completion of files.

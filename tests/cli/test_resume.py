@@ -57,9 +57,12 @@ def test_the_engine_is_followed_with_ego_noise_only(approach, tmp_path, capsys):
     source = open_source(approach.folder, engine=speed, settings=ListenSettings(ego_noise=True))
     assert source.engine is not None
     assert source.engine.at(3.0) == 50.0
-    assert main(["run", str(approach.folder), "--ego-noise", "--engine-rpm", str(speed), "--json"]) == 0
+    car = tmp_path / "car.json"
+    car.write_text('{"engine": {"rpm": "rpm.csv", "firings_per_turn": 2}}')
+    words = ["run", str(approach.folder), "--ego-noise", "--car", str(car)]
+    assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["hops"] > 50
     for text in ("time_s,rpm\n", "time_s,rpm\n1,900\n1,900\n", "time_s,rpm\n0,fast\n", "time_s\n0\n"):
         speed.write_text(text)
-        assert main(["run", str(approach.folder), "--ego-noise", "--engine-rpm", str(speed)]) == 2
+        assert main(words) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1

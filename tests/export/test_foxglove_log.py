@@ -43,7 +43,7 @@ def recording(tmp_path_factory):
 def logged(recording):
     log, states = recording / "out.mcap", recording / "states.jsonl"
     sound = str(recording / "out_multi.wav")
-    assert main(["run", sound, "--mcap", str(log), "--out", str(states)]) == 0
+    assert main(["run", sound, "--export", f"mcap={log}", "--out", str(states)]) == 0
     return log, states
 
 
@@ -58,7 +58,7 @@ def test_replay_gives_the_same_bytes_back(logged, tmp_path, capsys):
     log, states = logged
     assert main(["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")]) == 0
     assert (tmp_path / "again.jsonl").read_bytes() == states.read_bytes()
-    assert main(["log", "replay", str(states), "--mcap", str(tmp_path / "again.mcap")]) == 0
+    assert main(["log", "replay", str(states), "--export", f"mcap={tmp_path / 'again.mcap'}"]) == 0
     assert main(["log", "replay", str(tmp_path / "again.mcap"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["states"] == 6
 

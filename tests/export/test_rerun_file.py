@@ -27,7 +27,7 @@ def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     states = tmp_path / "states.jsonl"
     states.write_text("\n".join(state.to_json() for state in STATES) + "\n")
-    assert main(["log", "replay", str(states), "--rerun", str(tmp_path / "out.rrd")]) == 2
+    assert main(["log", "replay", str(states), "--export", f"rerun={tmp_path / 'out.rrd'}"]) == 2
     assert "worldstate[rerun]" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [states]
 
@@ -36,7 +36,7 @@ def test_every_entity_of_the_scene_is_in_the_recording(tmp_path):
     pytest.importorskip("rerun")
     states, out = tmp_path / "states.jsonl", tmp_path / "out.rrd"
     states.write_text("\n".join(state.to_json() for state in STATES) + "\n")
-    assert main(["log", "replay", str(states), "--rerun", str(out)]) == 0
+    assert main(["log", "replay", str(states), "--export", f"rerun={out}"]) == 0
     assert "verified without error" in reader("verify", str(out))
     printed = reader("print", str(out))
     paths = set(re.findall(r" - (/worldstate/\S*) - ", printed))

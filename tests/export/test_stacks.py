@@ -33,7 +33,9 @@ def log(tmp_path_factory):
 def test_osi_reads_the_trace_and_finds_every_entity(log, tmp_path):
     from osi3trace.osi_trace import OSITrace
 
-    assert main(["log", "replay", str(log), "--osi", str(tmp_path / "out.osi"), "--crossing", "7"]) == 0
+    assert (
+        main(["log", "replay", str(log), "--export", f"osi={tmp_path / 'out.osi'}", "--crossing", "7"]) == 0
+    )
     found = list(OSITrace(str(tmp_path / "out.osi"), type_name="SensorData"))
     assert [m.timestamp.seconds * 10**9 + m.timestamp.nanos for m in found] == [s.stamp_ns for s in STATES]
     for message, state in zip(found, STATES, strict=True):
@@ -106,7 +108,7 @@ def check(kind, value):
 
 
 def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lane(log, tmp_path):
-    assert main(["log", "replay", str(log), "--autoware", str(tmp_path / "objects.jsonl")]) == 0
+    assert main(["log", "replay", str(log), "--export", f"autoware={tmp_path / 'objects.jsonl'}"]) == 0
     lines = (tmp_path / "objects.jsonl").read_text().splitlines()
     assert len(lines) == len(STATES)
     for line, state in zip(lines, STATES, strict=True):
@@ -157,7 +159,7 @@ def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
 
         listener = threading.Thread(target=serve)
         listener.start()
-        assert main(["log", "replay", str(log), "--odas", f"127.0.0.1:{server.getsockname()[1]}"]) == 0
+        assert main(["log", "replay", str(log), "--export", f"odas=127.0.0.1:{server.getsockname()[1]}"]) == 0
         listener.join(timeout=20.0)
     # Packets are cut anywhere; a reader of ODAS splits the text where one object ends and the next begins.
     parts = b"".join(received).decode().rstrip("\n").split("}\n{")
@@ -185,13 +187,13 @@ def test_what_is_missing_is_named(log, tmp_path, monkeypatch, capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     for options, said in (
-        (["--odas", f"127.0.0.1:{port}"], "expected a listener at"),
-        (["--odas", "studio"], "expected HOST:PORT"),
-        (["--osi", str(tmp_path / "out.osi"), "--crossing", "0"], "--crossing"),
+        (["--export", f"odas=127.0.0.1:{port}"], "expected a listener at"),
+        (["--export", "odas=studio"], "expected HOST:PORT"),
+        (["--export", f"osi={tmp_path / 'out.osi'}", "--crossing", "0"], "--crossing"),
     ):
         assert main(["log", "replay", str(log), *options]) == 2
         assert said in capsys.readouterr().err
     monkeypatch.setitem(__import__("sys").modules, "osi3", None)
-    assert main(["log", "replay", str(log), "--osi", str(tmp_path / "out.osi")]) == 2
+    assert main(["log", "replay", str(log), "--export", f"osi={tmp_path / 'out.osi'}"]) == 2
     assert "worldstate[osi]" in capsys.readouterr().err
     assert not (tmp_path / "out.osi").exists()

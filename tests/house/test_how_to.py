@@ -39,7 +39,7 @@ def commissions(words: list[str]) -> bool:
 
 def run(words: list[str]) -> None:
     assert main(words) == 0, " ".join(words)
-    for option in ("--out", "--figure", "--save-state", "--mcap", "--windows"):
+    for option in ("--out", "--figure", "--save-state", "--windows"):
         if option in words:
             assert Path(words[words.index(option) + 1]).stat().st_size > 0
 

@@ -157,14 +157,14 @@ def test_raw_samples_on_standard_input(
     soundfile.write(tmp_path / "a.wav", wave(array, 20.0), RATE, subtype=subtype)
     raw = (tmp_path / "a.raw").read_bytes()
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(raw)))
-    said = ["--rate", str(RATE), "--channels", "4", "--format", encoding]
-    assert main(["array", "bearings", "-", *said, "--array", str(file), "--out", str(out)]) == 0
+    said = f"pcm:{RATE}:4:{encoding}"
+    assert main(["array", "bearings", said, "--array", str(file), "--out", str(out)]) == 0
     by_pipe = out.read_text()
     assert main(["array", "bearings", str(tmp_path / "a.wav"), "--array", str(file), "--out", str(out)]) == 0
     assert by_pipe == out.read_text()
     capsys.readouterr()
     assert main(["array", "bearings", "-", "--array", str(file), "--out", str(out)]) == 2
-    assert "--rate" in capsys.readouterr().err
+    assert "pcm:RATE:CHANNELS:FORMAT" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

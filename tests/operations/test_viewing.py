@@ -71,7 +71,7 @@ def test_the_snapshot_nearest_to_the_time_is_drawn(log, states, tmp_path, capsys
         ([], "expected one of --out"),
         (["--animate", "above.png"], "ending in .gif"),
         (["--out", "states.gif"], "ending in .png"),
-        (["--out", "states.png", "--recording", "-"], "--rate"),
+        (["--out", "states.png", "--recording", "-"], "pcm:RATE"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_in_one_line(log, tmp_path, monkeypatch, capsys, options, said):

@@ -174,7 +174,9 @@ def bag_of_approach(approach, tmp_path_factory):
 def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach, tmp_path):
     out, again = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
     assert main(["run", str(approach.folder), "--out", str(out)]) == 0
-    assert main(["run", str(bag_of_approach), "--out", str(again), "--ros-bag", str(tmp_path / "c")]) == 0
+    assert (
+        main(["run", str(bag_of_approach), "--out", str(again), "--export", f"rosbag={tmp_path / 'c'}"]) == 0
+    )
     of_folder, of_bag = ([json.loads(line) for line in path.open()] for path in (out, again))
     assert len(of_folder) == len(of_bag) > 50
     for one, other in zip(of_folder, of_bag, strict=True):
@@ -323,9 +325,9 @@ def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
     four.write_text("".join(f"0,{y},0\n" for y in (0.1, 0.05, -0.05, -0.1)))
     write_blocks(tmp_path / "four", samples)
     for name, options, said in (
-        ("two", [], "expected --audio-topic with one of /front, /rear"),
-        ("two", ["--audio-topic", "/left"], "on /left (--audio-topic), got /front (worldstate_msgs"),
-        ("two", ["--audio-topic", "/front"], "expected --array, or a message of worldstate_msgs"),
+        ("two", [], "expected --topic audio= with one of /front, /rear"),
+        ("two", ["--topic", "audio=/left"], "on /left (--topic audio=), got /front (worldstate_msgs"),
+        ("two", ["--topic", "audio=/front"], "expected --array, or a message of worldstate_msgs"),
         ("blind", [], "MultiChannelAudio or audio_common_msgs/msg/AudioDataStamped or"),
         ("planes", [], "expected interleaved or planar, got 'spiral'"),
         ("three", [], "expected samples of 3 channels, got 3200 numbers"),
@@ -333,8 +335,12 @@ def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
         ("changing", ["--array", str(four)], "expected 8000 Hz and 4 channels as in the first message"),
         ("four", ["--array", str(array), "--uncalibrated"], "expected 3 channels, one per microphone, got 4"),
         ("four", ["--array", str(array), "--start", "3"], "--start: expected none with a bag"),
-        ("four", ["--array", str(array), "--detections-topic", "/x"], "on /x (--detections-topic), got"),
-        ("four", ["--array", str(array), "--ros-bag", str(tmp_path / "two")], "expected a name that is free"),
+        ("four", ["--array", str(array), "--topic", "detections=/x"], "on /x (--topic detections=), got"),
+        (
+            "four",
+            ["--array", str(array), "--export", f"rosbag={tmp_path / 'two'}"],
+            "expected a name that is free",
+        ),
     ):
         options = [*options, *(["--uncalibrated"] if "--array" in options else [])]
         assert main(["run", str(tmp_path / name), *options]) == 2, (name, options)
@@ -361,7 +367,7 @@ def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
 def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
     states, log = tmp_path / "states.jsonl", tmp_path / "out.mcap"
     states.write_text("".join(state.to_json() + "\n" for state in STATES))
-    assert main(["log", "replay", str(states), "--mcap", str(log)]) == 0
+    assert main(["log", "replay", str(states), "--export", f"mcap={log}"]) == 0
     capsys.readouterr()
     assert main(["run", str(log)]) == 2
     assert "`worldstate log replay` reads" in capsys.readouterr().err
@@ -407,7 +413,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
     states = tmp_path / "states.jsonl"
     states.write_text("".join(state.to_json() + "\n" for state in STATES))
-    assert main(["log", "replay", str(states), "--ros-bag", str(tmp_path / "out")]) == 2
+    assert main(["log", "replay", str(states), "--export", f"rosbag={tmp_path / 'out'}"]) == 2
     assert "worldstate[ros]" in capsys.readouterr().err
     shutil.copy(states, tmp_path / "a.mcap")
     assert main(["run", str(tmp_path / "a.mcap")]) == 2

@@ -103,7 +103,7 @@ def test_the_command_writes_the_car_with_both_added(car, tmp_path, capsys, monke
         *map(str, sounds),
         "--car",
         str(car),
-        "--camera-name",
+        "--camera",
         "left",
         "--out",
         str(out),

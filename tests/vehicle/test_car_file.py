@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import read_camera
+from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.adapters.listen import ListenSettings, open_source
 from worldstate.adapters.vehicle.car_file import read_car
 from worldstate.adapters.vehicle.mounting import Mounting
@@ -91,7 +92,6 @@ def changed(part: str, **keys: object) -> object:
     ("car", "said"),
     [
         ([], "car: expected an object"),
-        ({"cameras": []}, "car.array: expected an object, got None"),
         (changed("car", wheels=4), r"car: expected keys among .*, got \['wheels'\]"),
         (changed("array", file="mics.csv"), "car.array: expected either file or positions_m"),
         (changed("array", yaw=3.0), r"car.array: expected keys among .*'yaw_deg'\], got \['yaw'\]"),
@@ -144,22 +144,41 @@ def test_run_and_live_take_the_car_in_place_of_array_and_camera(tmp_path, capsys
     assert json.loads(capsys.readouterr().out)["array"] == heard["array"]
 
 
+def test_a_car_file_alone_carries_all_that_a_vehicle_has(tmp_path):
+    """Array, boxes of two cameras, motion, engine and model: the same states as by single options."""
+    soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
+    (tmp_path / "moves.csv").write_text("time_s,speed_mps\n0,3\n9,3\n")
+    save_model(tmp_path / "mine.json", read_model())
+    wide = [FRONT | {"horizontal_fov_deg": 90.0}, LEFT | {"horizontal_fov_deg": 90.0}]
+    sensors = read_car(written(tmp_path, CAR | {"cameras": wide})).cameras
+    told = [boxes(tmp_path, name, sensors[name].column(np.full(15, 0.5)).tolist()) for name in sensors]
+    options = [word for one in told for word in ("--detections", one)]
+    options += ["--odometry", str(tmp_path / "moves.csv"), "--model", str(tmp_path / "mine.json")]
+    words = ["run", str(tmp_path / "street.wav"), "--car", str(tmp_path / "car.json")]
+    assert main([*words, *options, "--uncalibrated", "--out", str(tmp_path / "by_options.jsonl")]) == 0
+    full = [one | {"detections": f"{one['name']}.json"} for one in wide]
+    written(tmp_path, CAR | {"cameras": full, "odometry": "moves.csv", "model": "mine.json"})
+    assert main([*words, "--uncalibrated", "--out", str(tmp_path / "alone.jsonl")]) == 0
+    states = (tmp_path / "alone.jsonl").read_text()
+    assert states == (tmp_path / "by_options.jsonl").read_text()
+    last = json.loads(states.splitlines()[-1])
+    assert [one["sensor"] for one in last["searched"]] == ["front", "left"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--array", "mics.csv"], "--car: expected no --array and no --camera with it"),
-        (["--camera", "lens.json"], "--car: expected no --array and no --camera with it"),
-        (["--camera-name", "rear"], "camera: expected one of front, left, got rear"),
+        (["--array", "mics.csv"], "--car: expected no --array with it"),
+        (["--camera", "lens.json"], "camera: expected one of front, left, got lens.json"),
+        (
+            ["--detections", "a.json", "--detections", "b.json", "--uncalibrated"],
+            "--detections: expected one, or --car with",
+        ),
     ],
 )
 def test_options_that_say_two_things(tmp_path, capsys, words, said):
     assert main(["run", "street.wav", "--car", str(written(tmp_path, CAR)), *words]) == 2
     assert said in capsys.readouterr().err
-
-
-def test_a_name_without_a_car(capsys):
-    assert main(["run", "street.wav", "--camera-name", "rear"]) == 2
-    assert "--camera-name: expected --car" in capsys.readouterr().err
 
 
 def boxes(folder: Path, name: str, columns_px: list[float]) -> str:
@@ -177,7 +196,8 @@ def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path
     car, out = written(tmp_path, CAR | {"cameras": wide}), tmp_path / "states.jsonl"
     sensors, azimuths = read_car(car).cameras, np.radians(26.0 + 0.5 * np.arange(15))
     told = [boxes(tmp_path, name, sensors[name].column(azimuths).tolist()) for name in ("front", "left")]
-    words = ["--car", str(car), "--camera-detections", *told, "--uncalibrated", "--out", str(out)]
+    words = ["--car", str(car), *(word for one in told for word in ("--detections", one))]
+    words += ["--uncalibrated", "--out", str(out)]
     assert main(["run", str(tmp_path / "street.wav"), *words]) == 0
     last = json.loads(out.read_text().splitlines()[-1])
     assert [(one["sensor"], one["found"]) for one in last["searched"]] == [("front", True), ("left", True)]
@@ -189,15 +209,18 @@ def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path
     ("words", "said"),
     [
         (
-            ["--car", "CAR", "--camera-name", "left", "--camera-detections", "front=a.json"],
-            "--camera-detections: expected --car with it, and neither --detections nor --camera-name",
+            ["--car", "CAR", "--camera", "left", "--detections", "front=a.json"],
+            "--detections: expected NAME=PATH of different cameras, without --camera",
         ),
-        (["--car", "CAR", "--camera-detections", "a.json"], "expected NAME=PATH of different cameras"),
         (
-            ["--car", "CAR", "--camera-detections", "rear=a.json"],
+            ["--car", "CAR", "--detections", "left=a", "--detections", "left=b"],
+            "expected NAME=PATH of different cameras",
+        ),
+        (
+            ["--car", "CAR", "--detections", "rear=a.json"],
             "camera: expected one of front, left, got rear",
         ),
-        (["--car", "CAR", "--camera-detections", "left=a.json"], "a.json"),
+        (["--car", "CAR", "--detections", "left=a.json"], "a.json"),
     ],
 )
 def test_what_is_wrong_with_the_boxes_of_several_cameras_is_said(tmp_path, capsys, words, said):

@@ -1,7 +1,7 @@
 """`worldstate live`: microphones that run in, one snapshot a hop out.
 
 Listen to the microphones of this machine, or to a recording played as if they heard it, and keep the
-world-state.
+world-state; --help-all shows every option.
 
 States are kept where asked for. The sound is not, unless --keep-sound says so: microphones in public hear
 people. What the machine was too slow for is counted as an overrun, said when it happens, and heard as
@@ -28,21 +28,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options, add_search_options, stance
-from worldstate.cli.common.camera_options import LENS_HELP, add_lens_options, boxes_of
-from worldstate.cli.common.car_options import add_car_options, given_sensors
-from worldstate.cli.common.detector_options import add_detector_options, detector_filter, detector_maker
-from worldstate.cli.common.listen_options import (
+from worldstate.cli.common.command import stopped_by_signals
+from worldstate.cli.common.early_checks import check_call
+from worldstate.cli.common.exports import add_export_options, exported_files, exported_hops
+from worldstate.cli.common.inputs import add_array_options, add_search_options, stance
+from worldstate.cli.common.listening import (
     add_listen_options,
     add_memory_options,
-    given_context,
-    given_sides,
+    given_place,
     listen_settings,
 )
-from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
-from worldstate.cli.common.stopping import stopped_by_signals
+from worldstate.cli.common.sensors import (
+    GivenSensors,
+    add_car_option,
+    add_detector_option,
+    add_lens_options,
+    boxes_of,
+    detector_maker,
+    given_sensors,
+)
 
 if TYPE_CHECKING:
     from worldstate.adapters.listen import Source
@@ -58,12 +64,17 @@ examples:
   worldstate live --play ovad_dataset/SA1/left/1_00_0002
   worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4"""
 
+# What a first user needs.
+FIRST_OPTIONS = (
+    *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--device", "--play"),
+    *("--camera-device", "--detections", "--camera", "--odometry", "--out", "--export"),
+)
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_array_options(parser)
-    parser.description = f"{parser.description}\n\n{LENS_HELP}"
-    add_car_options(parser)
+    add_car_option(parser)
     _add_sound_options(parser)
     add_search_options(parser)
     add_listen_options(parser)
@@ -76,7 +87,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
     view = "show bearing, risk and entities (default: where standard error is a terminal)"
     add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
-    add_log_options(parser)
+    add_export_options(parser)
 
 
 def _add_sound_options(parser: argparse.ArgumentParser) -> None:
@@ -94,46 +105,48 @@ def _add_camera_options(parser: argparse.ArgumentParser) -> None:
     which = group.add_mutually_exclusive_group()
     which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
     which.add_argument("--detections", metavar="HOST:PORT", help="listen there to a detector of your own")
-    add_lens_options(group)
-    add_detector_options(parser)
+    add_lens_options(parser, group)
+    add_detector_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
-    check_outputs(arguments, "out", "keep_sound", "save_state", *LOG_FILES)
+    check_outputs(arguments, "out", "keep_sound", "save_state", exported=exported_files(arguments))
+    given = given_sensors(arguments)
+    check_call(arguments, given, [] if arguments.play is None else [arguments.play])
     with ExitStack() as opened:
-        recorded = None if arguments.play is None else _source(arguments, arguments.play)
-        feed = _microphones(arguments) if recorded is None else _played(arguments, recorded)
+        recorded = None if arguments.play is None else _source(arguments, given, arguments.play)
+        feed = _microphones(arguments, given) if recorded is None else _played(arguments, recorded)
         keep = opened.enter_context(kept_sound(arguments.keep_sound, feed.sample_rate_hz, feed.channels))
         sound = LiveSound(feed, keep)
-        source = _source(arguments, sound) if recorded is None else replace(recorded, sound=sound)
+        source = _source(arguments, given, sound) if recorded is None else replace(recorded, sound=sound)
         sound.start_ns = source.start_ns
-        source, camera_losses = _with_camera(arguments, source, sound, opened)
+        source, camera_losses = _with_camera(arguments, given, source, sound, opened)
         source, odometry_losses = _with_odometry(arguments, source, sound, opened)
-        figures = _listen(arguments, source, sound) | camera_losses() | odometry_losses()
+        figures = _listen(arguments, given, source, sound) | camera_losses() | odometry_losses()
         return CommandResult(figures | {"array": stance(source.array)})
 
 
-def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source":
+def _source(arguments: argparse.Namespace, given: GivenSensors, sound: "LiveSound | Path") -> "Source":
     from worldstate.adapters.files.checkpoint_file import read_checkpoint
     from worldstate.adapters.listen import open_source
     from worldstate.ground.values import seconds
 
-    array, camera = given_sensors(arguments)
     before = None if arguments.resume is None else read_checkpoint(arguments.resume)
     ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
-    moving = arguments.camera_device is not None
-    boxes = detector_filter(arguments) if moving else boxes_of(arguments)
+    looks = arguments.camera_device is not None
+    boxes = boxes_of(arguments, given.setup) if looks else given.setup.boxes
+    context, sides = given_place(arguments)
     return open_source(
         sound,
-        array=array,
-        camera=camera,
-        miss_rates=arguments.miss_rates,
-        model=arguments.model,
-        context=given_context(arguments),
-        sides=given_sides(arguments),
+        array=given.car.array,
+        camera=given.camera,
+        miss_rates=arguments.miss_rates or given.setup.miss_rates,
+        model=arguments.model or given.car.model,
+        context=context,
+        sides=sides,
         resume=before,
         start_s=ended_s if arguments.start is None else arguments.start,
         # A channel that is silent is told by the front-end, which leaves it out.
@@ -141,12 +154,12 @@ def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source
     )
 
 
-def _microphones(arguments: argparse.Namespace) -> "SoundFeed":
+def _microphones(arguments: argparse.Namespace, given: GivenSensors) -> "SoundFeed":
     from worldstate.adapters.live.microphones import PortAudioInput
     from worldstate.ground.checks import in_range
     from worldstate.ground.errors import InvalidArgumentError
 
-    array, _ = given_sensors(arguments)
+    array = given.car.array
     if array is None:
         problem = "expected the positions of the microphones, or --car, or --play RECORDING"
         raise InvalidArgumentError(f"--array: {problem}")
@@ -165,13 +178,17 @@ def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
 
 
 def _with_camera(
-    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+    arguments: argparse.Namespace,
+    given: GivenSensors,
+    source: "Source",
+    sound: "LiveSound",
+    opened: ExitStack,
 ) -> "tuple[Source, Losses]":
     """Return the source with the camera that was asked for, and what tells what was lost of its looks."""
     if arguments.detections is not None:
         return _with_detections(arguments.detections, source, sound, opened)
     if arguments.camera_device is not None:
-        return _with_device(arguments, source, sound, opened)
+        return _with_device(arguments, given, source, sound, opened)
     return source, dict
 
 
@@ -190,12 +207,16 @@ def _with_detections(
 
 
 def _with_device(
-    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+    arguments: argparse.Namespace,
+    given: GivenSensors,
+    source: "Source",
+    sound: "LiveSound",
+    opened: ExitStack,
 ) -> "tuple[Source, Losses]":
     from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
     from worldstate.adapters.live.live_camera import LiveCamera
 
-    images, detector = image_channel(), detector_maker(arguments)()
+    images, detector = image_channel(), detector_maker(arguments.detector, given.setup.labels)()
     size = source.camera.width_px, source.camera.height_px
     looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
     opened.enter_context(CameraFeed(arguments.camera_device, images))
@@ -219,7 +240,9 @@ def _with_odometry(
     }
 
 
-def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound") -> dict[str, object]:
+def _listen(
+    arguments: argparse.Namespace, given: GivenSensors, source: "Source", sound: "LiveSound"
+) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
     from worldstate.adapters.live.live_listening import live_steps
@@ -233,13 +256,13 @@ def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound")
     start_s, last = seconds(source.start_ns), None
     with (
         states_writer(arguments.out) as write,
-        log_hops(arguments, source, paced=False) as log,
+        exported_hops(arguments, source, given.car.crossing_m, paced=False) as export,
         live_view(shown) as show,
         stopped_by_signals(sound.close),
     ):
         for live in live_steps(source):
             write(live.step.state.to_json())
-            log(live.step)
+            export(live.step)
             for watcher in (report.add, show, notice):
                 watcher(live)
             last = live.step

@@ -57,6 +57,32 @@ STUDIES = {
     "bench": "bench",
 }
 
+_CAMERA_FILE = "a key of the camera in --camera or --car"
+# Options that are gone, with what stands in their place.
+FORMER_OPTIONS = {
+    **dict.fromkeys(("--rate", "--channels", "--format"), "INPUT pcm:RATE:CHANNELS:FORMAT"),
+    **{f"--{name}-topic": f"--topic {name}=TOPIC" for name in ("audio", "detections", "odometry")},
+    **{f"--{name}": f"--export {name}=FILE" for name in ("mcap", "rerun", "osi", "autoware")},
+    "--live": "--export foxglove=PORT",
+    "--odas": "--export odas=HOST:PORT",
+    "--ros-bag": "--export rosbag=FOLDER",
+    "--ros-storage": "--export rosbag-sqlite3=FOLDER",
+    "--crossing": "crossing_m in --car",
+    "--camera-name": "--camera NAME",
+    "--camera-detections": "--detections NAME=PATH",
+    "--image-rate": f"image_rate_hz, {_CAMERA_FILE}",
+    "--min-box-px": f"min_box_px, {_CAMERA_FILE}",
+    "--min-score": f"min_score, {_CAMERA_FILE}",
+    "--classes": f"classes, {_CAMERA_FILE}",
+    "--onnx-model": "--detector FILE.onnx",
+    "--labels": f"labels, {_CAMERA_FILE}",
+    "--engine-rpm": "engine in --car",
+    "--engine-lines": "engine in --car",
+    "--forgetting": "--site-memory S",
+    "--site-adaptation": "--site-memory S",
+    "--no-site-adaptation": "--site-memory 0",
+}
+
 DESCRIPTION = "Keep a structured world-state alive from sound when vision fails."
 EPILOG = """\
 example: worldstate demo --out out/demo
@@ -73,6 +99,7 @@ PROGRAM = Program(
     {words: "worldstate.cli." + words.replace(" ", ".").replace("-", "_") for words in COMMANDS},
     GROUPS,
     hidden=("completion",),
+    former_options=FORMER_OPTIONS,
 )
 
 

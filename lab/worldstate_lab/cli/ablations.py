@@ -24,7 +24,7 @@ from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.files.model_file import load_model
-from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.inputs import add_array_options, given_array
 from worldstate.cli.common.listening import read_streams
 from worldstate.cli.common.output import CommandResult
 from worldstate.ground.checks import in_range

@@ -32,10 +32,10 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.detector_options import detector_filter, detector_maker, detector_name
 from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar, track
+from worldstate.cli.common.sensors import detector_maker, detector_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -173,6 +173,7 @@ def _degradation(
     It listens with --model, else with the model that ships, and where that was not made for this sound with
     one that is trained on the training windows.
     """
+    from worldstate.adapters.camera.detections import DetectionFilter
     from worldstate_lab.degradation.degradation_study import DegradationSettings
     from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
     from worldstate_lab.evaluation.evaluation import whole_sweep
@@ -185,8 +186,8 @@ def _degradation(
     if arguments.smoke:
         return DegradationSettings(detectors[:1], model, width_px=SMOKE_WIDTH_PX, seed=seed)
     if arguments.onnx_model is not None:
-        onnx = argparse.Namespace(**vars(arguments), detector="onnx")
-        second = detector_name(onnx), detector_maker(onnx), detector_filter(onnx)
+        model_file, labels = str(arguments.onnx_model), tuple(arguments.labels)
+        second = detector_name(model_file), detector_maker(model_file, labels), DetectionFilter()
         detectors = detectors[0], StagedDetector(*second)
     settings = DegradationSettings(detectors, model, seed=seed)
     return whole_sweep(takes, settings) if arguments.full else settings

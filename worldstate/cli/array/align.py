@@ -13,18 +13,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options, add_search_options, search_of
-from worldstate.cli.common.camera_options import add_camera_options, boxes_of, given_detections
-from worldstate.cli.common.car_options import add_car_options, given_sensors
+from worldstate.cli.common.inputs import add_array_options, add_search_options, search_of
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.sensors import add_camera_options, add_car_option, given_sensors
 
 if TYPE_CHECKING:
     from worldstate.adapters.listen import Source
 
 EXAMPLE = """\
 examples:
-  worldstate array align drives/* --car car.json --camera-name front --out aligned.json
+  worldstate array align drives/* --car car.json --camera front --out aligned.json
   worldstate array align ovad_dataset --json"""
 
 
@@ -34,7 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs = "data sets, recording folders, or a sound file with --detections"
     add("input", type=Path, nargs="+", metavar="RECORDING", help=inputs)
     add_array_options(parser)
-    add_car_options(parser)
+    add_car_option(parser)
     add_search_options(parser)
     add_camera_options(parser)
     add("--out", type=Path, metavar="FILE", help="the file of --car, with both added, beside it")
@@ -54,7 +53,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if arguments.out is not None and arguments.car is None:
         raise InvalidArgumentError("--out: expected --car with it, whose camera is aligned")
     inputs = [found for path in arguments.input for found in find_inputs(path)]
-    if arguments.detections is not None and len(inputs) > 1:
+    if arguments.detections and len(inputs) > 1:
         raise InvalidArgumentError("--detections: expected one recording with it, folders bring their own")
     passes = [
         one
@@ -63,7 +62,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     ]
     found = align(passes)
     if arguments.out is not None:
-        write_aligned(arguments.car, arguments.out, arguments.camera_name, found.offset_s, found.yaw_deg)
+        name = None if arguments.camera is None else str(arguments.camera)
+        write_aligned(arguments.car, arguments.out, name, found.offset_s, found.yaw_deg)
     return CommandResult({"recordings": len(inputs)} | asdict(found))
 
 
@@ -73,11 +73,11 @@ def _source(arguments: argparse.Namespace, path: Path) -> "Source":
     from worldstate.adapters.listen import open_source
 
     # Only its sound, boxes and camera are used: no model has to fit the array.
-    array, camera = given_sensors(arguments)
+    given = given_sensors(arguments)
     return open_source(
         path,
-        array=array,
-        camera=camera,
-        detections=given_detections(arguments, camera),
-        settings=replace(search_of(arguments), boxes=boxes_of(arguments), uncalibrated=True, mask_dead=True),
+        array=given.car.array,
+        camera=given.camera,
+        detections=given.detections(arguments),
+        settings=replace(search_of(arguments), boxes=given.setup.boxes, uncalibrated=True, mask_dead=True),
     )

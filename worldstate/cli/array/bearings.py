@@ -11,16 +11,16 @@ criterion: reflections count, so it is no number of vehicles.
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.array_options import (
+from worldstate.cli.common.inputs import (
     add_array_options,
     add_search_options,
+    add_sound_options,
     search_of,
     sound_and_array,
     stance,
 )
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
-from worldstate.cli.common.sound_options import add_sound_options
 
 EXAMPLE = """\
 examples:

@@ -13,15 +13,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import (
+from worldstate.cli.common.inputs import (
     add_array_options,
     add_search_options,
+    add_sound_options,
     search_of,
     sound_and_array,
 )
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
-from worldstate.cli.common.sound_options import add_sound_options
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from worldstate.adapters.audio.sound_file import Audio
-from worldstate.cli.common.array_options import stance
+from worldstate.cli.common.inputs import stance
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import Fault
 from worldstate.frontend.health.sample_clock import RateEstimate

@@ -38,6 +38,9 @@ class Program:
     commands: Mapping[str, str]  # The words of a command to its module
     groups: Mapping[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()  # Left out of the overview
+    former_options: Mapping[str, str] = field(
+        default_factory=dict
+    )  # Options that are gone to their successors
 
     def called(self, words: Sequence[str]) -> str | None:
         """Return the words of the command that a call names, None where it names none."""
@@ -163,7 +166,11 @@ def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandP
         return _without_command(program, [*words, ""])
     parser = program.parser(called)
     prepare(parser)
-    arguments = parser.parse_args(words[len(called.split()) :])
+    given = words[len(called.split()) :]
+    for option in (word.partition("=")[0] for word in given):
+        if option in program.former_options and option not in parser._option_string_actions:
+            raise InvalidArgumentError(f"{option}: expected {program.former_options[option]} in its place")
+    arguments = parser.parse_args(given)
     check_extra(*arguments.needs)
     result: CommandResult = arguments.run(arguments)
     print_result(result, as_json=arguments.json)
@@ -196,6 +203,31 @@ def _orderly_termination() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Call `stop` at the first SIGINT or SIGTERM; the second one does what it did before."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = {number: signal.getsignal(number) for number in numbers}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def on_signal(number: int, frame: object) -> None:
+        restore()
+        stop()
+
+    for number in numbers:
+        signal.signal(number, on_signal)
+    try:
+        yield
+    finally:
+        restore()
 
 
 def _terminate(number: int, frame: object) -> None:

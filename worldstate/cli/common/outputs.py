@@ -2,12 +2,18 @@
 
 import argparse
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from worldstate.ground.errors import InputFileError
 
 
-def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[str, ...] = ()) -> None:
+def check_outputs(
+    arguments: argparse.Namespace,
+    *options: str,
+    figures: tuple[str, ...] = (),
+    exported: Mapping[str, Path] | None = None,
+) -> None:
     """Refuse output files that cannot be written, that replace an input, or that are one and the same.
 
     Examples
@@ -23,6 +29,7 @@ def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[s
 
     given = vars(arguments)
     outputs = {name: given[name] for name in (*options, *figures) if given[name] is not None}
+    outputs |= exported or {}
     lists = [
         value if isinstance(value, list) else [value] for name, value in given.items() if name not in outputs
     ]

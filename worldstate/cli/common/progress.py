@@ -1,47 +1,89 @@
-"""Progress on standard error for anything that takes more than two seconds."""
+"""Progress on standard error: a bar in a terminal, a line every 30 seconds elsewhere."""
 
-from collections.abc import Iterable, Iterator
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, TypeVar
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
 
 Item = TypeVar("Item")
+EVERY_S = 30.0
 
 
 class Bar:
     """Handle of one running progress bar."""
 
-    def __init__(self, progress: Progress, task: int) -> None:
-        self._progress = progress
-        self._task = task
+    def __init__(self, total: float | None) -> None:
+        self.total = total
+        self.done = 0.0
+        self.shown: Callable[[float], object] = lambda amount: None
 
     def advance(self, amount: float = 1.0) -> None:
         """Move the bar on by `amount` of its total."""
-        self._progress.advance(self._task, amount)  # type: ignore[arg-type]
+        self.done += amount
+        self.shown(amount)
 
 
 @contextmanager
 def progress_bar(description: str, total: float | None, *, quiet: bool = False) -> Iterator[Bar]:
-    """Show a bar on standard error while the block runs; nothing where `quiet` or not a terminal.
+    """Show on standard error how far the block is while it runs; nothing where `quiet`.
+
+    Without a terminal, or without the package rich, it is a line every 30 seconds.
 
     Examples
     --------
     >>> with progress_bar("working", 3, quiet=True) as bar:
     ...     bar.advance()
     """
+    bar = Bar(total)
+    if quiet:
+        yield bar
+        return
+    in_terminal = sys.stderr.isatty() and find_spec("rich") is not None
+    with _drawn(description, bar) if in_terminal else _told(description, bar):
+        yield bar
+
+
+@contextmanager
+def _drawn(description: str, bar: Bar) -> Iterator[None]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
-        yield Bar(progress, progress.add_task(description, total=total))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(description, total=bar.total)
+        bar.shown = lambda amount: progress.advance(task, amount)
+        yield
+
+
+@contextmanager
+def _told(description: str, bar: Bar) -> Iterator[None]:
+    # A thread, because minutes may pass between two advances.
+    ended, begun_s = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        while not ended.wait(EVERY_S):
+            share = f"{100.0 * bar.done / bar.total:.0f} %" if bar.total else f"{bar.done:g} done"
+            line = f"worldstate: {description}: {share} after {time.monotonic() - begun_s:.0f} s"
+            print(line, file=sys.stderr, flush=True)
+
+    teller = threading.Thread(target=tell, daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        teller.join()
 
 
 @contextmanager
 def sound_bar(audio: "Audio") -> Iterator[Bar]:
-    """Show a bar that counts the seconds of an open recording; of a pipe nobody knows how many there are."""
+    """Show a bar that counts the seconds of an open recording; how many a pipe has is not known."""
     known = audio.duration_s > 1.0
     with progress_bar(f"listening to {audio.path.name}", audio.duration_s if known else None) as bar:
         yield bar

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import (
+from worldstate.cli.common.inputs import (
     add_array_options,
     add_search_options,
     search_of,
@@ -32,14 +32,13 @@ examples:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="what `worldstate run --out` or --mcap wrote")
+    add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --out or --export mcap")
     add("--out", type=Path, metavar="PNG", help="draw the run over time")
     add("--recording", type=Path, action="append", dest="input", metavar="WAV", help="below --out its sound")
     add("--birds-eye", type=Path, metavar="PNG", help="draw the snapshot nearest to --time from above")
     add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the largest risk)")
     add("--animate", type=Path, metavar="GIF", help="draw every snapshot from above")
-    # Standard input is refused where raw samples are asked for: without a rate there are none.
-    parser.set_defaults(rate=None, channels=None)
+    parser.set_defaults(topic=[])
     add_array_options(parser)
     add_search_options(parser)
 

@@ -7,44 +7,48 @@ an MCAP file or a bag that `worldstate run` wrote holds the same bytes as the --
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.log_options import LOG_FILES, add_log_options, open_logs
+from worldstate.cli.common.exports import CROSSING_M, add_export_options, exported_files, open_exports
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 
 EXAMPLE = """\
 examples:
   worldstate log replay out.mcap --out states.jsonl
-  worldstate log replay states.jsonl --mcap out.mcap
-  worldstate log replay states.jsonl --live
-  worldstate log replay states.jsonl --osi out.osi --autoware objects.jsonl
-  worldstate log replay states.jsonl --odas 127.0.0.1:9000"""
+  worldstate log replay states.jsonl --export mcap=out.mcap
+  worldstate log replay states.jsonl --export foxglove
+  worldstate log replay states.jsonl --export osi=out.osi --export autoware=objects.jsonl
+  worldstate log replay states.jsonl --export odas=127.0.0.1:9000"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="what `worldstate run --mcap`, --ros-bag or --out wrote")
+    add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --export mcap, rosbag or --out")
     add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    add_log_options(parser)
+    add_export_options(parser)
+    crossing = "metres ahead of the lane in which other stacks find what is only heard (default: 9)"
+    add("--crossing", type=float, default=CROSSING_M, metavar="M", help=crossing)
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.state_log import read_log, states_writer
     from worldstate.cli.common.progress import progress_bar
+    from worldstate.ground.checks import in_range
     from worldstate.ground.values import seconds
     from worldstate.operations.recordings.warning import WarningMeter
 
-    check_outputs(arguments, "out", *LOG_FILES)
+    check_outputs(arguments, "out", exported=exported_files(arguments))
+    crossing_m = in_range("--crossing", arguments.crossing, 1.0, 100.0)
     meter, stamps_ns, peak_risk = WarningMeter(t0_s=None), [], 0.0
     with (
         states_writer(arguments.out) as write,
-        open_logs(arguments) as logs,
+        open_exports(arguments, crossing_m=crossing_m) as exports,
         progress_bar(f"reading {arguments.log.name}", None) as bar,
     ):
         for line, state in read_log(arguments.log):
             write(line)
-            logs.state(state)
+            exports.state(state)
             meter.update(state)
             stamps_ns.append(state.stamp_ns)
             peak_risk = max(peak_risk, state.risk)

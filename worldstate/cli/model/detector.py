@@ -16,10 +16,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.detector_options import add_detector_options, detector_maker, detector_name
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.sensors import add_detector_option, detector_maker, detector_name
 
 if TYPE_CHECKING:
     from worldstate.adapters.camera.miss_rates import MissRates
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 EXAMPLE = """\
 examples:
   worldstate model detector sim --detector motion --out beta.json --figure beta.png
-  worldstate model detector street.mp4 --reference boxes.json --detector onnx --onnx-model m.onnx \\
+  worldstate model detector street.mp4 --reference boxes.json --detector m.onnx \\
       --labels person bicycle car --out beta.json"""
 
 
@@ -37,7 +37,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
     add("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
-    add_detector_options(parser)
+    add_detector_option(parser)
+    add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of an ONNX model")
     add("--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)")
     add("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
     add("--seed", type=int, default=0, help="draws the staged noise (default: %(default)s)")
@@ -57,7 +58,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     )
 
     check_outputs(arguments, "out", figures=("figure",))
-    make = detector_maker(arguments)
+    make = detector_maker(arguments.detector, tuple(arguments.labels))
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
     with progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
         rates = measure_absence(
@@ -101,7 +102,7 @@ def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
     return {
         "data": arguments.input.name,
         "videos": str(videos),
-        "detector": detector_name(arguments),
+        "detector": detector_name(arguments.detector),
         "seed": str(arguments.seed),
         "worldstate": __version__,
     }

@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.inputs import add_array_options, given_array
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar

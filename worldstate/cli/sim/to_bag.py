@@ -7,8 +7,7 @@ has to look like for `worldstate run BAG`, and which topics; the definitions are
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.array_options import add_array_options, given_array
-from worldstate.cli.common.bag_options import add_storage_option
+from worldstate.cli.common.inputs import add_array_options, add_storage_option, given_array
 from worldstate.cli.common.output import CommandResult
 
 EXAMPLE = """\

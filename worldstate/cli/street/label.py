@@ -5,20 +5,19 @@ it: trajectories with covariance, the hidden phase included, and T0, the first l
 standard deviation. For a standing ego.
 
 --out is JSON in the layout of ASAM OpenLABEL. --windows is a list of labelled seconds, which
-`extract-features --labels` and `train --labels` read: recordings of one's own become training data without
-anybody marking them. It lies in the recording's folder or above it.
+`model features --labels` and `model fit --labels` read: recordings of one's own become training data without
+marking by hand. It lies in the recording's folder or above it.
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options
-from worldstate.cli.common.camera_options import add_camera_options, camera_source
+from worldstate.cli.common.inputs import add_array_options, add_sound_options, sound_of
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
-from worldstate.cli.common.sound_options import add_sound_options, sound_of
+from worldstate.cli.common.sensors import add_camera_options, add_car_option, camera_source
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,10 +37,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_sound_options(parser)
     add_array_options(parser)
+    add_car_option(parser)
     add_camera_options(parser)
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, required=True, metavar="JSON", help="trajectories and T0, OpenLABEL")
-    add("--windows", type=Path, metavar="CSV", help="labelled seconds for train --labels")
+    add("--windows", type=Path, metavar="CSV", help="labelled seconds for `model fit --labels`")
     add("--figure", type=Path, metavar="PNG", help="draw the passes as seen from above")
     site = "name of the place, S.. (default: S and the name of the recording's folder)"
     add("--environment", metavar="NAME", help=site)

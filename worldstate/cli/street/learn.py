@@ -17,11 +17,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options
-from worldstate.cli.common.camera_options import add_camera_options, camera_source
+from worldstate.cli.common.inputs import add_array_options
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
+from worldstate.cli.common.sensors import add_camera_options, add_car_option, camera_source
 
 if TYPE_CHECKING:
     from worldstate.operations.labelling.street_passes import WatchedRecording
@@ -40,6 +40,7 @@ STAGES = (1, 3, 10)
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_array_options(parser)
+    add_car_option(parser)
     add_camera_options(parser)
     add = parser.add_argument
     add("input", type=Path, nargs="+", metavar="INPUT", help="recordings of one place, in order")
@@ -89,7 +90,7 @@ def _check(arguments: argparse.Namespace) -> None:
     from worldstate.ground.errors import InvalidArgumentError
 
     in_range("--days", arguments.days, 0.0, 1e5)
-    if arguments.detections is not None and len(arguments.input) > 1:
+    if arguments.detections and len(arguments.input) > 1:
         raise InvalidArgumentError("--detections: expected one INPUT with it, they are of one recording")
     # What is known may be written over: it is read before, and its passes are kept.
     apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})

@@ -5,12 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from worldstate.adapters.camera.detection_formats import read_any_detections
-from worldstate.adapters.camera.detections import DetectionLog
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
+from worldstate.adapters.camera.miss_rates import load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.several_cameras import SeveralCameras
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.listen import Source
-from worldstate.adapters.vehicle.car_file import CarSensors
+from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
 from worldstate.ground.errors import InvalidArgumentError
 
 
@@ -20,9 +21,9 @@ def with_cameras(source: Source, car: CarSensors, detections: Mapping[str, Path 
     Parameters
     ----------
     source : Source
-        From `open_source`; its miss rates and boxes that count are those of every camera.
+        From `open_source`; its miss rates and boxes are those of every camera that names none of its own.
     car : CarSensors
-        Where the cameras are, and how their clocks differ.
+        Where the cameras are, how their clocks differ, and which of their boxes count.
     detections : mapping of str to path or DetectionLog
         What was detected in the images of each, by its name in the car's file, on its own clock.
 
@@ -38,12 +39,19 @@ def with_cameras(source: Source, car: CarSensors, detections: Mapping[str, Path 
         camera = car.camera(name)
         if camera is None:
             raise InvalidArgumentError(f"camera: expected a car with cameras, it has none of the name {name}")
-        channels[name] = _channel(source, camera, reported)
+        channels[name] = _channel(source, camera, car.setups[name], reported)
     return replace(source, co_evidence=SeveralCameras(channels))
 
 
-def _channel(source: Source, camera: PinholeCamera, reported: Path | DetectionLog) -> VisionQuery:
+def _channel(
+    source: Source, camera: PinholeCamera, setup: CameraSetup, reported: Path | DetectionLog
+) -> VisionQuery:
     if isinstance(reported, Path):
-        reported = read_any_detections(reported, size_px=(camera.width_px, camera.height_px))
+        size_px = (camera.width_px, camera.height_px)
+        reported = read_any_detections(reported, setup.image_rate_hz or 10.0, size_px)
+    rates = source.miss_rates if setup.miss_rates is None else load_miss_rates(setup.miss_rates)
+    told = setup.boxes != DetectionFilter()
+    settings = replace(source.settings, boxes=setup.boxes) if told else source.settings
     log = reported.shifted(camera.stamp_offset_s)
-    return replace(source, camera=camera, detections=log).camera_channel()
+    asked = replace(source, camera=camera, detections=log, miss_rates=rates, settings=settings)
+    return asked.camera_channel()

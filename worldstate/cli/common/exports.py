@@ -1,0 +1,177 @@
+"""--export: viewers, logs and other stacks that a command sends world-states to, hop by hop."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from worldstate.adapters.export.log_message import LogMessage, LogSink
+    from worldstate.adapters.listen import Source, Step
+    from worldstate.state import WorldState
+
+    Stack = AbstractContextManager[Callable[[WorldState], object]]
+
+FOXGLOVE_PORT = 8765
+CROSSING_M = 9.0
+HELP = """\
+--export NAME=TARGET sends states on, and may be repeated:
+  mcap=FILE            snapshots and scene for Foxglove
+  foxglove[=PORT]      the same on a websocket, in real time (8765)
+  rerun=FILE           the same for the Rerun viewer
+  osi=FILE             a trace of ASAM OSI SensorData
+  autoware=FILE        Autoware's PredictedObjects, one a line
+  odas=HOST:PORT       tracks as ODAS sends them; ODAS Studio listens at port 9000
+  rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3 in that storage
+  NAME=TARGET          what an exporter does that an installed package brings"""
+# Exporters of the library, with the optional module that each needs.
+EXPORTERS = {
+    "mcap": "mcap", "foxglove": "foxglove", "rerun": "rerun", "osi": "osi3", "autoware": None, "odas": None,
+    "rosbag": "rosbags", "rosbag-sqlite3": "rosbags",
+}  # fmt: skip
+_FILES = "mcap", "rerun", "osi", "autoware"
+
+
+def add_export_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --export."""
+    parser.description = f"{parser.description}\n\n{HELP}"
+    told = "send states to a viewer, a log or another stack; repeated"
+    parser.add_argument("--export", action="append", default=[], metavar="NAME=TARGET", help=told)
+
+
+def exported_files(arguments: argparse.Namespace) -> dict[str, Path]:
+    """Return the files that --export writes, by option."""
+    return {f"export {name}": Path(target) for name, target in _asked(arguments) if name in _FILES}
+
+
+def needed_extras(arguments: argparse.Namespace) -> list[str]:
+    """Return the optional modules that --export needs."""
+    found = (EXPORTERS.get(name) for name, _ in _asked(arguments))
+    return [module for module in found if module is not None]
+
+
+def _asked(arguments: argparse.Namespace) -> list[tuple[str, str]]:
+    if not arguments.export:
+        return []
+    from worldstate.adapters.own_parts import part_and_target
+
+    usual = [f"foxglove={FOXGLOVE_PORT}" if text == "foxglove" else text for text in arguments.export]
+    return [part_and_target("--export", text) for text in usual]
+
+
+@dataclass(frozen=True, slots=True)
+class Exports:
+    """Everything that states are passed on to."""
+
+    viewers: "list[LogSink]" = field(default_factory=list)  # These take messages
+    stacks: "list[Callable[[WorldState], object]]" = field(default_factory=list)  # These take states
+
+    def message(self, message: "LogMessage") -> None:
+        """Pass a message on to every viewer."""
+        for viewer in self.viewers:
+            viewer(message)
+
+    def state(self, state: "WorldState") -> None:
+        """Pass a state on."""
+        from worldstate.adapters.export.log_message import state_messages
+
+        for message in state_messages(state) if self.viewers else ():
+            self.message(message)
+        for stack in self.stacks:
+            stack(state)
+
+
+@contextmanager
+def open_exports(
+    arguments: argparse.Namespace, *, crossing_m: float = CROSSING_M, paced: bool = True
+) -> Iterator[Exports]:
+    """Open everything that was asked for; `paced` plays what comes too soon at the speed of its stamps."""
+    with ExitStack() as opened:
+        exports = Exports()
+        for name, target in _asked(arguments):
+            viewer = _viewer(name, target, paced=paced)
+            if viewer is not None:
+                exports.viewers.append(opened.enter_context(viewer))
+            else:
+                exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m)))
+        yield exports
+
+
+def _viewer(name: str, target: str, *, paced: bool) -> "AbstractContextManager[LogSink] | None":
+    if name == "mcap":
+        from worldstate.adapters.export.mcap_file import mcap_file
+
+        return mcap_file(Path(target))
+    if name == "rerun":
+        from worldstate.adapters.export.rerun_file import rerun_file
+
+        return rerun_file(Path(target))
+    return _websocket(target, paced=paced) if name == "foxglove" else None
+
+
+@contextmanager
+def _websocket(port: str, *, paced: bool) -> "Iterator[LogSink]":
+    from worldstate.adapters.export.live_server import live_server
+    from worldstate.ground.errors import InvalidArgumentError
+
+    if not port.isdecimal():
+        raise InvalidArgumentError(f"--export foxglove: expected a port, got {port}")
+    with live_server(int(port), paced=paced) as (send, found):
+        print(f"Foxglove: open connection ws://127.0.0.1:{found}", file=sys.stderr)
+        yield send
+
+
+def _stack(name: str, target: str, crossing_m: float) -> "Stack":
+    if name == "osi":
+        from worldstate.adapters.export.osi import osi_trace
+
+        return osi_trace(Path(target), crossing_m)
+    if name == "autoware":
+        return _autoware_lines(Path(target), crossing_m)
+    if name in ("rosbag", "rosbag-sqlite3"):
+        from worldstate.adapters.ros.state_bag import state_bag
+
+        return state_bag(Path(target), crossing_m, "mcap" if name == "rosbag" else "sqlite3")
+    if name == "odas":
+        from worldstate.adapters.export.odas import odas_socket
+
+        return odas_socket(target)
+    from worldstate.adapters.own_parts import ExporterPart, load_part
+
+    export: ExporterPart = load_part("worldstate.exporters", name, "--export", EXPORTERS)
+    return export(target)
+
+
+@contextmanager
+def _autoware_lines(path: Path, crossing_m: float) -> "Iterator[Callable[[WorldState], object]]":
+    from worldstate.adapters.export.autoware import autoware_objects
+    from worldstate.adapters.state_log import states_writer
+
+    with states_writer(path) as write:
+        yield lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+
+
+@contextmanager
+def exported_hops(
+    arguments: argparse.Namespace, source: "Source", crossing_m: float, *, paced: bool = True
+) -> "Iterator[Callable[[Step], None]]":
+    """Lend a function that exports a hop of a recording: state, power over azimuth, the camera's image."""
+    with open_exports(arguments, crossing_m=crossing_m, paced=paced) as exports:
+        if not exports.viewers:
+            yield lambda step: exports.state(step.state)
+            return
+        from worldstate.adapters.export.log_message import camera_images, srp_message
+
+        image_before = camera_images(source.audio_path.parent, source.start_ns)
+
+        def export_hop(step: "Step") -> None:
+            for message in image_before(step.state.stamp_ns):
+                exports.message(message)
+            exports.state(step.state)
+            exports.message(srp_message(step.state, step.frame.azimuths_rad, step.frame.srp))
+
+        yield export_hop

@@ -1,0 +1,171 @@
+"""What a command listens to, and by which microphones: INPUT, --array, where a bearing is looked for."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from .command import add_choice
+
+if TYPE_CHECKING:
+    from worldstate.adapters.audio.open_sound import Encoding, SoundInput
+    from worldstate.adapters.listen import ListenSettings
+    from worldstate.adapters.ros.bag_input import BagTopics
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+
+SOUND_HELP = """\
+INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
+(out_multi.wav and, where there is one, camera_baseline_results.json), several files of one channel each in
+the order of the microphones, a bag of ROS 2 (its folder, .mcap or .db3), or raw samples on standard input:
+pcm:RATE:CHANNELS:FORMAT, with s16, s24, s32 (little-endian whole numbers) or f32 (floats) as FORMAT."""
+SOUND_EXAMPLE = """\
+  arecord -D hw:1 -t raw -f S32_LE -r 48000 -c 8 | {} pcm:48000:8:s32"""
+ARRAY_HELP = """\
+--array FILE holds one microphone a channel, in the order of the channels, in metres:
+  XML   Acoular's and OVAD's <pos x= y= z= />: the array plane seen from behind, x right, y up, z forward
+  CSV   x,y,z a line, with or without header and names: base_link, x forward, y left, z up
+  JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too"""
+_RAW = "pcm:"
+_TOPICS = "audio", "detections", "odometry"
+# Below this a coordinate does not spread, metres.
+_FLAT_M = 0.005
+
+
+def add_sound_options(parser: argparse.ArgumentParser) -> None:
+    """Declare INPUT and --topic."""
+    parser.description = f"{parser.description}\n\n{SOUND_HELP}"
+    parser.epilog = f"{parser.epilog}\n{SOUND_EXAMPLE.format(parser.prog)}"
+    what = "sound file, recording folder, a file a microphone, bag, or pcm:RATE:CHANNELS:FORMAT"
+    parser.add_argument("input", type=Path, nargs="+", metavar="INPUT", help=what)
+    topic = "audio=, detections= or odometry=TOPIC of a bag (default: the only one of its type); repeated"
+    parser.add_argument("--topic", action="append", default=[], metavar="NAME=TOPIC", help=topic)
+
+
+def add_array_options(
+    parser: argparse.ArgumentParser, default: str = "the data set's, OVAD's where it names none"
+) -> None:
+    """Declare --array and --array-axes, and say in the help what the files look like."""
+    parser.description = f"{parser.description}\n\n{ARRAY_HELP}"
+    add = parser.add_argument
+    add("--array", type=Path, metavar="FILE", help=f"microphone positions (default: {default})")
+    axes = "x right, y up, z forward, or x forward, y left, z up (default: by the form of the file)"
+    add("--array-axes", choices=("acoular", "base_link"), help=axes)
+
+
+def add_search_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --band and --azimuth-span: where a bearing is looked for."""
+    add = parser.add_argument
+    band = "band of the bearing, Hz (default: by the spacing of the microphones; 300 to 1800 for the roof)"
+    add("--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help=band)
+    span = "sector ahead that is searched, 360 for all round (default: %(default)g)"
+    add("--azimuth-span", type=float, default=180.0, metavar="DEG", help=span)
+
+
+def add_storage_option(parser: argparse.ArgumentParser) -> None:
+    """Declare --ros-storage."""
+    add_choice(parser, "--ros-storage", "storage of the bag that is written", "mcap", "sqlite3")
+
+
+def topics_of(arguments: argparse.Namespace) -> "BagTopics":
+    """Return the topics that were asked for."""
+    from worldstate.adapters.own_parts import part_and_target
+    from worldstate.adapters.ros.bag_input import BagTopics
+    from worldstate.ground.errors import InvalidArgumentError
+
+    named = dict(part_and_target("--topic", text) for text in arguments.topic)
+    if not named.keys() <= {*_TOPICS}:
+        raise InvalidArgumentError(f"--topic: expected {', '.join(_TOPICS)}, got {', '.join(named)}")
+    return BagTopics(**named)
+
+
+def sound_of(arguments: argparse.Namespace) -> "SoundInput":
+    """Return what INPUT names."""
+    from worldstate.adapters.audio.open_sound import as_sound
+    from worldstate.adapters.ros.bag_input import read_sound
+
+    bag = bag_of(arguments)
+    if bag is not None:
+        return read_sound(bag, topics_of(arguments).audio)[0]
+    names = [str(path) for path in arguments.input]
+    raw = next((name for name in names if name == "-" or name.startswith(_RAW)), None)
+    return as_sound(tuple(arguments.input)) if raw is None else _raw_samples(raw, alone=len(names) == 1)
+
+
+def _raw_samples(name: str, *, alone: bool) -> "SoundInput":
+    import sys
+
+    from worldstate.adapters.audio.open_sound import RawPcm
+    from worldstate.ground.errors import InvalidArgumentError
+
+    told = name.removeprefix(_RAW).split(":")
+    if not (alone and len(told) in (2, 3) and told[0].isdecimal() and told[1].isdecimal()):
+        problem = f"expected standard input alone, as {_RAW}RATE:CHANNELS:FORMAT"
+        raise InvalidArgumentError(f"{name}: {problem}")
+    rate, channels, kind = [*told, "s16"][:3]
+    return RawPcm(sys.stdin.buffer, int(rate), int(channels), cast("Encoding", kind))
+
+
+def bag_of(arguments: argparse.Namespace) -> Path | None:
+    """Return the bag that INPUT names, None where it is none."""
+    from worldstate.adapters.ros.bag_reader import is_bag
+
+    alone = arguments.input[0] if len(arguments.input) == 1 else None
+    return alone if alone is not None and is_bag(alone) else None
+
+
+def given_array(arguments: argparse.Namespace) -> "MicrophoneArray | None":
+    """Return the array that --array names, None without it: a recording may then bring its own."""
+    from worldstate.adapters.files.array_file import read_array
+
+    return None if arguments.array is None else read_array(arguments.array, arguments.array_axes)
+
+
+def search_of(arguments: argparse.Namespace) -> "ListenSettings":
+    """Return where a bearing is looked for, all else by default."""
+    from worldstate.adapters.listen import ListenSettings
+
+    band = arguments.band
+    return ListenSettings(
+        band_hz=None if band is None else (band[0], band[1]), azimuth_span_deg=arguments.azimuth_span
+    )
+
+
+def sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, MicrophoneArray]":
+    """Return what INPUT and --array name, or the array that belongs to the sound."""
+    from worldstate.adapters.audio.open_sound import path_of
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.datasets.ovad import Recording
+    from worldstate.adapters.ros.bag_input import needed_array, read_sound
+
+    bag = bag_of(arguments)
+    if bag is not None:
+        heard, own = read_sound(bag, topics_of(arguments).audio)
+        return heard, needed_array(bag, given_array(arguments) or own)
+    sound = sound_of(arguments)
+    array = choose_array(path_of(sound), given_array(arguments))
+    if isinstance(sound, Path) and sound.is_dir():
+        sound = Recording.open(sound).audio_path
+    return sound, array
+
+
+def stance(array: "MicrophoneArray") -> str:
+    """Say in one line how an array stands on the vehicle: microphones, extent, what it tells apart.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
+    >>> stance(MicrophoneArray([[0, 0.2, 1.4], [0, -0.2, 1.4]]))
+    '2 microphones, 0.00 m along x (forward), 0.40 m along y (left), 0.00 m along z (up); hears front as back'
+    """
+    x, y, z = array.aperture_m.tolist()
+    extent = f"{x:.2f} m along x (forward), {y:.2f} m along y (left), {z:.2f} m along z (up)"
+    return f"{array.n_microphones} microphones, {extent}; {_apart(x, y, array.ambiguity)}"
+
+
+def _apart(x: float, y: float, ambiguity: str) -> str:
+    if ambiguity in ("none", "up-down"):
+        return "tells all azimuths apart"
+    if x < _FLAT_M:
+        return "hears front as back"
+    if y < _FLAT_M:
+        return "hears left as right: no extent across the vehicle; if that is wrong, see --array-axes"
+    return "hears a direction as its mirror image in the array"

@@ -1,0 +1,212 @@
+"""The sensors of a vehicle: --car, or --array with a camera, its detector and the boxes that count."""
+
+import argparse
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .inputs import given_array
+
+if TYPE_CHECKING:
+    from worldstate.adapters.audio.open_sound import SoundInput
+    from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
+    from worldstate.adapters.camera.onnx_detector import OnnxDetector
+    from worldstate.adapters.camera.pinhole import PinholeCamera
+    from worldstate.adapters.listen import Source
+    from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
+    from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
+
+CAR_HELP = """\
+--car FILE alone says what a vehicle has, JSON in base_link (x forward, y left, z up), files beside it:
+  {"array": {"file": "mics.csv", "position_m": [1.2, 0, 1.6], "pitch_deg": -5},
+   "cameras": [{"name": "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90,
+                "position_m": [1.9, 0, 1.3], "stamp_offset_s": 0.04, "detections": "front.json"}],
+   "model": "mine.json", "odometry": "odometry.csv", "measurements": {"radar": "radar.csv"},
+   "engine": {"rpm": "rpm.csv", "firings_per_turn": 2}, "crossing_m": 9}
+Every key is optional. An option in its place counts before it; --camera NAME names one of its cameras."""
+DETECTIONS_HELP = """\
+--detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the
+number of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the first
+sample of the sound, ten a second; classes have COCO's numbers (car is 3) and YOLO's (car is 2). Up to the
+last image with a box, one that lists nothing was searched in vain; later ones were not asked."""
+LENS_HELP = """\
+--camera takes JSON:
+{"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place of
+the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "roll_deg" (left side up), "position_m":
+[x, y, z] in base_link, "stamp_offset_s" (added to the stamps of its images: the clock of the sound); of its
+images "image_rate_hz" (10); of its boxes "classes" (["car", "motorcycle"]), "min_score" (0.75) and
+"min_box_px" (100: boxes must be higher); "miss_rates", a file that `worldstate model detector` wrote;
+"labels" (["car"]), the classes of an ONNX model. "cameras" of --car have the same keys."""
+# Background subtraction: its score is no confidence.
+MOVING = "motion", "knn"
+
+
+def add_car_option(parser: argparse.ArgumentParser) -> None:
+    """Declare --car."""
+    parser.description = f"{parser.description}\n\n{CAR_HELP}"
+    add = parser.add_argument_group("vehicle").add_argument
+    add("--car", type=Path, metavar="FILE", help="array, cameras and what they reported, odometry, model")
+
+
+def add_camera_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --detections, --camera and --miss-rates."""
+    parser.description = f"{parser.description}\n\n{DETECTIONS_HELP}"
+    group = parser.add_argument_group("camera")
+    told = "what its detector reported; NAME=PATH of a camera of --car, repeated: all these are asked"
+    group.add_argument("--detections", type=Path, action="append", default=[], metavar="PATH", help=told)
+    add_lens_options(parser, group)
+
+
+def add_lens_options(parser: argparse.ArgumentParser, group: "argparse._ArgumentGroup") -> None:
+    """Declare --camera and --miss-rates."""
+    parser.description = f"{parser.description}\n\n{LENS_HELP}"
+    lens = "its lens (default: OVAD's camera), or the name of one of --car (default: the first)"
+    group.add_argument("--camera", type=Path, metavar="JSON", help=lens)
+    told = "how often it misses, as `model detector` wrote it"
+    group.add_argument("--miss-rates", type=Path, metavar="JSON", help=told)
+
+
+def add_detector_option(parser: argparse.ArgumentParser, default: str | None = "motion") -> None:
+    """Declare --detector."""
+    kinds = (
+        "motion, knn: background subtraction by mixtures or neighbours; FILE.onnx: a model in YOLO's output"
+    )
+    told = f"{kinds} form; or the name of one that an installed package brings (default: {default or 'none'})"
+    parser.add_argument("--detector", metavar="NAME", default=default, help=told)
+
+
+@dataclass(frozen=True, slots=True)
+class GivenSensors:
+    """What --car names, or the single options in its place; None for what is not given."""
+
+    car: "CarSensors"
+    camera: "PinholeCamera | None"  # The one that is asked
+    setup: "CameraSetup"  # Of that camera
+
+    def several(self, arguments: argparse.Namespace) -> dict[str, Path]:
+        """Return what several cameras of --car reported, by their names; empty where one is asked."""
+        from worldstate.adapters.own_parts import part_and_target
+        from worldstate.ground.errors import InvalidArgumentError
+
+        given = list(map(str, arguments.detections))
+        if arguments.car is None or not any("=" in text for text in given):
+            known = {name: one.detections for name, one in self.car.setups.items()}
+            files = {name: path for name, path in known.items() if path is not None}
+            return files if len(files) > 1 and not given and arguments.camera is None else {}
+        pairs = [part_and_target("--detections", text) for text in given]
+        if len(dict(pairs)) < len(pairs) or arguments.camera is not None:
+            problem = "expected NAME=PATH of different cameras, without --camera"
+            raise InvalidArgumentError(f"--detections: {problem}, got {' '.join(given)}")
+        return {name: Path(path) for name, path in pairs}
+
+    def detections(self, arguments: argparse.Namespace) -> "Path | DetectionLog | None":
+        """Return what the one camera that is asked reported, read where its images do not come at 10 Hz."""
+        from worldstate.adapters.camera.detection_formats import read_any_detections
+        from worldstate.adapters.camera.pinhole import PinholeCamera
+        from worldstate.ground.errors import InvalidArgumentError
+
+        if len(arguments.detections) > 1:
+            raise InvalidArgumentError("--detections: expected one, or --car with NAME=PATH of its cameras")
+        path = arguments.detections[0] if arguments.detections else self.setup.detections
+        if path is None or self.setup.image_rate_hz is None:
+            return path
+        lens = self.camera or PinholeCamera()
+        return read_any_detections(path, self.setup.image_rate_hz, (lens.width_px, lens.height_px))
+
+
+def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
+    """Return the sensors that --car, or --array and --camera, name."""
+    from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors, read_camera_setup, read_car
+    from worldstate.ground.errors import InvalidArgumentError
+
+    if arguments.car is None:
+        setup, camera = CameraSetup(), None
+        if arguments.camera is not None:
+            camera, setup = read_camera_setup(arguments.camera)
+        return GivenSensors(CarSensors(given_array(arguments)), camera, setup)
+    if arguments.array is not None:
+        raise InvalidArgumentError("--car: expected no --array with it, it holds the array")
+    car = read_car(arguments.car)
+    name = next(iter(car.cameras), None) if arguments.camera is None else str(arguments.camera)
+    setup = CameraSetup() if name is None else car.setups.get(name, CameraSetup())
+    return GivenSensors(car, None if name is None else car.camera(name), setup)
+
+
+def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[Source, DetectionLog]":
+    """Return a recording of which boxes and camera are used, and no model has to fit the array; the boxes.
+
+    Raises
+    ------
+    InputFileError
+        If there are no boxes of a camera.
+    """
+    from worldstate.adapters.listen import ListenSettings, open_source
+    from worldstate.ground.errors import InputFileError
+
+    given = given_sensors(arguments)
+    source = open_source(
+        sound,
+        array=given.car.array,
+        detections=given.detections(arguments),
+        camera=given.camera,
+        settings=ListenSettings(boxes=given.setup.boxes, uncalibrated=True),
+    )
+    if source.detections is None:
+        problem = "expected boxes of a camera beside it, or --detections with what a detector reported"
+        raise InputFileError(source.audio_path, problem)
+    return source, source.detections
+
+
+def box_counts(source: "Source", *, as_json: bool) -> object:
+    """Say how many boxes count and why the others do not; None without a camera."""
+    from dataclasses import asdict
+
+    from worldstate.adapters.camera.box_linking import count_boxes
+
+    if source.detections is None:
+        return None
+    counts = count_boxes(source.detections, source.settings.boxes)
+    return asdict(counts) if as_json else str(counts)
+
+
+def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetector":
+    """Return what makes a detector, in any process; a model, with the labels of its classes, is opened once.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If no package brings a detector of that name.
+    """
+    from worldstate.adapters.camera.motion_detector import MotionDetector
+    from worldstate.adapters.own_parts import DetectorPart, load_part
+
+    if name.endswith(".onnx"):
+        make = partial(_opened, Path(name), labels)
+        make()  # what is wrong with a model is said before the work begins
+        return make
+    if name not in MOVING:
+        known = (*MOVING, "FILE.onnx")
+        make_own: DetectorPart = load_part("worldstate.detectors", name, "--detector", known)
+        return make_own
+    return partial(MotionDetector, "knn" if name == "knn" else "mog2")
+
+
+@cache
+def _opened(path: Path, labels: tuple[str, ...]) -> "OnnxDetector":
+    """Open a model once a process."""
+    from worldstate.adapters.camera.onnx_detector import open_onnx
+
+    return open_onnx(path, labels)
+
+
+def detector_name(name: str) -> str:
+    """Return the name of a detector in reports: of a model that of its file, too."""
+    return f"onnx {Path(name).name}" if name.endswith(".onnx") else name
+
+
+def boxes_of(arguments: argparse.Namespace, setup: "CameraSetup") -> "DetectionFilter":
+    """Return which boxes count: all of a motion detector's, whose score is no confidence."""
+    from worldstate.adapters.camera.camera_channel import any_motion
+
+    return any_motion() if arguments.detector in MOVING else setup.boxes
