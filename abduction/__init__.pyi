@@ -24,7 +24,6 @@ from .posterior import Posterior as Posterior
 from .posterior import abduce as abduce
 from .posterior import log_lambda as log_lambda
 from .posterior import statistic as statistic
-from .signature.classifier_signature import ClassifierSignature as ClassifierSignature
 from .signature.domain_guard import DomainGuard as DomainGuard
 from .signature.domain_guard import Familiar as Familiar
 from .signature.domain_guard import Foreign as Foreign
@@ -35,3 +34,4 @@ from .signature.published_signature import SignatureModel as SignatureModel
 from .signature.site_estimate import SiteEstimate as SiteEstimate
 from .signature.site_estimate import SiteEstimateSettings as SiteEstimateSettings
 from .signature.site_estimate import SiteSignature as SiteSignature
+from .signature.window_classes import ClassifierSignature as ClassifierSignature

@@ -54,7 +54,7 @@ class AcousticFrame:
         Azimuth with the same delays as the bearing (front-back ambiguity), radians.
     music : MusicReading or NotUsable
         MUSIC on the decision window; not usable when it is off.
-    band_log_energy : ndarray of float64, shape (level_bands,)
+    band_log_energy : ndarray of float64, shape (16,)
         Natural logarithm of the mean square of the last hop per band.
     looming : Looming or NotUsable
         Approach rate at the end of the window.

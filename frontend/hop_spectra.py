@@ -11,8 +11,7 @@ from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.direction.feature import feature_steering, pair_sum, pair_sum_of
 from worldstate.frontend.direction.music import MusicStage
 from worldstate.frontend.direction.srp import steered_power
-from worldstate.frontend.ego_noise.ego_noise import EgoNoise, spanned
-from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, spanned
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
@@ -210,7 +209,7 @@ class HopSpectra:
             beams.append((self._feature_beams, self._feature))
         part = spanned(part for _, part in beams)
         learned = bins[part]
-        engine = HarmonicCanceller(learned, sample_rate_hz, nfft, harmonics=chosen.harmonics)
+        engine = HarmonicCanceller(learned, sample_rate_hz, nfft)
         frequencies, speed = bin_frequencies_hz(learned, sample_rate_hz, nfft), settings.speed_of_sound_m_s
         split = ElevationSplit.of(array, frequencies, speed) if chosen.only_below_horizon else None
         frames_per_s = 2.0 * sample_rate_hz / nfft

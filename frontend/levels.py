@@ -63,6 +63,9 @@ def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> Flo
 
 # Highest frequency that the anti-aliasing filters of usual converters pass, relative to the sample rate.
 _HIGHEST = 0.45
+_BANDS = 16
+# Microphones, evenly picked, that are averaged.
+_MOST_CHANNELS = 8
 
 
 class LevelMeter:
@@ -72,11 +75,11 @@ class LevelMeter:
         low, high = settings.level_band_hz
         bins = band_bins((low, min(high, _HIGHEST * sample_rate_hz)), sample_rate_hz, settings.nfft)
         self._bins = range(max(bins.start, 1), bins.stop)
-        self._edges = band_edges(self._bins, settings.level_bands)
+        self._edges = band_edges(self._bins, _BANDS)
         # A bin reaches half its width to either side of its frequency.
         self.edges_hz: FloatArray = (self._edges - 0.5) * sample_rate_hz / settings.nfft
         self._nfft = settings.nfft
-        step = -(-n_channels // settings.level_channels)
+        step = -(-n_channels // _MOST_CHANNELS)
         self._channels = slice(None, None, step)
         self._stft = StreamingStft(-(-n_channels // step), settings.nfft, self._bins)
 

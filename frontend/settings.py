@@ -58,14 +58,8 @@ class FrontEndSettings:
         Band in which an engine line is searched, Hz, for example (20, 400); None switches it off.
     tone_hops : int
         Hops in the window of the tone fit.
-    tone_channels : int
-        Number of microphones averaged for the tone, those nearest to the centre of the array.
     srp_band_hz, feature_band_hz, looming_band_hz, level_band_hz : (float, float)
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
-    level_bands : int
-        Number of bands of `band_log_energy`.
-    level_channels : int
-        Largest number of microphones, evenly picked, over which band levels are averaged.
     looming_hops : int
         Hops in the window of the looming fit, >= 4.
     bearing_std_rad : float
@@ -107,13 +101,10 @@ class FrontEndSettings:
     music_sources: int = 0
     tone_band_hz: Band | None = None
     tone_hops: int = 10
-    tone_channels: int = 4
     srp_band_hz: Band = BAND_HZ
     feature_band_hz: Band = FEATURE_BAND_HZ
     looming_band_hz: Band = (300.0, 1800.0)
     level_band_hz: Band = (50.0, 8000.0)
-    level_bands: int = 16
-    level_channels: int = 8
     looming_hops: int = 10
     bearing_std_rad: float = float(np.radians(3.4))
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
@@ -128,14 +119,11 @@ class FrontEndSettings:
         in_range("bearing_hops", self.bearing_hops, 1, self.window_hops)
         in_range("looming_hops", self.looming_hops, 4, 1000)
         in_range("hop_rate_hz", self.hop_rate_hz, 0.1, 1000.0)
-        in_range("level_bands", self.level_bands, 1, self.nfft // 2)
-        in_range("level_channels", self.level_channels, 1, np.inf)
         in_range("bearing_std_rad", self.bearing_std_rad, 0.0, np.pi, open_low=True)
         in_range("speed_of_sound_m_s", self.speed_of_sound_m_s, 100.0, 10_000.0)
         in_range("max_peaks", self.max_peaks, 1, 1000)
         in_range("music_sources", self.music_sources, 0, 1000)
         in_range("tone_hops", self.tone_hops, 1, 1000)
-        in_range("tone_channels", self.tone_channels, 1, 1000)
         self._check_grid()
         for name in ("srp_band_hz", "feature_band_hz", "looming_band_hz", "level_band_hz", "tone_band_hz"):
             low, high = getattr(self, name) or ENGINE_BAND_HZ

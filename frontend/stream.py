@@ -169,7 +169,7 @@ class FrontEnd:
         Parameters
         ----------
         none_probability : float
-            In [0, 1]. Below `EgoNoiseSettings.min_weight` nothing is learned.
+            In [0, 1]. Below one half nothing is learned.
 
         Raises
         ------
@@ -331,7 +331,7 @@ class FrontEnd:
         if chosen.tone_band_hz is None:
             return None
         window_s = chosen.tone_hops / chosen.hop_rate_hz
-        return ToneStage(self.array, self.sample_rate_hz, chosen.tone_band_hz, window_s, chosen.tone_channels)
+        return ToneStage(self.array, self.sample_rate_hz, chosen.tone_band_hz, window_s)
 
     def _age_s(self, n_hops: int, end: int) -> float:
         hops = self._last(n_hops)

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from worldstate.abduction.sequence.boosted_trees import BoostedTrees
 from worldstate.abduction.sequence.sequence_inputs import INPUTS, HopEvidence
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequenceModel
+from worldstate.abduction.sequence.sequence_model import GROUPS, BoostedTrees, SequenceAlarm, SequenceModel
 
 
 def evidence_of(rng: np.random.Generator, hops: int) -> HopEvidence:

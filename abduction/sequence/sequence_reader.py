@@ -96,7 +96,7 @@ class SequenceReader:
 
     Examples
     --------
-    >>> from worldstate.abduction.sequence.boosted_trees import BoostedTrees
+    >>> from worldstate.abduction.sequence.sequence_model import BoostedTrees
     >>> stump = dict(split=[[0, 0, 0]], threshold=[[0.5, 0, 0]], yes=[[1, 1, 2]], no=[[2, 1, 2]])
     >>> trees = BoostedTrees(**stump, value=[[0.0, -1.0, 1.0]], tree_class=[0], baseline=[0.0] * len(GROUPS))
     >>> reader = SequenceReader(SequenceModel(trees, np.full(len(GROUPS), 1 / len(GROUPS))))

@@ -5,7 +5,7 @@ stands lower than the training sites' references do, and would turn every window
 stream says of its site is therefore how its mean differs from the mean empty window of the training sites,
 
 .. math:: d = \bar x - x_{empty}, \qquad
-          r = r_{home} + w \big( g_{level} \langle d \rangle + g_{pattern} (d - \langle d \rangle) \big),
+          r = r_{home} + w \big( \tfrac{1}{4} \langle d \rangle + d - \langle d \rangle \big),
 
 with the mean over directions taken apart from the pattern. A louder street raises the level of an approaching
 vehicle less than its own, since the louder one of the two is heard: a quarter of the level is carried over,
@@ -34,17 +34,18 @@ from .ensemble import EnsembleModel
 from .model_domain import ModelDomain
 from .site_reference import SiteReference, log_levels
 
+# Share of the difference in level that is carried over; all of the pattern is.
+_LEVEL_GAIN = 0.25
+
 
 @dataclass(frozen=True, slots=True)
 class SiteEstimateSettings:
-    """Forgetting time and gains of the site estimate.
+    """Forgetting time of the site estimate.
 
     Parameters
     ----------
     forgetting_s : float
         Time constant of the running mean, seconds.
-    level_gain, pattern_gain : float
-        Shares of the difference in level and in pattern that are carried over, in [0, 1].
 
     Raises
     ------
@@ -53,18 +54,14 @@ class SiteEstimateSettings:
 
     Examples
     --------
-    >>> SiteEstimateSettings().level_gain
-    0.25
+    >>> SiteEstimateSettings().forgetting_s
+    300.0
     """
 
     forgetting_s: float = 300.0
-    level_gain: float = 0.25
-    pattern_gain: float = 1.0
 
     def __post_init__(self) -> None:
         in_range("forgetting_s", self.forgetting_s, 0.0, math.inf, open_low=True)
-        in_range("level_gain", self.level_gain, 0.0, 1.0)
-        in_range("pattern_gain", self.pattern_gain, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,18 +116,16 @@ class SiteEstimate:
         heard_s = self.heard_s * math.exp(-dt_s / settings.forgetting_s) + dt_s
         return SiteEstimate(self.level + dt_s / heard_s * (levels - self.level), heard_s)
 
-    def reference(self, model: EnsembleModel, settings: SiteEstimateSettings) -> SiteReference:
+    def reference(self, model: EnsembleModel) -> SiteReference:
         r"""Return what windows are to be compared with; that of the training sites before anything was heard.
 
-        .. math:: r = r_{home} + \frac{h}{h + h_0} \big( g_{level} \langle d \rangle
-                  + g_{pattern} (d - \langle d \rangle) \big), \qquad d = m - x_{empty}
+        .. math:: r = r_{home} + \frac{h}{h + h_0} \big( \tfrac{1}{4} \langle d \rangle
+                  + d - \langle d \rangle \big), \qquad d = m - x_{empty}
 
         Parameters
         ----------
         model : EnsembleModel
             Whose training sites stand in before anything was heard.
-        settings : SiteEstimateSettings
-            Shares of level and pattern that are carried over.
 
         Raises
         ------
@@ -148,7 +143,7 @@ class SiteEstimate:
             return model.home
         difference = self.level - model.empty
         level = difference.mean()
-        offset = settings.level_gain * level + settings.pattern_gain * (difference - level)
+        offset = _LEVEL_GAIN * level + (difference - level)
         return model.home.shifted(self.heard_s / (self.heard_s + model.prior_s) * offset)
 
 
@@ -163,7 +158,7 @@ class SiteSignature:
     model : EnsembleModel
         The one that is asked.
     settings : SiteEstimateSettings, optional
-        Forgetting time and gains.
+        Forgetting time.
     hop_s : float
         Seconds between two windows.
     estimate : SiteEstimate, optional
@@ -223,6 +218,6 @@ class SiteSignature:
             On another shape, NaN or infinity; nothing is learned then.
         """
         window = finite_array("feature", feature, (self._model.n_features,))
-        reference = self.estimate.reference(self._model, self._settings)
+        reference = self.estimate.reference(self._model)
         self.estimate = self.estimate.updated(window, self._hop_s, self._settings)
         return self._model.answer(log_levels(window)[None], reference.row[None])

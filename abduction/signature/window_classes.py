@@ -1,4 +1,4 @@
-r"""Classes of a window: the four of the released data, two more, and evidence for the explanations.
+r"""Classes of a window, and evidence for the explanations from their posteriors, whatever classifier.
 
 A window may hold a hidden vehicle on *both* sides, or a *direct* sound: one plane wave, from a source in the
 open. The first belongs to either side by a half, the second is as likely under every explanation,
@@ -10,6 +10,7 @@ so that a direct sound moves no explanation against another: its side is that of
 """
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -197,3 +198,108 @@ class _Parts:
         sides = (self.four[:, [LEFT, RIGHT]] + self.both) / (prior.four[:, [LEFT, RIGHT]] + prior.both)
         rest = self.four[:, [FRONT, NONE]] / prior.four[:, [FRONT, NONE]] * known + self.direct
         return np.asarray(np.log(sides * known + self.direct) - np.log(rest[:, :1] + rest[:, 1:]))
+
+
+class FittedClassifier(Protocol):
+    """What is asked of a fitted classifier, pipelines and calibrated ones included."""
+
+    @property
+    def classes_(self) -> Any:
+        """Names of the columns of `predict_proba`."""
+        ...
+
+    def predict_proba(self, X: Any) -> Any:
+        """Return posteriors, shape (n, classes).
+
+        Shapes: X (n, features).
+        """
+        ...
+
+
+class ClassifierSignature:
+    r"""Likelihoods from posteriors: :math:`\log P_c - \log \pi_c`.
+
+    Parameters
+    ----------
+    classifier : FittedClassifier
+        Its ``classes_`` are front, left, none and right in any order; its posteriors should be calibrated.
+    class_prior : mapping of str to float, optional
+        Class frequencies that it was trained on; equal ones unless given.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the classes are others or the prior is none.
+
+    Examples
+    --------
+    >>> class Coin:
+    ...     classes_ = ["left", "right", "front", "none"]
+    ...     def predict_proba(self, X): return np.full((len(X), 4), 0.25)
+    >>> ClassifierSignature(Coin()).evidence([0.0]).hidden
+    (0.0, 0.0)
+    """
+
+    def __init__(self, classifier: FittedClassifier, class_prior: dict[str, float] | None = None) -> None:
+        names = [str(name) for name in classifier.classes_]
+        if sorted(names) != sorted(CLASSES):
+            raise InvalidArgumentError(f"classifier: expected the classes {CLASSES}, got {names[:8]}")
+        shares = class_prior or dict.fromkeys(CLASSES, 1.0 / len(CLASSES))
+        prior = finite_array("class_prior", [shares.get(name, 0.0) for name in CLASSES], (len(CLASSES),))
+        if (prior <= 0).any() or not np.isclose(prior.sum(), 1.0, atol=1e-6):
+            raise InvalidArgumentError("class_prior: expected a positive share of each class, sum one")
+        self._classifier = classifier
+        self._order = [names.index(name) for name in CLASSES]
+        self.class_prior = prior
+
+    @property
+    def reference_prior(self) -> tuple[float, ...]:
+        """Training prior in the order of the explanations (left, right, visible, none)."""
+        return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
+
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
+        r"""Return the posteriors of front, left, none, right, shape (n, 4).
+
+        .. math:: P_c = \frac{\max(p_c, 10^{-7})}{\sum_{c'} \max(p_{c'}, 10^{-7})}
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If X is not finite or the classifier answers with something that is no distribution.
+        """
+        inputs = finite_array("X", X, (None, None))
+        answer = finite_array(
+            "predict_proba", self._classifier.predict_proba(inputs), (len(inputs), len(CLASSES))
+        )
+        if (answer < 0).any() or not np.allclose(answer.sum(axis=1), 1.0, atol=1e-3):
+            raise InvalidArgumentError("predict_proba: expected posteriors that sum to one")
+        posteriors = np.maximum(answer[:, self._order], SMALLEST_PROBABILITY)
+        return np.asarray(posteriors / posteriors.sum(axis=1, keepdims=True))
+
+    def evidence(self, feature: ArrayLike) -> SignatureEvidence:
+        r"""Return the log-likelihoods of one window.
+
+        .. math:: \log \ell_c = \log P_c - \log \pi_c
+
+        Parameters
+        ----------
+        feature : array_like, shape (features,)
+            One window.
+
+        Raises
+        ------
+        InvalidArgumentError
+            As `predict_proba`.
+
+        References
+        ----------
+        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
+        """
+        return evidence_of(
+            explanation_ratios(self.predict_proba(np.atleast_2d(feature)), self.class_prior)[0]
+        )

@@ -22,8 +22,6 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, ComplexArray, Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 
-from .harmonic_sum import MEDIAN_OF_EXPONENTIAL
-
 # Three parameters are fitted; with fewer samples the residual gives no estimate of the noise.
 FEWEST_SAMPLES = 8
 # A grid of a quarter of the resolution puts the coarse peak within an eighth of it: well inside the main
@@ -268,6 +266,8 @@ _CHANCE, _WANDER = 2.0, 6.0
 _TOLERANCE, _STEPS = 1e-4, 3
 # Lowest frequency, periods in the window: below, a tone is not distinguishable from an offset.
 _FEWEST_PERIODS = 4.0
+# Median of an exponential variable over its mean: from a median of powers to the noise power.
+_MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -429,7 +429,7 @@ class _Spectrum:
         below = power[max(centre - outer, 1) : max(centre - inner, 1)]
         above = power[centre + inner : centre + outer]
         around = np.sort(np.concatenate([below, above]))
-        return float(around[len(around) // 2]) / MEDIAN_OF_EXPONENTIAL + _least(power)
+        return float(around[len(around) // 2]) / _MEDIAN_OF_EXPONENTIAL + _least(power)
 
     def beside(self, rest: FloatArray, omega: float) -> float:
         """Return the mean power beside a line that was taken out, as far as its own lobes reach."""

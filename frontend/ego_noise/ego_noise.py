@@ -27,17 +27,24 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.stft import whiten
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import Complex64Array, ComplexArray, FloatArray
+from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, FloatArray
 
-from .elevation_split import ElevationSplit, share_of
 from .harmonic_cancellation import HarmonicCanceller
 
 _TINY = np.float32(1e-30)
+# Hops of a lower weight are not learned: a likely source must not enter.
+_LEAST_WEIGHT = 0.5
+# Period after which the whitening of one bin, in turn, is updated, an M x M eigendecomposition; several bins
+# per hop at first and when the vehicle starts or stops.
+_REFRESH_HOPS = 4
 # Shares of below-horizon power at which whitening begins and is complete. Simulated streets: below 0.1;
 # drives at walking pace, where the street is as loud: above 0.6.
 _STREET_SHARE, _EGO_SHARE = 0.3, 0.6
@@ -63,15 +70,8 @@ class EgoNoiseSettings:
         Time constant of the covariance, seconds of learning time.
     guard_hops : int
         Delay, hops, after which a hop is learned with the minimum weight of the interval.
-    min_weight : float
-        Hops of a lower weight, in [0, 1], are not learned: a likely source must not enter.
     min_shrinkage : float
         Least shrinkage s towards white noise, in (0, 1]: no direction is amplified by more than 1 / sqrt(s).
-    refresh_hops : int
-        Period, hops, after which the whitening of one bin, in turn, is updated, an M x M eigendecomposition;
-        several bins per hop at first and when the vehicle starts or stops.
-    harmonics : int
-        Number of engine harmonics that are cancelled before, once `FrontEnd.follow_engine` gives the speed.
     feature : bool
         Compute the published feature from prewhitened sound, too; its classifier was trained without.
     only_below_horizon : bool
@@ -91,20 +91,15 @@ class EgoNoiseSettings:
 
     forgetting_s: float = 10.0
     guard_hops: int = 5
-    min_weight: float = 0.5
     min_shrinkage: float = 0.03
-    refresh_hops: int = 4
-    harmonics: int = 40
     feature: bool = False
     only_below_horizon: bool = True
 
     def __post_init__(self) -> None:
         in_range("forgetting_s", self.forgetting_s, 0.1, 1e5)
-        in_range("min_weight", self.min_weight, 0.0, 1.0)
         in_range("min_shrinkage", self.min_shrinkage, 1e-4, 1.0)
-        _whole("guard_hops", self.guard_hops, 0, 100)
-        _whole("harmonics", self.harmonics, 1, 1000)
-        _whole("refresh_hops", self.refresh_hops, 1, 1000)
+        if self.guard_hops != int(in_range("guard_hops", self.guard_hops, 0, 100)):
+            raise InvalidArgumentError(f"guard_hops: expected a whole number, got {self.guard_hops}")
 
 
 class EgoNoise:
@@ -120,7 +115,7 @@ class EgoNoise:
         n_microphones: int,
         beams: Sequence[tuple[Steering, slice]],
         engine: HarmonicCanceller | None = None,
-        elevation_split: ElevationSplit | None = None,
+        elevation_split: "ElevationSplit | None" = None,
     ) -> None:
         self.weight = 0.0
         self.engine = engine
@@ -182,7 +177,7 @@ class EgoNoise:
         return np.asarray(power / max(level, 1e-6) ** self.ego_share)
 
     def _gated(self) -> float:
-        return self.weight if self.weight >= self._settings.min_weight else 0.0
+        return self.weight if self.weight >= _LEAST_WEIGHT else 0.0
 
     def _whitened(self, spectra: Complex64Array) -> Complex64Array:
         if not self.ego_share:
@@ -211,7 +206,7 @@ class EgoNoise:
         """Update the whitening of the next bins if it is due, until all use the newest covariance."""
         self._hops_since_refresh += 1
         grown = self.learned_frames > _ANOTHER_LENGTH * self._aim_frames
-        due = grown or self._urgent or self._hops_since_refresh >= self._settings.refresh_hops
+        due = grown or self._urgent or self._hops_since_refresh >= _REFRESH_HOPS
         if not (self._stale and due):
             return
         self._update_share()
@@ -273,11 +268,6 @@ def _direction_sum(spectra: Complex64Array) -> Complex64Array:
     power = np.square(spectra.real).sum(axis=2) + np.square(spectra.imag).sum(axis=2)
     scale = np.sqrt(np.float32(spectra.shape[2]) / np.maximum(power, _TINY))
     return cross_spectra((spectra * scale[:, :, None]).transpose(1, 0, 2))
-
-
-def _whole(name: str, value: int, low: int, high: int) -> None:
-    if value != int(value) or not low <= value <= high:
-        raise InvalidArgumentError(f"{name}: expected a whole number in [{low}, {high}], got {value}")
 
 
 Item = TypeVar("Item")
@@ -456,3 +446,92 @@ class WhitenedBeams:
         alive = np.float32(np.count_nonzero(np.einsum("mm->m", root)))
         scaled = weights * np.sqrt(alive / np.maximum(gram, _TINY))
         ours.weights[bin_index], ours.conjugate[bin_index] = scaled, scaled.conj()
+
+
+# Elevations of the two fields: the body of the vehicle is well below a roof array, sources and facades are at
+# its height and above.
+_BELOW_DEG, _STREET_DEG = (-60.0, -50.0, -40.0, -30.0, -20.0), (0.0, 10.0, 20.0, 30.0)
+_AZIMUTHS_RAD = np.radians(np.arange(-180.0, 180.0, 5.0))
+# Least 1 - cos^2 of the angle between the fields at which they can be separated: 0.95 for the roof array, 0.1
+# for a horizontal line.
+_LEAST_CONTRAST = 0.2
+_LEAST_POWER = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ElevationSplit:
+    r"""Separate the noise of the own vehicle from that of the street by elevation.
+
+    The own vehicle is below its microphones, the street at their height and above. The part of each bin's
+    covariance between different microphones is fitted by two isotropic fields (B. F. Cron and C. H. Sherman,
+    J. Acoust. Soc. Am. 34, 1962),
+
+    .. math:: \hat p = \arg\min_p \sum_{i \ne j} |R_{ij} - p_b\, \Gamma^b_{ij} - p_s\, \Gamma^s_{ij}|^2,
+              \qquad q = \frac{\sum_k \Delta_k\, p_{b,k}}{\sum_k \Delta_k\, (p_{b,k} + p_{s,k})},
+
+    plane waves from all azimuths and from elevations well under the horizon (b) or from the horizon upwards
+    (s). Bins are weighted by the determinant of their normal equations: where the array is small against the
+    wavelength the two fields are alike. Wind and sensor noise are on the diagonal only and have no effect.
+    """
+
+    # shape (bins, 2 M^2): Combinations of the model fields, real and imaginary parts in turn, that give the
+    # power of one field times the determinant.
+    below: Float32Array
+    street: Float32Array
+    is_separable: bool  # Whether the array has the vertical extent for it
+
+    @classmethod
+    def of(
+        cls,
+        array: MicrophoneArray,
+        frequencies_hz: ArrayLike,
+        speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+    ) -> "ElevationSplit":
+        r"""Build the model fields of an array at the frequencies of its bins.
+
+        .. math:: \Gamma = \langle a a^H \rangle \text{ off the diagonal}, \qquad
+                  w_b = G_{ss} \Gamma^b - G_{bs} \Gamma^s, \quad w_s = G_{bb} \Gamma^s - G_{bs} \Gamma^b
+        """
+        # Means over the directions of each field, with G their inner products: the inner product of w with R
+        # is the power times the determinant.
+        b, s = (_field(array, frequencies_hz, el, speed_of_sound_m_s) for el in (_BELOW_DEG, _STREET_DEG))
+        bb, ss, bs = (np.einsum("kn,kn->k", x, y)[:, None] for x, y in ((b, b), (s, s), (b, s)))
+        contrast = float((bb * ss - bs**2).sum() / max(float((bb * ss).sum()), _LEAST_POWER))
+        below, street = ss * b - bs * s, bb * s - bs * b
+        scale = 1.0 / max(float(np.abs(below).max()), _LEAST_POWER)
+        below, street = (np.ascontiguousarray(scale * x, np.float32) for x in (below, street))
+        return cls(below, street, is_separable=contrast >= _LEAST_CONTRAST)
+
+    def powers(self, covariance: Complex64Array) -> FloatArray:
+        r"""Return the powers below and above the horizon; below only, if the array cannot separate them.
+
+        .. math:: P_b = \sum_k \Delta_k\, \hat p_{b,k}, \qquad P_s = \sum_k \Delta_k\, \hat p_{s,k}
+        """
+        if not self.is_separable:
+            return np.array([1.0, 0.0])
+        parts = covariance.reshape(len(covariance), -1).view(np.float32)
+        return np.array([np.vdot(parts, self.below), np.vdot(parts, self.street)], np.float64)
+
+
+def share_of(below: float, street: float) -> float:
+    r"""Return the share of the first power; negative estimates count as zero.
+
+    .. math:: q = \frac{\max(P_b, 0)}{\max(P_b, 0) + \max(P_s, 0)}
+
+    Examples
+    --------
+    >>> share_of(3.0, 1.0), share_of(-1.0, 2.0), share_of(1.0, -0.1), share_of(0.0, 0.0)
+    (0.75, 0.0, 1.0, 0.0)
+    """
+    return float(below / (below + max(street, 0.0))) if below > 0.0 else 0.0
+
+
+def _field(
+    array: MicrophoneArray, frequencies_hz: ArrayLike, elevations_deg: tuple[float, ...], speed: float
+) -> FloatArray:
+    """Covariance between different microphones of plane waves at some elevations, (bins, 2 M^2)."""
+    azimuths, elevations = np.meshgrid(_AZIMUTHS_RAD, np.radians(elevations_deg))
+    A = array.steering(frequencies_hz, azimuths.ravel(), elevations.ravel(), speed)
+    field = A @ A.conj().transpose(0, 2, 1) / A.shape[2]
+    field[:, np.arange(array.n_microphones), np.arange(array.n_microphones)] = 0.0
+    return np.asarray(np.ascontiguousarray(field.reshape(len(field), -1)).view(np.float64))

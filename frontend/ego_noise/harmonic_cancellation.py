@@ -35,6 +35,7 @@ _ORDER_STEPS = (1, 2, 4, 8)
 _NO_LINE = 2.0
 # Memory of the amplitudes: the engine's speed changes within a second.
 _MEMORY_S = 0.4
+_HARMONICS = 40
 # Ridge relative to the diagonal: close harmonics of a slow engine are nearly collinear in a hop.
 _RIDGE = 1e-3
 _TINY = 1e-30
@@ -87,11 +88,11 @@ class EngineState:
 class HarmonicCanceller:
     """Subtract the harmonics of an engine from the spectra of a stream."""
 
-    def __init__(self, bins: range, sample_rate_hz: float, nfft: int, *, harmonics: int = 40) -> None:
+    def __init__(self, bins: range, sample_rate_hz: float, nfft: int) -> None:
         self._frame_s = 0.5 * nfft / sample_rate_hz
         self._bin_hz = sample_rate_hz / nfft
         self._bins = np.arange(bins.start, bins.stop)
-        self._all_orders = np.arange(1, harmonics + 1)
+        self._all_orders = np.arange(1, _HARMONICS + 1)
         self._fit: _Fit | None = None
         self._evident: ComplexArray = np.empty((0, 0), np.complex64)
         self._engine: EngineState | None = None

@@ -26,7 +26,7 @@ from worldstate.abduction.grounding.grounded_likelihood import (
     motorcycle,
     tyre_noise_shape,
 )
-from worldstate.abduction.signature.classifier_signature import ClassifierSignature
+from worldstate.abduction.signature.window_classes import ClassifierSignature
 from worldstate.ground.errors import InvalidArgumentError
 
 SCORES = SignatureEvidence(("left", "right"), (0.7, -0.4), 0.1, -0.2)

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sequence import evidence_of
 
-from worldstate.abduction.sequence.boosted_trees import BoostedTrees
 from worldstate.abduction.sequence.sequence_inputs import (
     INPUTS,
     MEMORY_HOPS,
@@ -16,7 +15,7 @@ from worldstate.abduction.sequence.sequence_inputs import (
     running,
     sequence_inputs,
 )
-from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S, SequencePosterior
+from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S, BoostedTrees, SequencePosterior
 from worldstate.ground.errors import InvalidArgumentError
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -5,9 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.abduction.sequence.boosted_trees import BoostedTrees
 from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence, sequence_inputs
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, LONGEST_S, SequenceModel
+from worldstate.abduction.sequence.sequence_model import (
+    COMING_S,
+    GROUPS,
+    LONGEST_S,
+    BoostedTrees,
+    SequenceModel,
+)
 from worldstate.ground.errors import WorldstateError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import significant

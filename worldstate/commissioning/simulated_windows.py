@@ -166,7 +166,7 @@ def posteriors_along(model: EnsembleModel, features: FloatArray) -> FloatArray:
     chosen, estimate = SiteEstimateSettings(), SiteEstimate.start(model.n_features)
     references = np.empty((len(features), model.home.row.size))
     for row, feature in enumerate(np.asarray(features, np.float64)):
-        references[row] = estimate.reference(model, chosen).row
+        references[row] = estimate.reference(model).row
         estimate = estimate.updated(feature, HOP_S, chosen)
     return model.posteriors(log_levels(features), references)
 

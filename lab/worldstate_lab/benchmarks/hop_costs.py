@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.abduction.sequence.boosted_trees import BoostedTrees
 from worldstate.abduction.sequence.sequence_inputs import INPUTS
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceModel
+from worldstate.abduction.sequence.sequence_model import GROUPS, BoostedTrees, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel

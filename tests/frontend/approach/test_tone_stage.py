@@ -203,7 +203,6 @@ def test_level_does_not_matter(scale: float) -> None:
         (8_000, {"tone_band_hz": (20.0, 4_000.0)}, "tone_band_hz"),
         (8_000, {"tone_band_hz": (50.0, 400.0), "tone_hops": 1}, "tone_hops"),
         (8_000, {"tone_band_hz": (400.0, 20.0)}, "tone_band_hz"),
-        (8_000, {"tone_channels": 0}, "tone_channels"),
     ],
 )
 def test_bad_settings_are_refused(rate: float, chosen: dict[str, object], message: str) -> None:

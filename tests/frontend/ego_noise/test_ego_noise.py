@@ -388,9 +388,6 @@ def test_it_has_to_be_asked_for() -> None:
         {"guard_hops": -1},
         {"guard_hops": 1.5},
         {"min_shrinkage": 0},
-        {"refresh_hops": 0},
-        {"min_weight": 2},
-        {"harmonics": 0},
     ],
 )
 def test_settings_out_of_range_are_named(wrong: dict) -> None:

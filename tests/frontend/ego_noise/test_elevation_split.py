@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings, GuardDelay
-from worldstate.frontend.ego_noise.elevation_split import ElevationSplit, share_of
+from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings, ElevationSplit, GuardDelay, share_of
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.simulation.sound.ego_sound import ego_noise

@@ -55,11 +55,11 @@ def asked_while_listening(
 
     Shapes: table (n, 60 or more): what is behind the first 60 features of a window is not looked at.
     """
-    windows, settings = table.features[:, :N_FEATURES], SiteEstimateSettings()
+    windows = table.features[:, :N_FEATURES]
     learned = learned_while_listening(replace(table, features=windows), rng)
 
     def posteriors(model: EnsembleModel, rows: BoolArray) -> FloatArray:
-        references = [learned[row].reference(model, settings).row for row in np.flatnonzero(rows)]
+        references = [learned[row].reference(model).row for row in np.flatnonzero(rows)]
         return model.explain(np.hstack([windows[rows], references]))
 
     return posteriors

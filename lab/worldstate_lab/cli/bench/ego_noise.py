@@ -16,8 +16,7 @@ import numpy as np
 from worldstate.cli.common.output import CommandResult
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
-from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings, ElevationSplit
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, whiten
 from worldstate.ground.blas_threads import one_blas_thread
