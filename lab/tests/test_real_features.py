@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from released_data import FOLDER, TABLE, needs_released_windows
-from worldstate_lab.features.comparison import report
+from worldstate_lab.cli.windows import report
 from worldstate_lab.features.feature_evaluation import (
     WindowMethod,
     check_unseen,

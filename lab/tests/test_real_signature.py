@@ -8,7 +8,7 @@ import pytest
 from released_data import FOLDER, needs_released_windows
 from released_data import TABLE as NAME
 from worldstate_lab.cli.main import main
-from worldstate_lab.features.comparison import comparison, report, run_passes
+from worldstate_lab.cli.windows import comparison, report, run_passes
 from worldstate_lab.features.feature_evaluation import predict_held_out
 from worldstate_lab.features.methods import row_of
 

@@ -20,19 +20,31 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
   --reference curated  all windows of the junction's other recordings, half of them hazards: no car has it
 
 Thresholds and risk maps are set on inner out-of-fold scores, compared as under `run`, as in `train`.
-Figures are means over the seeds; intervals are
-the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
+Figures are means over the seeds; intervals are the middle 95 % of 500 bootstrap samples of recordings, the
+same for every method.
 
 With --model a finished model is evaluated instead; it is refused where it was trained on these recordings.
 """
 
 import argparse
+import csv
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from joblib import Parallel, delayed
+from scipy.special import bdtrc
 
+from worldstate.abduction.cueing.calibration_error import (
+    brier_score,
+    calibration_error_sampling,
+    expected_calibration_error,
+)
+from worldstate.abduction.signature.ensemble_training import SimulatedWindows
+from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, read_ids
+from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.feature_options import add_table_options, read_beside
@@ -41,17 +53,263 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate_lab.features.comparison import (
-    comparison,
-    report,
-    row_predictions,
-    run_passes,
-    write_predictions,
-)
-from worldstate_lab.features.feature_evaluation import Predictions, predict_held_out
-from worldstate_lab.features.methods import ROWS, Passes, row_of, rows_beside
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate, worst_rate
+from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
+from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
+from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
+from worldstate_lab.metrics.intervals import DRAWS, middle, paired_gains, recording_draws
 
-Figures = dict[str, Any]
+# The floor belongs to the risks: another seed in every run would only add noise to it.
+FLOOR_SEED = 0
+Figures = dict[str, float | None]
+DEVIATING = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "fpr", "ece")
+POSTERIORS = tuple(f"p_{label}" for label in CLASSES)
+COLUMNS = ("seed", "fold", "recording", "environment", "class", *POSTERIORS, "score", "risk", "decision")
+
+
+def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
+    """Return the figures of one pass over the table."""
+    scored = table.hazards | table.hazard_free
+    hazards, score = table.hazards[scored], predictions.score[scored]
+    floor = calibration_error_sampling(predictions.risk[scored], np.random.default_rng(FLOOR_SEED))
+    return {
+        **_figures_on(table, predictions)(np.arange(len(table))),
+        "ece_raw": expected_calibration_error(score, hazards),
+        "ece_floor": floor[0],
+        "ece_floor_std": floor[1],
+        "brier_raw": brier_score(score, hazards),
+    }
+
+
+def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray], Figures]:
+    """Return what forms the figures of some rows: hazard windows against hazard-free ones."""
+    # `front` counts in the 4-class accuracy only.
+    hazards, hazard_free, correct = table.hazards, table.hazard_free, one.classes == table.labels
+    sites = np.unique(table.environments, return_inverse=True)[1]
+
+    def figures(rows: IndexArray) -> Figures:
+        scored = rows[(hazards | hazard_free)[rows]]
+        labels, score, risk = (values[scored] for values in (hazards, one.score, one.risk))
+        by_site, decision = auroc_by_group(score, labels, sites[scored]), one.decision[rows]
+        return {
+            "accuracy": float(correct[rows].mean()),
+            "auroc_macro": macro(by_site),
+            "auroc_pooled": auroc(score, labels),
+            "worst_group_auroc": min(by_site.values()),
+            "tpr": rate(decision, hazards[rows]),
+            "fpr": rate(decision, hazard_free[rows]),
+            "worst_group_fpr": worst_rate(decision, hazard_free[rows], sites[rows]),
+            "ece": expected_calibration_error(risk, labels),
+            "brier": brier_score(risk, labels),
+        }
+
+    return figures
+
+
+def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArray) -> Figures:
+    """Return accuracy, area and rates of one junction; None where a label is missing there."""
+    scored = here & (table.hazards | table.hazard_free)
+    return {
+        "accuracy": rate(predictions.classes == table.labels, here),
+        "auroc": auroc(predictions.score[scored], table.hazards[scored]),
+        "tpr": rate(predictions.decision, here & table.hazards),
+        "fpr": rate(predictions.decision, here & table.hazard_free),
+    }
+
+
+def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> dict[str, Any]:
+    """Return the mean figures over all passes (seeds), with their standard deviation between seeds."""
+    published, absent = ([one[beta] for one in passes] for beta in (1.0, 0.0))
+    figures, others = ([window_figures(table, one) for one in some] for some in (published, absent))
+    # The posteriors, and so the classes, are the same.
+    means = {f"{key}_absent": value for key, value in mean_figures(others).items() if key != "accuracy"}
+    return {
+        **mean_figures(figures),
+        **means,
+        "seed_std": {key: np.std(np.array([one[key] for one in figures], float)).item() for key in DEVIATING},
+        **count_windows(table),
+        "per_group": report_groups(table, published),
+    }
+
+
+def count_windows(table: FeatureTable) -> dict[str, int]:
+    """Return the numbers of windows, by what they hold, and of recordings."""
+    return {
+        "n_windows": len(table),
+        "n_hazard": int(table.hazards.sum()),
+        "n_hazard_free": int(table.hazard_free.sum()),
+        "n_recordings": len(np.unique(table.recording_keys)),
+    }
+
+
+def mean_figures(figures: Sequence[Figures]) -> Figures:
+    """Return the mean of each figure, None where it could not be had.
+
+    Examples
+    --------
+    >>> mean_figures([{"tpr": 0.5, "fpr": None}, {"tpr": 1.0, "fpr": None}])
+    {'tpr': 0.75, 'fpr': None}
+    """
+    means: Figures = {}
+    for key in figures[0]:
+        values = [figure[key] for figure in figures if figure[key] is not None]
+        means[key] = float(np.mean(values)) if values else None  # type: ignore[arg-type]
+    return means
+
+
+def write_predictions(
+    path: str | Path, table: FeatureTable, passes: Sequence[Predictions], seeds: Sequence[int]
+) -> None:
+    """Write one row a window and seed, whole or not at all; floats as they are, to the last digit."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for seed, one in zip(seeds, passes, strict=True):
+            about = one.folds, table.recordings, table.environments, table.labels
+            told = *one.probabilities.T, one.score, one.risk, one.decision.astype(int)
+            rows = zip(*(column.tolist() for column in (*about, *told)), strict=True)
+            writer.writerows([seed, *row] for row in rows)
+
+
+def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[str, Figures]:
+    """Return the figures of each junction, mean over the passes, with its number of windows."""
+    figures: dict[str, Figures] = {}
+    for environment in np.unique(table.environments).tolist():
+        here = table.environments == environment
+        means = mean_figures([_group_figures(table, one, here) for one in passes])
+        figures[environment] = {"n_windows": int(here.sum()), **means}
+    return figures
+
+
+# The same samples for every method and run: the differences between methods are paired.
+BOOTSTRAP_SEED = 0
+
+
+def run_passes(
+    names: Sequence[str],
+    table: FeatureTable,
+    protocol: Protocol,
+    *,
+    seeds: int,
+    alpha: float,
+    train: FeatureTable | None = None,
+    simulated: SimulatedWindows | None = None,
+    jobs: int = 1,
+    on_pass: Callable[[], None] = lambda: None,
+) -> dict[str, Passes]:
+    """Run every seed of every method; the outcome does not depend on the number of jobs."""
+    known = methods(simulated)
+    tasks = [(name, seed) for name in names for seed in range(seeds)]
+    run = delayed(evaluate_pass)
+    outcomes = Parallel(n_jobs=jobs, return_as="generator")(
+        run(known[name], table, protocol, seed=seed, alpha=alpha, train=train) for name, seed in tasks
+    )
+    passes: dict[str, Passes] = {name: [] for name in names}
+    for (name, _), outcome in zip(tasks, outcomes, strict=True):
+        passes[name].append(outcome)
+        on_pass()
+    return passes
+
+
+def comparison(
+    table: FeatureTable, passes: Mapping[str, Passes], row: str, alpha: float, draws: int = DRAWS
+) -> dict[str, Any]:
+    """Return the figures of one row, those of all others, and what the one gains on each.
+
+    Parameters
+    ----------
+    table : FeatureTable
+        Windows that were predicted.
+    passes : mapping of str to list
+        From `run_passes`.
+    row : str
+        Name in `ROWS` of the one that the plain keys are of.
+    alpha : float
+        Budget, for the test of the achieved false-positive rate.
+    draws : int
+        Bootstrap samples behind the intervals.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are no passes of that row's method.
+
+    Returns
+    -------
+    dict
+        Figures of the row, its intervals, the other rows, and the gains.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> labels, keys = np.repeat(["left", "none", "right", "front"], 20), np.arange(80).astype(str)
+    >>> features = np.where(labels == "none", 0.1, 0.2)[:, None] * rng.lognormal(0.0, 0.2, (80, 60))
+    >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
+    >>> passes = run_passes(["baseline"], table, "cv", seeds=1, alpha=0.1)
+    >>> comparison(table, passes, "baseline", alpha=0.1, draws=20)["auroc_pooled"] > 0.9
+    True
+    """
+    chosen = {name: row_predictions(passes, name) for name in ROWS if ROWS[name].method in passes}
+    if row not in chosen:
+        raise InvalidArgumentError(f"method: expected passes of {row}, got {', '.join(passes)}")
+    samples = recording_draws(table, np.random.default_rng(BOOTSTRAP_SEED), draws)
+    drawn = {name: draw_figures(table, mine, samples) for name, mine in chosen.items()}
+    rows = {name: _row_figures(table, mine, drawn[name], alpha) for name, mine in chosen.items()}
+    others = [name for name in rows if name != row]
+    return {
+        **rows[row],
+        "statistic": "absent" if ROWS[row].miss_rate == ABSENT_MISS_RATE else "published",
+        **count_windows(table),
+        "per_group": report_groups(table, chosen[row]),
+        "rows": {name: rows[name] for name in others},
+        "gains": {
+            name: _gains(rows[row], rows[name], paired_gains(drawn[row], drawn[name])) for name in others
+        },
+    }
+
+
+def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]:
+    """Return the predictions of one row, seed by seed."""
+    return [one[ROWS[row].miss_rate] for one in passes[ROWS[row].method]]
+
+
+def _row_figures(
+    table: FeatureTable, passes: Sequence[Predictions], draws: Mapping[str, FloatArray], alpha: float
+) -> dict[str, Any]:
+    figures = mean_figures([window_figures(table, one) for one in passes])
+    n = int(table.hazard_free.sum())
+    # Probability of as many false positives or more, were the true rate the budget.
+    p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
+    return {
+        **figures,
+        "fpr_p_value": p_value,
+        "intervals": {name: middle(one) for name, one in draws.items()},
+    }
+
+
+def _gains(
+    ours: Mapping[str, Any], theirs: Mapping[str, Any], intervals: Mapping[str, tuple[float, float]]
+) -> dict[str, dict[str, float]]:
+    return {
+        figure: {"gain": ours[figure] - theirs[figure], "low": low, "high": high}
+        for figure, (low, high) in intervals.items()
+    }
+
+
+def draw_figures(
+    table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[IndexArray]
+) -> dict[str, FloatArray]:
+    """Return the figures on every bootstrap sample of recordings, mean over the passes (seeds)."""
+    # The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
+    measures = [_figures_on(table, one) for one in passes]
+    found = [[measure(rows) for rows in samples] for measure in measures]
+    draws = {name: [[one[name] for one in mine] for mine in found] for name in found[0][0]}
+    return {name: np.array(values, float).mean(axis=0) for name, values in draws.items()}
+
+
+Report = dict[str, Any]
 # What fits a line of the table; the JSON object has the gains of all figures.
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
 
@@ -93,7 +351,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 def _evaluate_method(
     arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
-) -> tuple[Figures, list[Predictions]]:
+) -> tuple[Report, list[Predictions]]:
     row = row_of(arguments.method, arguments.protocol, arguments.reference)
     passes = _passes(arguments, whole, table, row)
     detail = report(table, passes[row]) if row == "baseline" else {}
@@ -129,7 +387,7 @@ def _passes(
 
 def _evaluate_model(
     arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
-) -> tuple[Figures, list[Predictions]]:
+) -> tuple[Report, list[Predictions]]:
     predictions = predict_held_out(
         read_model(arguments.model), table, arguments.alpha, arguments.reference, np.random.default_rng(0)
     )
@@ -137,7 +395,7 @@ def _evaluate_model(
     return figures, [predictions[1.0]]
 
 
-def _origin(arguments: argparse.Namespace, method: str, protocol: str, seeds: int) -> Figures:
+def _origin(arguments: argparse.Namespace, method: str, protocol: str, seeds: int) -> Report:
     return {
         "method": method,
         "protocol": protocol,
@@ -148,7 +406,7 @@ def _origin(arguments: argparse.Namespace, method: str, protocol: str, seeds: in
     }
 
 
-def _flat(figures: Figures) -> dict[str, object]:
+def _flat(figures: Report) -> dict[str, object]:
     """One line a junction and one a compared row, for people."""
     flat = {key: value for key, value in figures.items() if not isinstance(value, dict)}
     intervals = figures.get("intervals", {})

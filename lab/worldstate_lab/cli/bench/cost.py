@@ -36,12 +36,13 @@ from worldstate_lab.benchmarks.hop_costs import (
     NFFT,
     RATE_HZ,
     SRP_BINS,
+    Milliseconds,
+    elapsed_ms,
     evidence_times,
     peer_times,
     srp_beams,
     stage_times,
 )
-from worldstate_lab.benchmarks.stopwatch import Milliseconds, elapsed_ms
 
 EXAMPLE = "example: worldstate-lab bench"
 

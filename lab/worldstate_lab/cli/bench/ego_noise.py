@@ -21,7 +21,7 @@ from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCancelle
 from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import Complex64Array, Float32Array
-from worldstate_lab.benchmarks.stopwatch import Milliseconds, elapsed_ms
+from worldstate_lab.benchmarks.hop_costs import Milliseconds, elapsed_ms
 
 EXAMPLE = "example: worldstate-lab bench ego-noise --rounds 5"
 

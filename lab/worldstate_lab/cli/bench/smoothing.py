@@ -18,7 +18,7 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.measurement import Approach, Bearing
 from worldstate.smoothing import AngularHeight, FixedLagSmoother, PastEdge, ReflectedBearing
 from worldstate.smoothing.observations import Observation
-from worldstate_lab.benchmarks.stopwatch import Milliseconds, elapsed_ms
+from worldstate_lab.benchmarks.hop_costs import Milliseconds, elapsed_ms
 
 EXAMPLE = "example: worldstate-lab bench smoothing --seconds 40"
 
