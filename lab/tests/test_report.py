@@ -22,13 +22,12 @@ from worldstate_lab.degradation.degradation_study import (
     DetectorSweep,
 )
 from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
+from worldstate_lab.evaluation.figures import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.front_end_study import front_end_study
-from worldstate_lab.evaluation.paper_values import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, ProtocolRun
 from worldstate_lab.evaluation.report.approach_timeline import approach_figure
-from worldstate_lab.evaluation.report.contents import evaluation_document
+from worldstate_lab.evaluation.report.contents import evaluation_document, signature_values
 from worldstate_lab.evaluation.report.panels import roc_curve
-from worldstate_lab.evaluation.report.study_sections import signature_values
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.line_of_sight import VisionOnly

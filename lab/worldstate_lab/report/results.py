@@ -52,9 +52,9 @@ def keep_results(
     path: Path, words: Sequence[str], arguments: argparse.Namespace, figures: Mapping[str, object]
 ) -> None:
     """Merge the figures of one command into a results file, under the key of its words."""
-    found = read_results(path)
-    found[result_key(words)] = {
-        "command": " ".join(("worldstate-lab", *words)),
+    found, key = read_results(path), result_key(words)
+    found[key] = {
+        "command": f"worldstate-lab {key}",
         "commit": _commit(),
         "seeds": _seeds(arguments),
         "smoke": bool(getattr(arguments, "smoke", False)),

@@ -10,7 +10,7 @@ from worldstate_lab.degradation.beta_curves import Band
 from worldstate_lab.degradation.conditions import FAMILIES, OFF
 from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
 from worldstate_lab.degradation.staged_filter import StreamSweep
-from worldstate_lab.evaluation.paper_values import COMMANDS, paper_value
+from worldstate_lab.evaluation.figures import COMMANDS, paper_value
 from worldstate_lab.report.pages import Section
 from worldstate_lab.report.table import Cell, Figure, Table, Value, plain
 

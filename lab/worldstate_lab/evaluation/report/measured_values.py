@@ -10,9 +10,8 @@ from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.operations.arrays.array_bounds import array_bounds
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import FIGURES
+from worldstate_lab.evaluation.figures import FIGURES, PAPER_VALUES, PaperValue, paper_value
 from worldstate_lab.evaluation.front_end_study import FrontEndStudy
-from worldstate_lab.evaluation.paper_values import PAPER_VALUES, PaperValue, paper_value
 from worldstate_lab.evaluation.protocols import RETRAINED, STATIC
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.line_of_sight import seen_early_s

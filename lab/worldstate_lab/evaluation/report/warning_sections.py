@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import FIGURES
-from worldstate_lab.evaluation.paper_values import paper_value
+from worldstate_lab.evaluation.figures import FIGURES, paper_value
 from worldstate_lab.evaluation.protocols import STATIC
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate_lab.evaluation.scores import paired
