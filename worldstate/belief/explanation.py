@@ -8,7 +8,7 @@ chain adds is whether a source in view is the one that was heard while hidden.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from operator import attrgetter
 from typing import Annotated, TypeAlias
 
@@ -68,7 +68,8 @@ _IN_PRIOR = Unqueried("already weighed into the prior")
 _MOST_HIDDEN = 0.999
 
 
-@dataclass(frozen=True, slots=True)
+# No slots: the probabilities are computed once, and read some sixteen times a step.
+@dataclass(frozen=True)
 class ExplanationBelief:
     r"""Filtered P(hidden_k), P(in view, come from k), P(in view, from elsewhere) and P(none).
 
@@ -101,10 +102,12 @@ class ExplanationBelief:
         """Number of approach sides."""
         return len(self.log_probabilities) // 2 - 1
 
-    @property
+    @cached_property
     def probabilities(self) -> FloatArray:
-        """Shape (2K + 2,), in the order of the chain."""
-        return np.exp(self.log_probabilities)
+        """Shape (2K + 2,), in the order of the chain; read-only."""
+        probabilities: FloatArray = np.exp(self.log_probabilities)
+        probabilities.flags.writeable = False
+        return probabilities
 
     @property
     def hidden(self) -> tuple[float, ...]:
@@ -154,7 +157,7 @@ class ExplanationBelief:
         """Return the belief after a hand-over: the hidden mass of a direction moves into view."""
         # `residual` is the share that stays hidden, since the sighting may be of another vehicle. The rest
         # counts as from elsewhere: the entity is seen now, and its existence no longer read from here.
-        p, k = self.probabilities, self.k
+        p, k = self.probabilities.copy(), self.k
         moved = p[direction] * (1.0 - residual)
         p[direction] -= moved
         p[2 * k] += moved + p[k + direction]
@@ -166,7 +169,7 @@ class ExplanationBelief:
 
         Shapes: hidden (K,). Sides exclude each other here: given more than one in all, they share it.
         """
-        p, k = self.probabilities, self.k
+        p, k = self.probabilities.copy(), self.k
         least = np.array(hidden) * min(_MOST_HIDDEN / max(sum(hidden), _MOST_HIDDEN), 1.0)
         raised = np.maximum(least - p[:k], 0.0)
         if not raised.any():
@@ -178,7 +181,7 @@ class ExplanationBelief:
 
     def forget_origin(self, direction: int) -> "ExplanationBelief":
         """Return the belief with the visible mass that came from a direction counted as from elsewhere."""
-        p, k = self.probabilities, self.k
+        p, k = self.probabilities.copy(), self.k
         p[2 * k] += p[k + direction]
         p[k + direction] = 0.0
         return replace(self, log_probabilities=_logs(p))

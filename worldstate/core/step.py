@@ -284,6 +284,7 @@ def _ruled(
     # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
     log_prior = np.log(model.policy.reference_prior)
     instant = posterior_of(log_prior, said, answer)
+    heard = instant if isinstance(answer, Unqueried) else posterior_of(log_prior, said, _NO_LOOK)
     held = instant.hidden_total >= model.policy.gamma_at(memory.threshold.shift_nats)
     run = next((one.run for one in memory.rules if one.source == source), 0)
     rule = replace(model.policy.rule(), run=run).advance(held)
@@ -292,7 +293,7 @@ def _ruled(
     return replace(
         memory,
         instant=Instant.of(instant),
-        heard_nats=posterior_of(log_prior, said, _NO_LOOK).log_lambda,
+        heard_nats=heard.log_lambda,
         rules=tuple(sorted(rules, key=attrgetter("source"))),
     )
 
