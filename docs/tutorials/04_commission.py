@@ -8,8 +8,8 @@ from tutorial_options import tutorial_options
 from worldstate import MicrophoneArray
 from worldstate.adapters import save_model
 from worldstate.commissioning.commission import commission, exam_of
-from worldstate.commissioning.exam_report import exam_figures, write_exam_figure
-from worldstate.commissioning.plan import CommissionSettings, quick_settings
+from worldstate.commissioning.heard_stream import CommissionSettings, quick_settings
+from worldstate.commissioning.stream_exam import exam_figures, write_exam_figure
 
 CORNERS = [(x, y, 0.0) for x in (0.1, -0.1) for y in (0.1, -0.1)]
 # The whole plan for 4 microphones is: worldstate model make --array mics.csv --out my_model.json --onsets 20

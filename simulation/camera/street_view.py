@@ -1,16 +1,307 @@
 """The street as the camera sees it without a vehicle: ground, side walls, corners, what stands opposite."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from worldstate.ground.typing import BoolArray, Float32Array, ImageArray
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageArray, IndexArray
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.route import ARRAY_HEIGHT_M
 
-from .rays import OVERSAMPLING, Panel, Patch, View, cast_panels, reduced
-from .textures import Facade, asphalt, flags, grass, leaves, paving, smooth_noise, tinted
+# From two coordinates on a surface to red, green, blue in 0..255, shape (..., 3).
+Paint = Callable[[Float32Array, Float32Array], Float32Array]
+
+OVERSAMPLING = 2  # rays across a pixel and down
+NEAREST_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A rectangle of the image in rays: rows from `top` to `bottom`, columns from `left` to `right`."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """For indexing an array of rays."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    @property
+    def pixels(self) -> tuple[slice, slice]:
+        """For indexing an image; whole pixels only."""
+        n = OVERSAMPLING
+        return slice(self.top // n, self.bottom // n), slice(self.left // n, self.right // n)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A pinhole camera with a few rays a pixel."""
+
+    camera: PinholeCamera  # Size of the image, angle of view, place and direction
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of rays."""
+        return OVERSAMPLING * self.camera.height_px, OVERSAMPLING * self.camera.width_px
+
+    @property
+    def whole(self) -> Patch:
+        """All of the image."""
+        return Patch(0, self.shape[0], 0, self.shape[1])
+
+    @property
+    def focal(self) -> float:
+        """Focal length in rays."""
+        return 0.5 * self.shape[1] / math.tan(self.camera.half_angle_rad)
+
+    def rays(self, patch: Patch) -> Float32Array:
+        """Directions in `base_link`, one unit long along the optical axis, shape (rows, columns, 3)."""
+        rows, columns = self.shape
+        left = (0.5 * columns - 0.5 - np.arange(patch.left, patch.right)) / self.focal
+        up = (0.5 * rows - 0.5 - np.arange(patch.top, patch.bottom)) / self.focal
+        axes = self._axes
+        rays = axes[0] + left[None, :, None] * axes[1] + up[:, None, None] * axes[2]
+        return np.asarray(rays, np.float32)
+
+    def around(self, points_m: FloatArray) -> Patch | None:
+        """Return whole pixels around the projection of points ahead, (n, 3); None where it is outside."""
+        ahead, left, up = (self._axes @ (points_m - self.camera.position_m).T).astype(np.float64)
+        ahead = np.maximum(ahead, NEAREST_M)
+        rows, columns = self.shape
+        across = 0.5 * columns - self.focal * left / ahead
+        down = 0.5 * rows - self.focal * up / ahead
+        low, high = _whole(across, columns)
+        top, bottom = _whole(down, rows)
+        return Patch(top, bottom, low, high) if low < high and top < bottom else None
+
+    @property
+    def _axes(self) -> FloatArray:
+        """Forward, left and up, shape (3, 3)."""
+        yaw, pitch = self.camera.yaw_rad, self.camera.pitch_rad
+        sin_yaw, cos_yaw, sin_pitch, cos_pitch = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
+        forward = [cos_yaw * cos_pitch, sin_yaw * cos_pitch, sin_pitch]
+        up = [-cos_yaw * sin_pitch, -sin_yaw * sin_pitch, cos_pitch]
+        return np.array([forward, [-sin_yaw, cos_yaw, 0.0], up])
+
+
+def _whole(values: FloatArray, limit: int) -> tuple[int, int]:
+    """First and last ray of the pixels that hold all values, within the image."""
+    n = OVERSAMPLING
+    low, high = np.clip([values.min(), values.max()], -n, limit + n)
+    return max(int(low) // n * n, 0), min((int(high) // n + 1) * n, limit)
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A rectangle across one axis, painted."""
+
+    axis: int  # 0, 1 or 2: the coordinate that is constant
+    at_m: float  # Its value
+    # Ranges of the two others, in the order of the axes.
+    limits_m: tuple[tuple[float, float], tuple[float, float]]
+    paint: Paint  # Colour by those two coordinates
+
+
+def cast_panels(
+    view: View, patch: Patch, panels: list[Panel], sky: Paint
+) -> tuple[Float32Array, Float32Array]:
+    """Paint a patch of rays with the nearest panel that each meets, or the sky."""
+    rays, eye = view.rays(patch), view.camera.position_m
+    image = sky(rays[..., 1] / rays[..., 0], rays[..., 2] / rays[..., 0])
+    depth = np.full(rays.shape[:2], np.inf, np.float32)
+    for panel in panels:
+        first, second = (axis for axis in range(3) if axis != panel.axis)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = (panel.at_m - eye[panel.axis]) / rays[..., panel.axis]
+            a, b = (eye[axis] + reach * rays[..., axis] for axis in (first, second))
+        (a_low, a_high), (b_low, b_high) = panel.limits_m
+        met = (reach > NEAREST_M) & (reach < depth)
+        met &= (a >= a_low) & (a <= a_high) & (b >= b_low) & (b <= b_high)
+        image[met] = panel.paint(a[met], b[met])
+        depth[met] = reach[met]
+    return image, depth
+
+
+def cast_solid(
+    rays: Float32Array, eye_m: FloatArray, normals: FloatArray, offsets: FloatArray
+) -> tuple[Float32Array, IndexArray]:
+    r"""Meet a convex solid :math:`\{p : n_k \cdot p \le o_k\}`.
+
+    Shapes: rays (rows, columns, 3), eye_m (3,), normals, offsets (K, 3), returns (rows, columns).
+    """
+    enter, leave = np.full(rays.shape[:2], -np.inf, np.float32), np.full(rays.shape[:2], np.inf, np.float32)
+    face = np.zeros(rays.shape[:2], np.intp)
+    for number, (normal, offset) in enumerate(zip(normals.astype(np.float32), offsets, strict=True)):
+        gap = np.float32(offset - normal @ eye_m)
+        towards = rays @ normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = gap / towards
+        # A ray along a face never meets it; outside of that face it misses the solid.
+        leave[(towards == 0.0) & (gap < 0.0)] = -np.inf
+        np.minimum(leave, reach, out=leave, where=towards > 0.0)
+        later = (towards < 0.0) & (reach > enter)
+        enter[later], face[later] = reach[later], number
+    enter[(enter > leave) | (enter <= NEAREST_M)] = np.inf
+    return enter, face
+
+
+def reduced(image: Float32Array) -> Float32Array:
+    """Average the rays of each pixel, (rows, columns, 3) to (height, width, 3).
+
+    Examples
+    --------
+    >>> reduced(np.arange(12, dtype=np.float32).reshape(2, 2, 3))
+    array([[[4.5, 5.5, 6.5]]], dtype=float32)
+    """
+    n = OVERSAMPLING
+    total = sum(image[i::n, j::n] for i in range(n) for j in range(n))
+    return np.asarray(total / np.float32(n * n), np.float32)
+
+
+Colour = tuple[float, float, float]
+
+BRICK_M, COURSE_M, JOINT_M = 0.21, 0.065, 0.01
+STOREY_M = 2.9
+OPENING_TOP_M, FRAME_M = 2.25, 0.07
+FRAME: Colour = (196.0, 194.0, 188.0)
+SILL: Colour = (168.0, 164.0, 156.0)
+GLASS: Colour = (58.0, 66.0, 74.0)
+
+
+def cell_noise(a: ArrayLike, b: ArrayLike, seed: int) -> Float32Array:
+    """Draw a number in [0, 1) for every whole pair of coordinates, always the same for the same seed.
+
+    Examples
+    --------
+    >>> once, again = cell_noise([0.0, 1.0], [2.0, 2.0], 1), cell_noise([0.0, 1.0], [2.0, 2.0], 1)
+    >>> bool((once == again).all()), bool(once[0] != once[1])
+    (True, True)
+    """
+    i, j = (np.floor(np.asarray(x)).astype(np.int64).astype(np.uint32) for x in (a, b))
+    mixed = i * np.uint32(0x9E3779B1) + j * np.uint32(0x85EBCA77) + np.uint32(seed * 2654435761 & 0xFFFFFFFF)
+    for shift, factor in ((15, 0x2C1B3C6D), (12, 0x297A2D39)):
+        mixed = (mixed ^ (mixed >> np.uint32(shift))) * np.uint32(factor)
+    return np.asarray((mixed ^ (mixed >> np.uint32(15))) / np.float32(2**32), np.float32)
+
+
+def smooth_noise(a: Float32Array, b: Float32Array, cell_m: float, seed: int) -> Float32Array:
+    """Noise in [0, 1) without edges, features of about `cell_m`."""
+    x, y = a / np.float32(cell_m), b / np.float32(cell_m)
+    left, low = np.floor(x), np.floor(y)
+    fx, fy = _ease(x - left), _ease(y - low)
+    corners = [[cell_noise(left + i, low + j, seed) for i in (0, 1)] for j in (0, 1)]
+    below, above = ((1.0 - fx) * pair[0] + fx * pair[1] for pair in corners)
+    return np.asarray((1.0 - fy) * below + fy * above, np.float32)
+
+
+def _ease(t: Float32Array) -> Float32Array:
+    return t * t * (3.0 - 2.0 * t)
+
+
+def tinted(colour: Colour, shade: ArrayLike) -> Float32Array:
+    """Return a colour times a shade of any shape, with a last axis of three."""
+    return np.asarray(np.asarray(shade, np.float32)[..., None] * np.array(colour, np.float32), np.float32)
+
+
+def asphalt(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
+    """Paint asphalt: dark, mottled, with patches."""
+    patches = np.where(smooth_noise(a, b, 2.7, seed) > 0.62, -0.07, 0.0)
+    shade = (
+        0.85 + 0.16 * smooth_noise(a, b, 0.6, seed + 1) + 0.22 * (cell_noise(a / 0.02, b / 0.02, seed) - 0.5)
+    )
+    return tinted((96.0, 97.0, 99.0), shade + patches)
+
+
+def paving(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
+    """Paint paving bricks in courses, brown grey."""
+    return tinted((124.0, 108.0, 98.0), _courses(a, b, 0.2, 0.1, seed))
+
+
+def flags(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
+    """Paint concrete flags of 30 cm."""
+    return tinted((150.0, 148.0, 143.0), _courses(a, b, 0.3, 0.3, seed))
+
+
+def grass(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
+    """Paint a verge."""
+    shade = 0.75 + 0.3 * smooth_noise(a, b, 1.3, seed) + 0.3 * (cell_noise(a / 0.03, b / 0.03, seed) - 0.5)
+    return tinted((92.0, 108.0, 70.0), shade)
+
+
+def leaves(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
+    """Paint a hedge."""
+    shade = 0.6 + 0.5 * smooth_noise(a, b, 0.25, seed) + 0.3 * (cell_noise(a / 0.06, b / 0.06, seed) - 0.5)
+    return tinted((70.0, 84.0, 56.0), shade)
+
+
+def brick(a: Float32Array, b: Float32Array, colour: Colour, seed: int) -> Float32Array:
+    """Paint a wall in stretcher bond, a along it, b up."""
+    weather = 0.9 + 0.2 * smooth_noise(a, b, 1.8, seed + 7)
+    return tinted(colour, weather * _courses(a, b, BRICK_M, COURSE_M, seed))
+
+
+def _courses(a: Float32Array, b: Float32Array, length_m: float, height_m: float, seed: int) -> Float32Array:
+    """Shade of stones in courses, every other one half a stone along, joints darker."""
+    course = np.floor(b / np.float32(height_m))
+    along = a / np.float32(length_m) + 0.5 * np.mod(course, 2.0)
+    shade = 0.85 + 0.3 * cell_noise(along, course, seed)
+    joint = (np.mod(along, 1.0) < JOINT_M / length_m) | (np.mod(b / height_m, 1.0) < JOINT_M / height_m)
+    return np.where(joint, 0.72, shade).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Facade:
+    """A house front: brick, windows in every storey, doors at the ground."""
+
+    colour: Colour  # Of the brick
+    bay_m: float  # Distance between windows
+    foot_m: float  # Coordinate of the ground
+    brightness: float  # Of the light that falls on it
+    seed: int  # Which house
+
+    def paint(self, a: Float32Array, b: Float32Array) -> Float32Array:
+        """Colours at places along the wall and up."""
+        up = b - np.float32(self.foot_m)
+        image = brick(a, up, self.colour, self.seed)
+        bay, storey = np.floor(a / self.bay_m), np.floor(up / STOREY_M)
+        x = a - (bay + 0.5) * np.float32(self.bay_m)
+        y = up - storey * np.float32(STOREY_M)
+        doors = (storey < 1) & (cell_noise(bay, storey, self.seed + 1) < 0.3)
+        drawn = cell_noise(bay + np.floor(1.5 * x), np.floor(0.7 * y), self.seed + 3) < 0.3
+        mirrored = 0.75 + 0.5 * np.clip((y - 0.9) / 1.4, 0.0, 1.0)
+        for opening, here in ((WINDOW, ~doors), (DOOR, doors)):
+            half, low = opening.half_m, opening.low_m
+            image[here & (np.abs(x) < half) & (y > low) & (y < OPENING_TOP_M)] = FRAME
+            pane = here & (np.abs(x) < half - FRAME_M) & (np.abs(x) > 0.5 * FRAME_M)
+            pane &= (y > low + FRAME_M) & (y < OPENING_TOP_M - FRAME_M)
+            image[pane] = tinted(opening.colour, mirrored * np.where(drawn, 1.5, 1.0))[pane]
+            image[here & (np.abs(x) < half + 0.08) & (y > low - opening.sill_m) & (y < low)] = SILL
+        # Walls are darker at their foot, where less of the sky is seen.
+        light = self.brightness * (0.72 + 0.28 * np.clip(up / 1.5, 0.0, 1.0))
+        return np.asarray(image * light[..., None], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _Opening:
+    """Half the width of a hole in a wall, where it begins, the height of its sill, what fills it."""
+
+    half_m: float
+    low_m: float
+    sill_m: float
+    colour: Colour
+
+
+WINDOW = _Opening(0.6, 0.95, 0.1, GLASS)
+DOOR = _Opening(0.45, 0.0, 0.0, (70.0, 82.0, 78.0))
+
 
 ROAD_Z_M = -ARRAY_HEIGHT_M
 FAR_M = 150.0

@@ -11,9 +11,7 @@ import numpy as np
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, TextArray
 from worldstate.simulation.scene.vehicle import AXLES_BEHIND_FRONT_M, HEIGHT_M, LENGTH_M, WIDTH_M
 
-from .rays import Patch, cast_solid, reduced
-from .street_view import ROAD_Z_M, StreetView
-from .textures import GLASS, Colour, tinted
+from .street_view import GLASS, ROAD_Z_M, Colour, Patch, StreetView, cast_solid, reduced, tinted
 
 PAINTS: tuple[Colour, ...] = (
     (206.0, 208.0, 208.0), (148.0, 152.0, 156.0), (46.0, 48.0, 52.0), (78.0, 84.0, 92.0),

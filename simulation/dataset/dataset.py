@@ -30,20 +30,29 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
-from worldstate.simulation.camera.rays import View
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
-from worldstate.simulation.camera.street_view import paint_street
+from worldstate.simulation.camera.street_view import View, paint_street
 from worldstate.simulation.camera.vehicle_view import PAINTS, Car, add_car, with_parked_car
-from worldstate.simulation.scene.drawn_sounds import with_sounds
-from worldstate.simulation.scene.junction import MOVING_SITES, SITES, Site
-from worldstate.simulation.scene.places import PLACES, place
+from worldstate.simulation.scene.junction import MOVING_SITES, PLACES, SITES, Site, place
 from worldstate.simulation.scene.presets import preset
-from worldstate.simulation.scene.settings import APPROACHES, SimulationSettings, draw_settings, rate_for
+from worldstate.simulation.scene.settings import (
+    APPROACHES,
+    SimulationSettings,
+    draw_settings,
+    rate_for,
+    with_sounds,
+)
 from worldstate.simulation.scene.vehicle import LENGTH_M, WIDTH_M
 
 from .plan import DatasetSettings, Plan
-from .recording import SimulatedRecording, simulate_recording
-from .recording_folder import put_in_place, refuse_foreign, sound_writer, write_json
+from .recording import (
+    SimulatedRecording,
+    put_in_place,
+    refuse_foreign,
+    simulate_recording,
+    sound_writer,
+    write_json,
+)
 
 # OVAD's location numbers 00 to 09, then the other places.
 LOCATIONS = (*SITES, *MOVING_SITES, *(place(name).site.name for name in PLACES))

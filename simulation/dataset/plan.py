@@ -7,12 +7,10 @@ import numpy as np
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation.scene.junction import MOVING_SITES, SITES
+from worldstate.simulation.scene.junction import MOVING_SITES, PLACES, SITES, place, place_of
 from worldstate.simulation.scene.kinds import vehicle_kind
-from worldstate.simulation.scene.places import PLACES, place, place_of
 from worldstate.simulation.scene.presets import DEFAULT_PRESET, preset
-from worldstate.simulation.scene.settings import MAX_SOUNDS
-from worldstate.simulation.scene.sound_settings import sound_kind
+from worldstate.simulation.scene.settings import MAX_SOUNDS, sound_kind
 
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000

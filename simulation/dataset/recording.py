@@ -1,14 +1,20 @@
 """One recording: sound at every microphone, detections of the camera, and the truth."""
 
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import soundfile
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
+from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.simulation.camera.simulated_detector import (
     Frame,
@@ -18,8 +24,8 @@ from worldstate.simulation.camera.simulated_detector import (
     park,
 )
 from worldstate.simulation.emitters.placed_sound import add_signal, add_sound
-from worldstate.simulation.scene.driving import trajectories
-from worldstate.simulation.scene.settings import SimulationSettings
+from worldstate.simulation.scene.driving import comes_into_view_s, trajectories
+from worldstate.simulation.scene.settings import SimulationSettings, SoundSettings
 from worldstate.simulation.scene.vehicle import Trajectory
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
@@ -28,7 +34,125 @@ from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.static_field import StaticSources
 from worldstate.simulation.sound.vehicle_sound import add_vehicle
 
-from .truth import describe
+SCHEMA = "worldstate.simulation.truth"
+SCHEMA_VERSION = "1.2.0"
+
+
+def describe(
+    settings: SimulationSettings, frames_s: FloatArray, seen: list[Trajectory], sights: list[BoolArray]
+) -> dict[str, Any]:
+    """Return settings and, per camera frame, where the vehicles and the ego are, ready for JSON."""
+    # Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`,
+    # `azimuth_rad` (of the front axle, left positive), `range_m`, `line_of_sight` (whether the front is in
+    # the camera's view: between the edges of its image, and nothing stands before it), `time_to_visible_s`
+    # (negative afterwards, null where it never comes into view). `frames` are those of the vehicle that
+    # `approach` names, `others` those of the rest. Without the former there are no frames and `entry_s` is
+    # null. `ego` has the ego's way along its street, 0 where it stops. `sounds` has the azimuth and range of
+    # what else sounds at a place, and when.
+    ego_x = settings.ego.x_m(frames_s)
+    entries = [comes_into_view_s(settings, vehicle) for vehicle in settings.traffic]
+    frames = [_frames(*one, ego_x) for one in zip(seen, sights, entries, strict=True)]
+    named = 0 if settings.approach == "none" else 1
+    return {
+        "schema": SCHEMA,
+        "version": SCHEMA_VERSION,
+        "settings": asdict(settings),
+        "frame_rate_hz": FRAME_RATE_HZ,
+        "entry_s": entries[0] if named else None,
+        "frames": frames[0] if named else [],
+        "others": frames[named:],
+        "sounds": [_sound(sound, frames_s, ego_x) for sound in settings.sounds],
+        "ego": {"x_m": ego_x.round(6).tolist(), "speed_mps": settings.ego.at_mps(frames_s).round(6).tolist()},
+    }
+
+
+def _sound(sound: SoundSettings, frames_s: FloatArray, ego_x_m: FloatArray) -> dict[str, Any]:
+    sounding = (frames_s >= sound.start_s) & (frames_s < sound.end_s)
+    told = {
+        "kind": sound.kind,
+        "label": sound.what.label,
+        "of": sound.what.origin,
+        "start_s": sound.start_s,
+        "end_s": sound.end_s,
+        "sounding": sounding.tolist(),
+    }
+    if not sound.has_place:
+        return told
+    x, y = sound.at(frames_s)
+    return told | {
+        "azimuth_rad": np.arctan2(y, x - ego_x_m).round(6).tolist(),
+        "range_m": np.hypot(y, x - ego_x_m).round(6).tolist(),
+    }
+
+
+def _frames(
+    seen: Trajectory, sight: BoolArray, entry_s: float | None, ego_x_m: FloatArray
+) -> list[dict[str, Any]]:
+    axle_x, axle_y = seen.behind(seen.kind.axles_m[0])
+    columns = {
+        "time_s": seen.time_s,
+        "speed_mps": seen.speed_mps,
+        "azimuth_rad": np.arctan2(axle_y, axle_x - ego_x_m),
+        "range_m": np.hypot(axle_y, axle_x - ego_x_m),
+    }
+    ahead = seen.behind(0.0)[0] - ego_x_m
+    return [
+        {name: round(float(values[i]), 6) for name, values in columns.items()}
+        | {"position_m": [round(float(ahead[i]), 6), round(float(seen.front_y_m[i]), 6)]}
+        | {"line_of_sight": bool(sight[i])}
+        | {"time_to_visible_s": None if entry_s is None else round(entry_s - float(seen.time_s[i]), 6)}
+        for i in range(len(sight))
+    ]
+
+
+WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
+SAMPLE_BYTES = 3
+
+
+def sound_format(samples: int, channels: int) -> str:
+    """Return the container that holds so many samples of 24 bits.
+
+    Examples
+    --------
+    >>> sound_format(480_000, 56), sound_format(172_800_000, 56)
+    ('WAV', 'RF64')
+    """
+    return "RF64" if SAMPLE_BYTES * samples * channels > WAV_LIMIT_BYTES else "WAV"
+
+
+@contextmanager
+def sound_writer(
+    path: Path, samples: int, channels: int, sample_rate_hz: float
+) -> Iterator[soundfile.SoundFile]:
+    """Open a file for so many samples of 24 bits, which are written at once or block by block."""
+    kind = sound_format(samples, channels)
+    try:
+        with soundfile.SoundFile(path, "w", round(sample_rate_hz), channels, "PCM_24", format=kind) as file:
+            yield file
+    except soundfile.SoundFileError as error:
+        raise InputFileError(
+            path, f"expected to write {samples} samples, the disk may be full: {error}"
+        ) from error
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write an object, whose numbers are all finite, on one line."""
+    path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def refuse_foreign(target: Path) -> None:
+    """Refuse to replace a folder that holds no simulated truth."""
+    if target.exists() and not (target / TRUTH_NAME).is_file():
+        raise InputFileError(target, "expected a free name or a simulated recording, found something else")
+
+
+def put_in_place(target: Path, finished: Path) -> None:
+    """Put a finished folder in the place of an old one, which goes with the parent of the new one."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if target.exists():
+        target.replace(finished.with_suffix(".old"))
+    finished.replace(target)
+
 
 FULL_SCALE_PA = 20.0  # 120 dB, where measurement microphones of this kind end
 HEAD_START_S = 2.0  # emission begins this long before the recording: travel time and late field

@@ -7,11 +7,24 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
-from worldstate.simulation.scene.sound_settings import SoundKind
+from worldstate.simulation.scene.settings import SoundKind
 
-from .people import steps, voice
 from .signals import gate
-from .tonal_sounds import beeper, bell, bicycle_bell, birds, drill, horn, music, saw, siren, tone, wail
+from .syntheses import (
+    beeper,
+    bell,
+    bicycle_bell,
+    birds,
+    drill,
+    horn,
+    music,
+    saw,
+    siren,
+    steps,
+    tone,
+    voice,
+    wail,
+)
 
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]
 

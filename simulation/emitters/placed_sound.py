@@ -8,17 +8,14 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, split_octaves
 from worldstate.simulation.scene.presets import Preset
-from worldstate.simulation.scene.sound_settings import SoundKind, SoundSettings, sound_kind
+from worldstate.simulation.scene.settings import SoundKind, SoundSettings, sound_kind
 from worldstate.simulation.scene.vehicle import Trajectory
-from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.diffraction import screen_attenuation_db
-from worldstate.simulation.sound.emission import Emission, MovingSource
-from worldstate.simulation.sound.late_field import add_late_sound
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings
-from worldstate.simulation.sound.scatter import scattering
-from worldstate.simulation.sound.scattered_sound import add_scattered
-from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.scatter import add_scattered, scattering
+from worldstate.simulation.sound.static_field import StaticSources, add_late_sound
 
 from .emitter import emitted
 from .weather import add_gusts, add_rain

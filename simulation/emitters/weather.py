@@ -8,7 +8,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, level_curve
-from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.scene.settings import SoundSettings
 from worldstate.simulation.sound.background import noise_frequencies, shaped_noise, wind_density
 from worldstate.simulation.sound.receiver import Receiver
 from worldstate.simulation.sound.static_field import (

@@ -12,9 +12,8 @@ from worldstate.simulation.scene.occluders import OccludingBody, detours, walls
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
 
-from .air import air_gain, ground_gain
-from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
-from .emission import MovingSource
+from .delay import MovingSource
+from .diffraction import SPEED_OF_SOUND_MPS, air_gain, ground_gain, screen_attenuation_db
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls, trace_paths
 from .receiver import Receiver, Surroundings, add_along, add_to_all, add_turning, in_own_street
 from .static_field import StaticSources

@@ -8,14 +8,11 @@ from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.simulation.scene.presets import Preset
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
 
-from .delay import KNOT_SAMPLES
-from .emission import Emission, MovingSource
-from .late_field import add_late_sound
+from .delay import KNOT_SAMPLES, Emission, MovingSource
 from .propagation import ANY_ORDER, add_sources
 from .receiver import Receiver, Surroundings
-from .scatter import scattering
-from .scattered_sound import add_scattered
-from .static_field import StaticSources
+from .scatter import add_scattered, scattering
+from .static_field import StaticSources, add_late_sound
 
 # From so many reflections on a vehicle is one point; its parts would cost three times as much. Not from 2 on:
 # whether the second image is lit, on the vehicle's own side, hangs on a metre.

@@ -24,7 +24,7 @@ from worldstate.simulation.scene.vehicle import (
     propulsion_level_db,
     rolling_level_db,
 )
-from worldstate.simulation.sound.late_field import LATE_DISTANCE_M, late_level_db
+from worldstate.simulation.sound.static_field import LATE_DISTANCE_M, late_level_db
 
 STEP_M = 0.05
 ACCELERATION_MPS2, COMFORTABLE_MPS2 = 1.5, 2.0  # comfortable values of drivers in towns

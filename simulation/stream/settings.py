@@ -11,8 +11,7 @@ from worldstate.simulation.scene.junction import Site, ego_moves
 from worldstate.simulation.scene.kinds import KINDS
 from worldstate.simulation.scene.presets import Preset, preset
 from worldstate.simulation.scene.route import EgoMotion
-from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SAMPLE_RATE_HZ
-from worldstate.simulation.scene.sound_settings import SIGNALS, SOUNDS
+from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SAMPLE_RATE_HZ, SIGNALS, SOUNDS
 
 # What a flow is, is drawn in `manoeuvres.py`; these bring vehicles out of a hidden arm.
 HAZARDS = ("left", "right", "both", "waits", "queue")

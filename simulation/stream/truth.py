@@ -22,7 +22,7 @@ from worldstate.simulation.camera.simulated_detector import (
     lost,
     park,
 )
-from worldstate.simulation.dataset.truth import SCHEMA, SCHEMA_VERSION
+from worldstate.simulation.dataset.recording import SCHEMA, SCHEMA_VERSION
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.route import EgoMotion
 

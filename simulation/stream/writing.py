@@ -1,6 +1,6 @@
-"""A stream on disk: sound block by block, array, detections and truth in one folder."""
+"""A continuous stream: all about it is drawn before any of it is rendered, and written while it is."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,8 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.camera.simulated_detector import to_json
-from worldstate.simulation.dataset.recording_folder import (
+from worldstate.simulation.dataset.recording import (
+    FULL_SCALE_PA,
     put_in_place,
     refuse_foreign,
     sound_writer,
@@ -24,9 +25,8 @@ from worldstate.simulation.dataset.recording_folder import (
 )
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 
-from .arrivals import SoundEvent
-from .drawn_stream import DrawnStream, draw_stream
-from .rendering import Block
+from .arrivals import SoundEvent, draw_events, draw_sounds
+from .rendering import Block, StreamScene, draw_microphones, render_blocks, stream_ambience
 from .settings import StreamSettings
 from .truth import (
     EVENTS_NAME,
@@ -36,7 +36,47 @@ from .truth import (
     describe_stream,
     detected_frames,
     rows_csv,
+    vehicle_truth,
 )
+
+ARRIVALS, CHANNELS, LEVEL, SOUNDS = 0, 1, 2, 6  # purposes of generators; 3 and 4 are the pieces'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnStream:
+    """Who comes when, and what hears it; its sound can be written or listened to as it is rendered."""
+
+    scene: StreamScene
+    array: MicrophoneArray
+    vehicles: tuple[VehicleTruth, ...]
+    sounds: tuple[SoundEvent, ...]
+
+    def blocks(self, jobs: int = 1) -> Generator[Block, None, None]:
+        """Yield its sound from the beginning."""
+        return render_blocks(self.scene, [*(one.event for one in self.vehicles), *self.sounds], jobs)
+
+    def recorded(self, block: Block) -> Float32Array:
+        """Return what the converters make of a block, shape (n, M), full scale 1."""
+        # Gains are the converters': they come after everything that sounds, and are in no level of the truth.
+        gains = (self.scene.microphones.gains / FULL_SCALE_PA).astype(np.float32)[:, None]
+        return np.asarray(np.clip(block.pressure_pa * gains, -1.0, 1.0).T)
+
+
+def draw_stream(settings: StreamSettings, array: MicrophoneArray) -> DrawnStream:
+    """Draw vehicles, other sounds, background and microphones of a stream, each from its own generator."""
+    arrivals, drawn = settings.generator(ARRIVALS), settings
+    events = draw_events(drawn.site, drawn.traffic, drawn.preset, drawn.duration_s, arrivals, drawn.ego)
+    return DrawnStream(
+        StreamScene(
+            settings,
+            stream_ambience(settings, settings.generator(LEVEL)),
+            draw_microphones(settings, array, settings.generator(CHANNELS)),
+        ),
+        array,
+        tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events)),
+        tuple(draw_sounds(settings, array.n_microphones, settings.generator(SOUNDS))),
+    )
+
 
 LINE_S = 0.5
 FFT_SAMPLES = 256

@@ -8,7 +8,7 @@ import pytest
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.commissioning.commission import windows_of_array
-from worldstate.commissioning.plan import CommissionSettings
+from worldstate.commissioning.heard_stream import CommissionSettings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import OutOfDomainError
 

@@ -7,11 +7,15 @@ from worldstate_lab.cli.foreign import guard_exam
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
 from worldstate.commissioning.guard_training import (
     FLAGGED,
+    FOREIGN,
+    SIGNALS,
+    STREET,
+    SoundRows,
     fit_guard,
+    sound_rows,
     street_excesses,
     threshold_of,
 )
-from worldstate.commissioning.sound_rows import FOREIGN, SIGNALS, STREET, SoundRows, sound_rows
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.serialisation import encode

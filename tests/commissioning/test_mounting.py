@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.commissioning.exam_report import in_view_bearings
-from worldstate.commissioning.heard_stream import HeardStream, hear_stream
-from worldstate.commissioning.plan import mountings
+from worldstate.commissioning.heard_stream import HeardStream, hear_stream, mountings
+from worldstate.commissioning.stream_exam import in_view_bearings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation import site

@@ -6,8 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior
-from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.plan import CommissionSettings, exam_streams, learned_streams
+from worldstate.commissioning.heard_stream import (
+    CommissionSettings,
+    HeardStream,
+    exam_streams,
+    learned_streams,
+)
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import (
     LOUDEST,

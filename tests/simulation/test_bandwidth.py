@@ -30,12 +30,10 @@ from worldstate.simulation.scene.settings import (
 )
 from worldstate.simulation.scene.vehicle import LIGHT, SOURCE_HEIGHT_M, SourceSignal, drive, emit
 from worldstate.simulation.sound.background import add_background
-from worldstate.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings, standing_m
-from worldstate.simulation.sound.scatter import scattering
-from worldstate.simulation.sound.scattered_sound import add_scattered
+from worldstate.simulation.sound.scatter import add_scattered, scattering
 from worldstate.simulation.sound.static_field import StaticSources
 
 FACTOR, ARRAY = 8, ovad_array()

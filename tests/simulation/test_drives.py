@@ -13,12 +13,11 @@ from worldstate.simulation import preset
 from worldstate.simulation.scene.junction import drawn_site
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.route import EgoMotion
-from worldstate.simulation.stream.ambience import draw_microphones
 from worldstate.simulation.stream.arrivals import STANDING, VehicleEvent
-from worldstate.simulation.stream.drawn_stream import draw_stream
-from worldstate.simulation.stream.event_sound import event_sound, loudness_db
 from worldstate.simulation.stream.manoeuvres import Driver, emerges
+from worldstate.simulation.stream.rendering import draw_microphones, event_sound, loudness_db
 from worldstate.simulation.stream.settings import StreamSettings, traffic_named
+from worldstate.simulation.stream.writing import draw_stream
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
 RATE_HZ = 3000.0

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.signal import bilinear_zpk, find_peaks, sosfilt, stft, zpk2sos
 
 from worldstate.simulation.emitters.emitter import SYNTHESES, emitted
-from worldstate.simulation.emitters.tonal_sounds import saw, saw_motion
+from worldstate.simulation.emitters.syntheses import saw, saw_motion
 from worldstate.simulation.scene.octave_bands import split_octaves
-from worldstate.simulation.scene.sound_settings import MICROPHONES, SOUNDS
+from worldstate.simulation.scene.settings import MICROPHONES, SOUNDS
 
 FS = 32_000.0
 SECONDS = 6
@@ -174,7 +174,7 @@ def test_a_low_rate_hears_the_same_sound_band_limited(name):
 
 def test_an_unknown_sound_is_refused_by_name():
     from worldstate.ground.errors import InvalidArgumentError
-    from worldstate.simulation.scene.sound_settings import sound_kind
+    from worldstate.simulation.scene.settings import sound_kind
 
     with pytest.raises(InvalidArgumentError, match="vuvuzela"):
         sound_kind("vuvuzela")

@@ -29,10 +29,9 @@ from worldstate.simulation import (
 )
 from worldstate.simulation.emitters.emitter import emitted
 from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, directivity
-from worldstate.simulation.scene.drawn_sounds import with_sounds
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import split_octaves
-from worldstate.simulation.scene.sound_settings import SIGNALS, sound_kind
+from worldstate.simulation.scene.settings import SIGNALS, sound_kind, with_sounds
 from worldstate.simulation.scene.vehicle import drive
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.receiver import Receiver

@@ -25,7 +25,7 @@ from worldstate.simulation import (
     site,
 )
 from worldstate.simulation.camera.simulated_detector import line_of_sight
-from worldstate.simulation.dataset.truth import describe
+from worldstate.simulation.dataset.recording import describe
 from worldstate.simulation.scene.driving import trajectories
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])

@@ -26,8 +26,15 @@ from worldstate.simulation import (
     write_dataset,
     write_recording,
 )
-from worldstate.simulation.camera.rays import Panel, Patch, View, cast_panels, cast_solid
-from worldstate.simulation.camera.street_view import ROAD_Z_M, paint_street
+from worldstate.simulation.camera.street_view import (
+    ROAD_Z_M,
+    Panel,
+    Patch,
+    View,
+    cast_panels,
+    cast_solid,
+    paint_street,
+)
 from worldstate.simulation.camera.vehicle_view import Car, add_car
 from worldstate.simulation.dataset.dataset import (
     camera_frames,

@@ -11,9 +11,8 @@ from worldstate_lab.streets.simulated_windows import RATE_HZ
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.simulation import preset, site
-from worldstate.simulation.scene.ambience import site_ambience
-from worldstate.simulation.scene.junction import Site
-from worldstate.simulation.scene.places import place
+from worldstate.simulation.scene.junction import Site, place
+from worldstate.simulation.scene.presets import site_ambience
 from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.scene.vehicle import Trajectory, drive, load_db
 from worldstate.simulation.sound.background import add_background, opening_images

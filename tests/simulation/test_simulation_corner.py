@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from worldstate.simulation.scene.junction import SITES, Site, site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
-from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, SPEED_OF_SOUND_MPS, edge_gain
-from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.paths import through_mouth, trace_paths
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings

@@ -24,14 +24,12 @@ from worldstate.simulation import (
 from worldstate.simulation.scene.driving import trajectories
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.route import EgoMotion
-from worldstate.simulation.sound import scattered_sound
-from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound import scatter
+from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
-from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings, add_turning
-from worldstate.simulation.sound.scatter import scattering
-from worldstate.simulation.sound.scattered_sound import add_scattered
+from worldstate.simulation.sound.scatter import add_scattered, scattering
 from worldstate.simulation.sound.static_field import StaticSources
 
 FS = 48_000.0
@@ -112,8 +110,8 @@ def test_patches_that_are_left_out_are_not_missed(monkeypatch):
     around = Surroundings(site("DA1"), receiver, 24.0, np.full(8, 0.3))
     source = MovingSource(sound, 12.0, np.linspace(18.0, -5.0, len(sound.knots_s)))
     heard = []
-    for faintest in (scattered_sound.FAINTEST, 0.0):
-        monkeypatch.setattr(scattered_sound, "FAINTEST", faintest)
+    for faintest in (scatter.FAINTEST, 0.0):
+        monkeypatch.setattr(scatter, "FAINTEST", faintest)
         heard.append(np.zeros((2, receiver.samples), np.float32))
         add_scattered(StaticSources(heard[-1], FS), source, around)
     some, every = heard

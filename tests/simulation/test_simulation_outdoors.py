@@ -11,10 +11,10 @@ from scipy.spatial import ConvexHull
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import SimulationSettings, draw_settings, site
 from worldstate.simulation.scene.driving import trajectories
+from worldstate.simulation.scene.junction import place
 from worldstate.simulation.scene.kinds import KINDS, LIGHT, vehicle_kind
 from worldstate.simulation.scene.occluders import OccludingBody, box, detours, hidden_by
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks
-from worldstate.simulation.scene.places import place
 from worldstate.simulation.scene.route import BRAKING_MPS2, EgoMotion
 from worldstate.simulation.scene.vehicle import (
     GEARS_HZ_PER_MPS,
@@ -27,13 +27,13 @@ from worldstate.simulation.scene.vehicle import (
     propulsion_level_db,
     rolling_level_db,
 )
-from worldstate.simulation.sound.air import (
+from worldstate.simulation.sound.diffraction import (
     ROAD_REFLECTION,
+    SPEED_OF_SOUND_MPS,
     absorption_db_per_m,
     air_gain,
     ground_gain,
 )
-from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 
 FS = 48_000.0
 TIME_S = np.linspace(-2.0, 10.0, 4501)

@@ -12,12 +12,13 @@ from worldstate.simulation.sound import propagation
 from worldstate.simulation.sound.delay import (
     KNOT_SAMPLES,
     OVERSAMPLING,
+    Emission,
+    MovingSource,
     Table,
     add_delayed,
     emission_times,
 )
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
-from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.static_field import StaticSources
 

@@ -36,8 +36,7 @@ from worldstate.simulation.camera.simulated_detector import line_of_sight
 from worldstate.simulation.scene.presets import DEFAULT_PRESET, PRESETS
 from worldstate.simulation.scene.vehicle import drive, propulsion_level_db, rolling_level_db
 from worldstate.simulation.sound.background import far_passages_s
-from worldstate.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.paths import trace_paths
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings

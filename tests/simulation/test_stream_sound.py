@@ -24,16 +24,18 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array
 from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.simulation import SITES, preset, site
-from worldstate.simulation.scene.ambience import site_ambience
 from worldstate.simulation.scene.kinds import LIGHT
-from worldstate.simulation.scene.sound_settings import SoundSettings
-from worldstate.simulation.stream.ambience import OVERLAP_S, draw_microphones
+from worldstate.simulation.scene.presets import site_ambience
+from worldstate.simulation.scene.settings import SoundSettings
 from worldstate.simulation.stream.arrivals import Event, SoundEvent, VehicleEvent
-from worldstate.simulation.stream.event_sound import event_sound, loudness_db
 from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver
 from worldstate.simulation.stream.rendering import (
     EVENT,
+    OVERLAP_S,
     StreamScene,
+    draw_microphones,
+    event_sound,
+    loudness_db,
     pieces,
     render_blocks,
     render_piece,

@@ -13,10 +13,10 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.cli.sim.stream_figure import FLOW_COLOURS
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import preset, site
+from worldstate.simulation.scene.junction import place
 from worldstate.simulation.scene.kinds import LIGHT, vehicle_kind
-from worldstate.simulation.scene.places import place
 from worldstate.simulation.scene.route import along
-from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.scene.settings import SoundSettings
 from worldstate.simulation.stream.arrivals import (
     SoundEvent,
     VehicleEvent,

@@ -29,8 +29,17 @@ from worldstate.operations.training.training import TrainingSettings, train_mode
 from worldstate.simulation.stream.settings import StreamSettings
 
 from .guard_training import train_guard
-from .heard_stream import HeardStream, hear_recording, hear_stream
-from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams, mounting_streams, mountings
+from .heard_stream import (
+    HAZARD_FREE,
+    CommissionSettings,
+    HeardStream,
+    exam_streams,
+    hear_recording,
+    hear_stream,
+    learned_streams,
+    mounting_streams,
+    mountings,
+)
 from .road_user_training import train_road_users
 from .sequence_training import LabelledStream, calibrated_margin_s, stream_truth, train_sequence
 from .simulated_windows import (

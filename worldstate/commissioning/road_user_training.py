@@ -24,8 +24,8 @@ from worldstate.simulation.stream.manoeuvres import LEFT, draw_driver, emerges
 from worldstate.simulation.stream.settings import StreamSettings
 from worldstate.simulation.stream.truth import visible_s
 
-from .plan import junction_named
-from .sound_rows import SoundRows, characters, event_and_ambience, fit_softmax, loudness
+from .guard_training import SoundRows, characters, event_and_ambience, fit_softmax, loudness
+from .heard_stream import junction_named
 
 # What the simulator's kinds are to a user.
 CLASS_OF = {

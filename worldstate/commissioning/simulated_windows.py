@@ -27,13 +27,12 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.operations.training.site_references import simulated_beside, with_site_references
 from worldstate.operations.training.training import fit_ensemble
-from worldstate.simulation.scene.places import open_road
+from worldstate.simulation.scene.junction import open_road
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS
 from worldstate.simulation.sound.background import add_background
-from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.ego_sound import ego_noise
-from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings, standing_m
 from worldstate.simulation.sound.static_field import StaticSources

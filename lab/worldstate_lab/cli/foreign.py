@@ -22,9 +22,16 @@ from worldstate.adapters.files.atomic import write_text
 from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar
-from worldstate.commissioning.guard_training import fit_guard, guard_rows, threshold_of
+from worldstate.commissioning.guard_training import (
+    FOREIGN,
+    SIGNALS,
+    STREET,
+    SoundRows,
+    fit_guard,
+    guard_rows,
+    threshold_of,
+)
 from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.sound_rows import FOREIGN, SIGNALS, STREET, SoundRows
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError

@@ -19,8 +19,8 @@ import numpy as np
 from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
-from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.plan import CommissionSettings, learned_streams
+from worldstate.commissioning.guard_training import characters
+from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams
 from worldstate.commissioning.road_user_training import (
     CLASSES,
     FIRST_S,
@@ -32,7 +32,6 @@ from worldstate.commissioning.road_user_training import (
     road_user_rows,
 )
 from worldstate.commissioning.sequence_training import AUDIBLE_DB, ROW_S
-from worldstate.commissioning.sound_rows import characters
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND
 from worldstate.ground.checks import in_range

@@ -17,10 +17,10 @@ from worldstate.commissioning.stream_exam import alarm_outcomes, approaches, tim
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
     SLACK_S,
-    Approach,
     ApproachOutcome,
     ApproachTable,
     Figures,
+    StreamApproach,
     mean_of,
     shortly_before,
 )
@@ -58,7 +58,7 @@ def outcomes(stream: PassedStream) -> list[PassOutcome]:
     return found
 
 
-def _identity(stream: PassedStream, one: Approach) -> bool | None:
+def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
     """Tell whether the entity hidden on the first vehicle's side at T0 is the one seen in its place later."""
     followed, entry_s = stream.followed, one.entries_s[0]
     hop = int(np.searchsorted(followed.time_s, entry_s - SLACK_S)) - 1
@@ -140,7 +140,7 @@ def _ahead(streams: Sequence[PassedStream]) -> Figures:
 
 def _hops_beside(
     streams: Sequence[PassedStream], first_s: float, end_s: float
-) -> Iterator[tuple[PassedStream, Approach, int, float]]:
+) -> Iterator[tuple[PassedStream, StreamApproach, int, float]]:
     """Yield the hops so long after the T0 of loud approaches, with the azimuth of the first vehicle then."""
     for stream in streams:
         for one in approaches(stream.heard):

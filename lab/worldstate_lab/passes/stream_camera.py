@@ -6,8 +6,7 @@ import numpy as np
 
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.plan import junction_named
+from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import AFTER_S
 from worldstate.simulation.camera.simulated_detector import BOX_NOISE_PX, inside, miss_rate, project

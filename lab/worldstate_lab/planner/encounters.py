@@ -9,12 +9,11 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.adapters.files.model_file import Model, model_to_dict
-from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.plan import junction_named
+from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.commissioning.stream_exam import approaches
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.approach_table import Approach
+from worldstate.operations.metrics.approach_table import StreamApproach
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import vehicle_kind
@@ -199,13 +198,13 @@ def joined_encounters(parts: Sequence[Encounters]) -> Encounters:
 
 def recorded_approaches(
     streams: Sequence[BelievedStream], *, quiet: bool
-) -> list[tuple[BelievedStream, Approach]]:
+) -> list[tuple[BelievedStream, StreamApproach]]:
     """Return all approaches of loud vehicles alone, or those with a quiet one among them."""
     return [(stream, one) for stream in streams for one in approaches(stream.heard) if one.quiet is quiet]
 
 
 def approach_encounters(
-    recorded: Sequence[tuple[BelievedStream, Approach]],
+    recorded: Sequence[tuple[BelievedStream, StreamApproach]],
     count: int,
     ego: EgoVehicle,
     rng: np.random.Generator,
@@ -244,7 +243,7 @@ def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.rand
     return joined_encounters(found)
 
 
-def _meets_s(stream: BelievedStream, one: Approach, ego: EgoVehicle) -> float:
+def _meets_s(stream: BelievedStream, one: StreamApproach, ego: EgoVehicle) -> float:
     """Return when an ego that never brakes has to begin to meet the first vehicle of an approach."""
     first = min(stream.ways, key=lambda way: abs(way.entry_s - one.entries_s[0]))
     middle_s = float(np.interp(0.0, -first.to_come_m - 0.5 * first.length_m, first.time_s))

@@ -18,11 +18,9 @@ from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 from worldstate.simulation.scene.presets import Preset, preset
 from worldstate.simulation.scene.vehicle import SourceSignal, drive, emit
-from worldstate.simulation.sound.air import air_gain, ground_gain
 from worldstate.simulation.sound.background import add_background
-from worldstate.simulation.sound.delay import KNOT_SAMPLES, add_delayed, emission_times
-from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
-from worldstate.simulation.sound.emission import Emission
+from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, add_delayed, emission_times
+from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS, air_gain, ground_gain
 from worldstate.simulation.sound.receiver import NEAREST_M, Receiver
 
 from .clip_signatures import ClipSignatures, signature

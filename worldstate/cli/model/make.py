@@ -21,7 +21,7 @@ from worldstate.cli.common.progress import progress_bar
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_table import FeatureTable
     from worldstate.adapters.files.model_file import Model
-    from worldstate.commissioning.plan import CommissionSettings
+    from worldstate.commissioning.heard_stream import CommissionSettings
     from worldstate.frontend.array.microphone_array import MicrophoneArray
     from worldstate.operations.metrics.approach_table import Figures
 
@@ -76,14 +76,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.files.model_file import save_model
     from worldstate.cli.common.output import write_report
     from worldstate.commissioning.commission import LEARNING_STEPS, commission, exam_of
-    from worldstate.commissioning.exam_report import (
+    from worldstate.commissioning.heard_stream import exam_streams, learned_streams
+    from worldstate.commissioning.stream_exam import (
         REFERENCE,
         beside_reference,
         exam_figures,
         mounting_lines,
         write_exam_figure,
     )
-    from worldstate.commissioning.plan import exam_streams, learned_streams
     from worldstate.frontend.array.microphone_array import ovad_array
 
     check_outputs(arguments, "out", "report", figures=("figure",))
@@ -140,8 +140,8 @@ def _mounted(
     array: "MicrophoneArray", model: "Model", settings: "CommissionSettings", folder: Path
 ) -> "dict[str, Figures]":
     from worldstate.commissioning.commission import exam_of_mountings
-    from worldstate.commissioning.exam_report import exam_figures
-    from worldstate.commissioning.plan import mounting_streams
+    from worldstate.commissioning.heard_stream import mounting_streams
+    from worldstate.commissioning.stream_exam import exam_figures
 
     with progress_bar("mounting", len(mounting_streams(settings))) as bar:
         heard = exam_of_mountings(array, model, settings, folder, on_step=bar.advance)
@@ -149,7 +149,7 @@ def _mounted(
 
 
 def _settings(arguments: argparse.Namespace) -> "CommissionSettings":
-    from worldstate.commissioning.plan import CommissionSettings, quick_settings
+    from worldstate.commissioning.heard_stream import CommissionSettings, quick_settings
 
     minutes: float = arguments.minutes
     settings = CommissionSettings(

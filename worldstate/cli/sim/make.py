@@ -156,8 +156,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from worldstate.simulation.dataset.plan import BANDWIDTHS_HZ
     from worldstate.simulation.scene.junction import site
     from worldstate.simulation.scene.presets import preset
-    from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, rate_for
-    from worldstate.simulation.scene.sound_settings import SIGNALS
+    from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
     from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
     band = arguments.bandwidth

@@ -37,7 +37,7 @@ FEWEST_RECORDINGS = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Approach:
+class StreamApproach:
     """Vehicles that belong together, the first to come into view first."""
 
     flow: str = "single"  # "single", "both" or "queue"
@@ -66,7 +66,7 @@ class ApproachOutcome:
     own_side: bool = False
     other_side: bool = False
     every_side: bool = False
-    approach: Approach = Approach()
+    approach: StreamApproach = StreamApproach()
 
     @property
     def detected(self) -> bool:
@@ -106,14 +106,14 @@ def alarm_outcome(time_s: FloatArray, alarm: BoolArray, t0_s: float) -> Approach
     return onset_outcome(time_s[rising_edges(alarm)], t0_s)
 
 
-def hop_outcome(approach: Approach, time_s: FloatArray, raised: BoolArray) -> ApproachOutcome:
+def hop_outcome(approach: StreamApproach, time_s: FloatArray, raised: BoolArray) -> ApproachOutcome:
     """Return the outcome of one approach of a stream: time_s (n,), alarm of either side (n, 2).
 
     Examples
     --------
     >>> time_s = 0.1 * np.arange(100)
     >>> left = np.column_stack([time_s > 5.55, np.zeros(100, bool)])
-    >>> found = hop_outcome(Approach("single", (8.0,), (1,)), time_s, left)
+    >>> found = hop_outcome(StreamApproach("single", (8.0,), (1,)), time_s, left)
     >>> round(found.lead_s, 1), found.own_side, found.other_side
     (2.4, False, True)
     """

@@ -21,8 +21,7 @@ from worldstate.adapters.acoustic_sequence import street_listener
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
-from worldstate.commissioning.heard_stream import HeardStream, vehicle_rows, vehicle_table
-from worldstate.commissioning.plan import junction_named
+from worldstate.commissioning.heard_stream import HeardStream, junction_named, vehicle_rows, vehicle_table
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import alarm_outcomes, approaches
 from worldstate.core.filter import WorldFilter
@@ -34,8 +33,8 @@ from worldstate.operations.metrics.approach_table import rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.settings import rate_for
-from worldstate.simulation.stream.drawn_stream import draw_stream
 from worldstate.simulation.stream.settings import StreamSettings, traffic_named
+from worldstate.simulation.stream.writing import draw_stream
 from worldstate.smoothing.learned_edge import LearnedEdge
 from worldstate.smoothing.learned_street import LearnedStreet, context_of
 from worldstate.state.context import Context
