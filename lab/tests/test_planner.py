@@ -17,8 +17,8 @@ from worldstate_lab.planner.encounters import (
 from worldstate_lab.planner.planner_exam import (
     CHANCE,
     FULL,
-    NOBODY,
     PHANTOM,
+    UNAWARE,
     draw_corners,
     every_planner,
     planner_figures,
@@ -70,7 +70,7 @@ EVERY = (stream(), stream("SA1"), stream(entries_s=()))
 def test_who_knows_brakes_for_vehicles_alone_and_who_knows_nothing_hits_them(ego: EgoVehicle) -> None:
     corners = draw_corners(EVERY, 40, ego, np.random.default_rng(1))
     figures = planner_figures(corners, every_planner(corners, 0.5, 0.5, ego), np.random.default_rng(2))
-    nobody, phantom, full, chance = (figures[name] for name in (NOBODY, PHANTOM, FULL, CHANCE))
+    nobody, phantom, full, chance = (figures[name] for name in (UNAWARE, PHANTOM, FULL, CHANCE))
     assert nobody["loud_collisions"] > 0 and nobody["empty_needless_s"] == 0.0
     assert [one["loud_collisions"] + one["quiet_collisions"] for one in (phantom, full, chance)] == [0, 0, 0]
     assert chance["empty_needless_s"] == 0.0 < full["empty_needless_s"] < phantom["empty_needless_s"]
@@ -113,7 +113,7 @@ def test_whatever_is_said_no_car_brakes_or_accelerates_beyond_its_limits(seed: i
 def test_streams_without_what_is_asked_for_are_refused() -> None:
     with pytest.raises(InvalidArgumentError, match="60 replays of approaches"):
         draw_corners([EVERY[2]], 60, EgoVehicle(), np.random.default_rng(0))
-    with pytest.raises(InvalidArgumentError, match="60 moments without anybody"):
+    with pytest.raises(InvalidArgumentError, match="60 moments without vehicles"):
         draw_corners([EVERY[0]], 60, EgoVehicle(), np.random.default_rng(0))
 
 

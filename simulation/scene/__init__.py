@@ -1,1 +1,1 @@
-"""Who stands and drives where: junctions, occluders, vehicles, presets."""
+"""Places and motion: junctions, occluders, vehicles, presets."""

@@ -378,7 +378,7 @@ def one_corner() -> Place:
 
 
 def parked_van() -> Place:
-    """Return a crossing in the open, before which a van parked on our left hides who comes from there."""
+    """Return a crossing in the open, before which a van parked on our left hides vehicles from there."""
     ways = Way("left", ((8.5, 60.0), (8.5, -60.0))), Way("right", ((11.5, -60.0), (11.5, 60.0)))
     return _open("SV1", (*ways, TURNS_OFF_AHEAD, CROSSES_BEHIND), box(1.5, 6.5, 2.0, 4.0))
 

@@ -190,7 +190,7 @@ MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
 MAX_OTHERS, MAX_SOUNDS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 16, 64, 0.1
 # What the released patterns move by in the two seconds round T0: in all three fitted places 3 to 5 m/s then,
-# hardly braking. Drivers who came at 9 m/s and braked by 3 left the windows in front half a second behind.
+# hardly braking. Drivers that came at 9 m/s and braked by 3 left the windows in front half a second behind.
 SPEEDS_MPS, WALLED_SPEEDS_MPS = (3.8, 6.2), (3.4, 4.8)
 BRAKING_SHARE, BRAKING_MPS2 = 0.6, (0.3, 1.4)
 EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)

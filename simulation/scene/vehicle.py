@@ -21,7 +21,7 @@ REFERENCE_KMH = 70.0
 POWER_TO_1M_DB = -8.0
 FADE_KMH = 5.0  # a warning sound that ends at some speed is gone so much above it
 SLOWEST_KMH = 10.0  # the law is fitted above 20; a log of zero speed would be silence
-CREEPING_MPS = 1.0  # below, tyres fade with the speed: who stands before a corner is an engine alone
+CREEPING_MPS = 1.0  # below, tyres fade with the speed: a vehicle that stands is an engine alone
 HARMONIC_SHARE = 0.5  # of the propulsion power; the rest is broadband
 HARMONICS = 24
 # Firing frequency of four cylinders over speed in gears 1 to 4, Hz per m/s; up at 2400 rpm, idle at 850 rpm.

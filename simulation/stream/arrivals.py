@@ -1,4 +1,4 @@
-"""Who comes when: every flow is a Poisson process, every arrival one vehicle or several."""
+"""Arrivals: every flow is a Poisson process, every arrival one vehicle or several."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from .settings import HAZARDS, StreamSettings, Traffic
 HEADWAY_S = (1.5, 4.0)
 TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
 LONGEST_QUEUE = 8
-AROUND_DRIVE_S = 20.0  # who arrives so long before or after a drive is still heard in it
+AROUND_DRIVE_S = 20.0  # a vehicle that arrives so long before or after a drive is still heard in it
 STANDING = EgoMotion()
 SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # the fades of an event lie beside the sound
 
@@ -111,7 +111,7 @@ def _arrival(
         arms[flow] = ((LEFT,), (RIGHT,))[rng.integers(2)]
     for arm in arms.get(flow, (None,)):
         kind = _kind(traffic, rng)
-        # Nobody hears a bicycle two streets away.
+        # A bicycle two streets away is not heard.
         heard = vehicle_kind("light") if flow == "far" and kind.name == "bicycle" else kind
         driver = draw_driver(site, heard, preset, rng, arm)
         signal = _signal(traffic, heard, rng)
@@ -127,7 +127,7 @@ def _arrival(
             another = number == 0 if flow == "queue" else rng.random() < traffic.follower_share
             if not another:
                 break
-            # Who follows on a bicycle would not keep up: it is a vehicle of the leader's kind or a car.
+            # A follower on a bicycle would not keep up: it is a vehicle of the leader's kind or a car.
             kind = leader.motion.kind if rng.random() < 0.5 else vehicle_kind("light")
             last = behind(last, rng.uniform(*HEADWAY_S), kind)
             yield _event("follows", arrival_s + late_s, last)

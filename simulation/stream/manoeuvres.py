@@ -138,7 +138,7 @@ class Manoeuvre:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Driver:
-    """Who drives where: what every manoeuvre is drawn for."""
+    """A vehicle and its street: what every manoeuvre is drawn for."""
 
     site: Site
     kind: VehicleKind
@@ -302,5 +302,5 @@ def _arc(start_m: tuple[float, float], towards: tuple[float, float], then: tuple
 
 
 def behind(leader: Manoeuvre, headway_s: float, kind: VehicleKind) -> Manoeuvre:
-    """Return a follower, who drives as the one in front does."""
+    """Return a follower, which drives as the one in front does."""
     return replace(leader, motion=replace(leader.motion, kind=kind), gap_s=leader.gap_s + headway_s)

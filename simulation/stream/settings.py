@@ -53,13 +53,13 @@ class Traffic:
 
     @property
     def hazard_free(self) -> bool:
-        """Whether nobody ever comes out of a hidden arm."""
+        """Whether no vehicle ever comes out of a hidden arm."""
         return not any(self.per_hour.get(flow, 0.0) for flow in HAZARDS)
 
 
 _OTHERS = {"turns_away": 20.0, "parks": 8.0, "far": 40.0, "from_behind": 12.0, "from_ahead": 12.0}
-# A side street at midday and a district road in the rush hour; `no-hazard` is the latter without anyone who
-# comes out of a hidden arm: whatever warns there is wrong. `empty` is background alone.
+# A side street at midday and a district road in the rush hour; `no-hazard` is the latter without vehicles
+# out of a hidden arm: whatever warns there is wrong. `empty` is background alone.
 TRAFFICS = {
     traffic.name: traffic
     for traffic in (
@@ -115,7 +115,7 @@ class StreamSettings:
     seed : int
         Of everything that is drawn.
     traffic : Traffic
-        Who drives how often.
+        Arrivals of every flow.
     preset : Preset
         Levels of everything else.
     sample_rate_hz : float

@@ -112,7 +112,7 @@ EVENTS_NAME, ROWS_NAME = "events.json", "vehicles.csv"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleTruth:
-    """One vehicle of a stream: who it is, and its rows."""
+    """One vehicle of a stream and its rows."""
 
     number: int
     event: VehicleEvent

@@ -44,7 +44,7 @@ ARRIVALS, CHANNELS, LEVEL, SOUNDS = 0, 1, 2, 6  # purposes of generators; 3 and 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnStream:
-    """Who comes when, and what hears it; its sound can be written or listened to as it is rendered."""
+    """Arrivals and microphones of a stream; its sound is written or listened to as it is rendered."""
 
     scene: StreamScene
     array: MicrophoneArray

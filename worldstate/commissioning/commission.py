@@ -174,7 +174,7 @@ def commission(
 ) -> Model:
     """Make a model for an array from simulated streets, and from labelled windows where there are any.
 
-    Recordings in which nobody came set the alarm in place of the simulated streets without hazards. The model
+    Recordings without vehicles set the alarm in place of the simulated streets without hazards. The model
     says where the labelled windows come from and which lists of them were left out.
     """
     check_extra("sklearn")
@@ -214,7 +214,7 @@ def commission(
 def with_quiet_alarm(
     model: Model, array: MicrophoneArray, quiet: Sequence[Path], onsets_per_hour: float
 ) -> Model:
-    """Return a model whose alarm is set on recordings in which nobody came."""
+    """Return a model whose alarm is set on recordings without vehicles."""
     windows, sequence = parts_of(model)
     heard = [hear_recording(path, array) for path in quiet]
     hours = sum(len(one.hops) for one in heard) * HOP_S / SECONDS_PER_HOUR

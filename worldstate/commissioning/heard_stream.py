@@ -55,7 +55,7 @@ class CommissionSettings:
     exam_minutes : float
         Hazard-free stream at each junction of the exam; approaches take three fifths of that.
     onsets_per_hour : float
-        Alarms allowed where nobody comes.
+        Alarms allowed where no vehicle comes.
     bandwidth_hz : float
         Sound is rendered up to here.
     seed : int
@@ -92,7 +92,7 @@ class CommissionSettings:
 
     def __post_init__(self) -> None:
         in_range("junctions", self.junctions, 2, 200)
-        # Of less there are streams in which nobody comes, and nothing is learned.
+        # Of less there are streams without vehicles, and nothing is learned.
         in_range("approach_minutes", self.approach_minutes, 0.8, 120.0)
         in_range("hazard_free_minutes", self.hazard_free_minutes, 0.5, 120.0)
         in_range("exam_minutes", self.exam_minutes, 0.5, 160.0)
@@ -190,7 +190,7 @@ _PCM = 32767.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeardStream:
-    """What was heard of one stream, and who was there."""
+    """What was heard of one stream, and the vehicles there."""
 
     hops: HopTable  # One row a hop: `AcousticFrame` by columns, NaN where something was refused
     vehicles: HopTable  # One row a vehicle: flow, kind, arm, T0 as `entry_s` (NaN: never comes into view)
@@ -198,7 +198,7 @@ class HeardStream:
 
     @property
     def hazard_free(self) -> bool:
-        """Whether nobody comes out of a hidden arm."""
+        """Whether no vehicle comes out of a hidden arm."""
         return not self.vehicles.hazard.any()
 
     @property
@@ -241,7 +241,7 @@ def hear_stream(
 
 
 def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
-    """Listen to a recording in which nobody is known to come."""
+    """Listen to a recording that is known to hold no vehicle."""
     with open_sound(sound, array.n_microphones) as audio:
         about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
         blocks = audio.blocks(round(audio.sample_rate_hz))

@@ -31,7 +31,7 @@ ROW_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreamTruth:
-    """Who is where at every hop of a stream; sides are left and right."""
+    """Vehicles at every hop of a stream; sides are left and right."""
 
     coming_s: FloatArray  # shape (n, 2): Seconds until the next one comes into view, infinite without
     seen: BoolArray  # shape (n,): Whether any is in view
@@ -43,7 +43,7 @@ class StreamTruth:
         """Return the number of the group of every hop and side, shape (n, 2)."""
         nearest = np.searchsorted(COMING_S, self.coming_s, side="left")
         coming = self.coming_s <= COMING_S[-1]
-        # In the order in which they count: who comes is told even while another one is in view.
+        # In the order in which they count: a vehicle that comes counts even while another one is in view.
         conditions = {
             "seen": np.broadcast_to(self.seen[:, None], coming.shape),
             "other": self.coming_s[:, ::-1] <= OTHER_SIDE_S,

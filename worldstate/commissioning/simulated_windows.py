@@ -48,7 +48,7 @@ MOVING_LATE_S = 0.5
 # In view: from half a second after it came, the released front windows end 1.5 s after; farther than this a
 # vehicle is hardly heard. Windows that hold its sound, to a second after it has gone, are of no other class.
 FRONT_S, NEAR_M, WINDOW_S = (0.5, 0.0), 25.0, 1.0
-# Empty: nobody comes for so long, as nobody does in the second before.
+# Empty: no vehicle comes for so long, nor came in the second before.
 CALM_S = 5.0
 
 

@@ -218,7 +218,7 @@ def _times(streams: Sequence[ExaminedStream]) -> Figures:
 
 
 def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:
-    """Return how true the times are of those who come within five seconds; None where none is stated.
+    """Return the errors of stated times of vehicles that come within five seconds; None where none is stated.
 
     Shapes: stated (n, 3), coming_s (n,).
     """
@@ -388,4 +388,4 @@ def write_exam_figure(streams: Sequence[ExaminedStream], path: Path) -> None:
         ranked.plot(-BEFORE_S, auroc_before(streams, BEFORE_S), color="black", label="all")
         warned.set(ylim=(0.0, 1.0), xlabel="seconds to T0", ylabel="approaches in alarm by then")
         ranked.set(ylim=(0.5, 1.0), xlabel="seconds to T0", ylabel="AUROC against hazard-free hops")
-        legend_beside(ranked, "alarms where nobody comes")
+        legend_beside(ranked, "alarms without vehicles")

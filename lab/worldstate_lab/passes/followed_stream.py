@@ -45,7 +45,7 @@ def measurements(
 ) -> Iterator[Measurement]:
     """Yield one measurement a hop, as the acoustic adapter makes them of the sound.
 
-    `street` tells the sides; where whoever filters tells it who came, it learns on the way.
+    `street` corrects the sides, and learns from the passes that the filter reports to it.
     """
     hops, signature, groups = heard.hops, SiteSignature(model), sequence.posterior(evidence).groups
     for i in range(len(hops)):
@@ -110,7 +110,7 @@ class PassedStream:
 def followed(
     world: WorldFilter, measurements: Iterable[Measurement], street: StreetListener | None = None
 ) -> FollowedStream:
-    """Filter a stream; return what was believed after every measurement. `street` is told who came."""
+    """Filter a stream; return what was believed after every measurement. `street` learns from passes."""
     states: list[WorldState] = []
     for measurement in measurements:
         world = world.update(measurement)

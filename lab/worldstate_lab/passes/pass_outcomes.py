@@ -39,7 +39,7 @@ class PassOutcome:
 
     alarm: ApproachOutcome
     hidden_before: int  # Different entities believed hidden before T0
-    identity: bool | None  # None where nobody was believed there, or nobody was seen
+    identity: bool | None  # None where no entity was believed or seen there
 
 
 def outcomes(stream: PassedStream) -> list[PassOutcome]:
@@ -173,7 +173,7 @@ def _forecast(streams: Sequence[PassedStream]) -> Figures:
     return {
         "skill_2s": brier_skill(within[said], coming_s[said] <= 2.0),
         "ece_2s": expected_calibration_error(within[said], coming_s[said] <= 2.0),
-        # The risk is that of somebody hidden, who comes into view within the time that the sequence foresees.
+        # The risk is of a hidden vehicle that comes into view within the time that the sequence foresees.
         "risk_skill": brier_skill(risk, coming_s <= COMING_S[-1]),
         "risk_ece": expected_calibration_error(risk, coming_s <= COMING_S[-1]),
         **time_figures(stated, coming_s),

@@ -1,4 +1,4 @@
-"""The closed loop: at every step a planner brakes for whom it sees and whom it assumes behind a corner."""
+"""The closed loop: at every step a planner brakes for vehicles that it sees or assumes behind a corner."""
 
 from dataclasses import dataclass
 
@@ -33,9 +33,9 @@ class Drives:
 
 
 def drive_through(encounters: Encounters, threshold: float, ego: EgoVehicle) -> Drives:
-    """Drive through all encounters, braking for whom it sees and for vehicles that it assumes.
+    """Drive through all encounters, braking for vehicles that it sees or assumes.
 
-    One is assumed at the limit just behind what can be seen of a side while the chance that somebody comes
+    One is assumed at the limit just behind what can be seen of a side while the chance that a vehicle comes
     into view from there within `HORIZON_S` is not below the threshold: always at 0, never at infinity.
     """
     assumed = encounters.within[..., HORIZONS_S.index(HORIZON_S)] >= threshold
@@ -89,7 +89,7 @@ def _for_assumed(
     reach_m: FloatArray,
     assumed: BoolArray,
 ) -> FloatArray:
-    """Return the acceleration that leaves it able to stop before whoever is assumed."""
+    """Return the acceleration that leaves it able to stop before an assumed vehicle."""
     room = encounters.line_m - ego.gap_m - x
     out_m = encounters.lane_m + HALF_LANE_M + ego.length_m - x[:, None]
     arrives_s = (reach_m - 0.5 * ego.width_m) / ego.limit_mps - ego.reaction_s
@@ -109,7 +109,7 @@ def _towards(ego: EgoVehicle, room_m: FloatArray, v: FloatArray, reaction_s: flo
 def _for_seen(
     encounters: Encounters, ego: EgoVehicle, x: FloatArray, v: FloatArray, step: int, known: BoolArray
 ) -> FloatArray:
-    """Return the acceleration with which it lets pass whom it sees and would meet."""
+    """Return the acceleration with which it lets vehicles pass that it sees and would meet."""
     # What it knows is as old as its reaction.
     late = round(ego.reaction_s / STEP_S)
     steps = max(step - late, 0), max(step - late - 2, 0)
@@ -117,7 +117,7 @@ def _for_seen(
     speed = np.maximum((before - now) / (2.0 * STEP_S), _LEAST_MPS)
     now = now - speed * late * STEP_S
     half, lane = 0.5 * encounters.width_m, np.take_along_axis(encounters.lane_m, encounters.side, axis=1)
-    # Who has braked before the corner speeds up behind it: it is not to be passed at its present pace.
+    # What has braked before the corner speeds up behind it: it is not to be passed at its present pace.
     enters_s = ego.soonest_s(now - 0.5 * ego.width_m, speed)
     leaves_s = (now + 0.5 * ego.width_m + encounters.length_m) / speed
     in_m, out_m = lane - half - x[:, None], lane + half + ego.length_m - x[:, None]
@@ -134,7 +134,7 @@ def _for_seen(
 
 
 def _overlaps(encounters: Encounters, ego: EgoVehicle, x: FloatArray, step: int) -> BoolArray:
-    """Tell whether the footprint of the ego lies on anybody's."""
+    """Tell whether the footprint of the ego lies on that of a vehicle."""
     lane, half = np.take_along_axis(encounters.lane_m, encounters.side, axis=1), 0.5 * encounters.width_m
     along = (x[:, None] > lane - half) & (x[:, None] - ego.length_m < lane + half)
     front = encounters.to_come_m[:, step]

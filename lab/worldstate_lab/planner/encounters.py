@@ -52,14 +52,14 @@ class Crossing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BelievedStream:
-    """The chances that a stream's snapshots state, and who was there; sides are left and right."""
+    """The chances that a stream's snapshots state, and the vehicles there; sides are left and right."""
 
     time_s: FloatArray  # shape (n,)
     within: FloatArray  # shape (n, 2, horizons): Probability to come into view within each horizon
     heard: HeardStream
     site: Site
-    ways: tuple[Crossing, ...]  # Of those who come out of a hidden arm
-    others: IndexArray  # Numbers of everybody else
+    ways: tuple[Crossing, ...]  # Of vehicles out of a hidden arm
+    others: IndexArray  # Numbers of all other vehicles
 
 
 def believed_stream(path: Path, model: Model, cache: Path | None) -> BelievedStream:
@@ -112,7 +112,7 @@ class EgoVehicle:
     length_m: float = 4.3
     width_m: float = 1.8
     # Cameras in the bumper's corners, as parking aids have them: from behind a windscreen, two metres back,
-    # nobody can see into these streets before the bumper is in them.
+    # no camera sees into these streets before the bumper is in them.
     eye_m: float = 0.5  # Behind the bumper
     limit_mps: float = 25.0 / 3.6  # Of both streets; the fastest vehicle of the streams drives 22 km/h
     acceleration_mps2: float = 2.0
@@ -121,8 +121,8 @@ class EgoVehicle:
     reaction_s: float = 0.3
     begins_m: float = 30.0  # Before the line at which it would stand
     begins_mps: float = 25.0 / 3.6
-    gap_m: float = 0.25  # Between the bumper that stands and whoever passes
-    gap_s: float = 0.3  # Between one who leaves the conflict zone and one who enters it
+    gap_m: float = 0.25  # Between the bumper that stands and a vehicle that passes
+    gap_s: float = 0.3  # Between vehicles that leave and enter the conflict zone
 
     def stopping_speed_mps(self, room_m: FloatArray, reaction_s: float) -> FloatArray:
         r"""Return the highest speed from which it stands within d metres, having reacted after tau.
@@ -161,7 +161,7 @@ STEPS = round(LASTS_S / STEP_S)
 MEETS_WITHIN_S = 3.0  # Between vehicle and an ego that never brakes, in the middle of the conflict zone
 MOST_VEHICLES = 6
 _NEAR_M, _BEFORE_S, _AFTER_S, _PASSED_S = 12.0, 1.0, 15.0, 8.0
-# Half the widest lorry: what a planner leaves free where it does not see who comes.
+# Half the widest lorry: what a planner leaves free where it sees no vehicle.
 HALF_LANE_M = 1.25
 _ROUNDS, _MINUTES = 200, 10_000
 
@@ -170,7 +170,7 @@ _ROUNDS, _MINUTES = 200, 10_000
 class Encounters:
     """Replays, one a row; K vehicles, missing ones gone from the beginning; lanes left, right."""
 
-    recorded: IndexArray  # shape (n,): Number of the approach, or of a minute in which nobody comes
+    recorded: IndexArray  # shape (n,): Number of the approach, or of a minute without vehicles
     corner_ahead_m: FloatArray  # shape (n,)
     corner_m: FloatArray  # shape (n, 2): Distance of the corners from the ego's axis
     lane_m: FloatArray  # shape (n, 2): How far ahead vehicles from the left and from the right drive
@@ -211,7 +211,7 @@ def approach_encounters(
 ) -> Encounters:
     """Draw replays, each recorded approach as often as the others, the ego uniformly within 3 s of it.
 
-    Drawn again are replays in which somebody drives in the ego's own street.
+    Drawn again are replays in which a vehicle drives in the ego's own street.
     """
     found: list[Encounters] = []
     for _ in range(_ROUNDS if recorded else 0):
@@ -226,7 +226,7 @@ def approach_encounters(
 
 
 def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.random.Generator) -> Encounters:
-    """Draw moments of streams without hazards at which nobody is in view or in the ego's own street."""
+    """Draw moments of streams without hazards at which no vehicle is in view or in the ego's own street."""
     found: list[Encounters] = []
     for _ in range(_ROUNDS * count):
         number = len(found) % max(len(streams), 1)
@@ -239,7 +239,7 @@ def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.rand
             minute = number * _MINUTES + int(start_s // 60.0)
             found.append(_encounter(streams[number], start_s, minute))
     if len(found) < count:
-        raise InvalidArgumentError(f"streams: expected {count} moments without anybody, found {len(found)}")
+        raise InvalidArgumentError(f"streams: expected {count} moments without vehicles, found {len(found)}")
     return joined_encounters(found)
 
 

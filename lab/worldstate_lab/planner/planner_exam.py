@@ -1,10 +1,10 @@
 """What planners make of the same corners: collisions, needless braking, time lost."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,7 +24,8 @@ from .encounters import (
     recorded_approaches,
 )
 
-NOBODY, PHANTOM, FULL, CHANCE, LOUD = (
+Of = TypeVar("Of")
+UNAWARE, PHANTOM, FULL, CHANCE, LOUD = (
     "no knowledge",
     "phantom",
     "phantom, full brakes",
@@ -32,34 +33,28 @@ NOBODY, PHANTOM, FULL, CHANCE, LOUD = (
     "chance, loud",
 )
 THRESHOLDS = tuple(round(0.001 * 2.0 ** (0.5 * step), 4) for step in range(13))
-# Of corners at which somebody comes.
+# Of corners at which a vehicle comes.
 SHARES = (0.05, 0.2)
 HARD_MPS2 = 4.0
 _QUIET = 100_000  # Numbers of quiet approaches beside those of loud ones
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Corners:
-    """Replays of approaches of loud vehicles, of those with a quiet one among them, and without anybody."""
+class ByKind(NamedTuple, Generic[Of]):
+    """One thing each of loud approaches, of those with a quiet vehicle, and of moments without vehicles."""
 
-    loud: Encounters
-    quiet: Encounters
-    empty: Encounters
+    loud: Of
+    quiet: Of
+    empty: Of
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CornerDrives:
-    """One planner's drives through them."""
-
-    loud: Drives
-    quiet: Drives
-    empty: Drives
+Corners = ByKind[Encounters]
+CornerDrives = ByKind[Drives]  # One planner's, through such corners
 
 
 def draw_corners(
     streams: Sequence[BelievedStream], count: int, ego: EgoVehicle, rng: np.random.Generator
 ) -> Corners:
-    """Draw approaches of loud vehicles, quiet ones by their share, and as many moments without anybody."""
+    """Draw approaches of loud vehicles, quiet ones by their share, and as many moments without vehicles."""
     loud, quiet = approaches_drawn(streams, count, ego, rng)
     return Corners(loud, quiet, empty_encounters([one for one in streams if not one.ways], count, rng))
 
@@ -74,8 +69,8 @@ def approaches_drawn(
 
 
 def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
-    """Return the threshold one below the largest up to which nobody is hit; 0, the phantom, without one."""
-    # What nobody was hit with at some 130 approaches may hit somebody elsewhere: one step is kept in hand.
+    """Return the threshold below the largest up to which no vehicle is hit; 0, the phantom, without one."""
+    # What hits no vehicle at some 130 approaches may hit one elsewhere: one step is kept in hand.
     kept = 0.0
     for lower, threshold in pairwise((0.0, *THRESHOLDS)):
         if any(drive_through(one, threshold, ego).collided.any() for one in approached):
@@ -86,15 +81,13 @@ def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
 
 def drives_of(corners: Corners, threshold: float, ego: EgoVehicle) -> CornerDrives:
     """Return the drives of the planner that assumes vehicles from a chance on."""
-    return CornerDrives(
-        *(drive_through(one, threshold, ego) for one in (corners.loud, corners.quiet, corners.empty))
-    )
+    return CornerDrives(*(drive_through(one, threshold, ego) for one in corners))
 
 
 def every_planner(corners: Corners, chance: float, loud: float, ego: EgoVehicle) -> dict[str, CornerDrives]:
     """Return the drives of all planners; only the one with full brakes has another stopping law."""
     return {
-        NOBODY: drives_of(corners, np.inf, ego),
+        UNAWARE: drives_of(corners, np.inf, ego),
         PHANTOM: drives_of(corners, 0.0, ego),
         FULL: drives_of(corners, 0.0, replace(ego, comfortable_mps2=ego.full_mps2)),
         CHANCE: drives_of(corners, chance, ego),
@@ -157,8 +150,8 @@ def _figures(
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLOURS = {NOBODY: RED, PHANTOM: BLUE, FULL: ORANGE, CHANCE: GREEN, LOUD: SKY}
-_TOLD = {NOBODY: "no knowledge", PHANTOM: "phantom at every corner", FULL: "phantom, full brakes"}
+_COLOURS = {UNAWARE: RED, PHANTOM: BLUE, FULL: ORANGE, CHANCE: GREEN, LOUD: SKY}
+_TOLD = {UNAWARE: "no knowledge", PHANTOM: "phantom at every corner", FULL: "phantom, full brakes"}
 _ARM_M, _BEHIND_M, _BEYOND_M = 13.0, 9.0, 2.0
 
 
@@ -170,10 +163,10 @@ def write_planner_figure(
     ego: EgoVehicle,
     path: Path,
 ) -> None:
-    """Draw one approach that hits who knows nothing, one empty corner, and what every threshold costs."""
+    """Draw an approach in which only the unaware planner collides, an empty corner, and the costs."""
     with figure_file(path, 11.0, 3.5) as figure:
         above, speeds, costs = figure.subplots(1, 3, width_ratios=(1.15, 1.0, 1.0))
-        hit = planners[NOBODY].loud.collided & ~planners[CHANCE].loud.collided
+        hit = planners[UNAWARE].loud.collided & ~planners[CHANCE].loud.collided
         _draw_corner(above, corners.loud, int(np.flatnonzero(hit)[0]), planners, ego)
         _draw_speeds(speeds, corners.empty, planners)
         _draw_costs(costs, curve, figures)
@@ -182,15 +175,15 @@ def write_planner_figure(
 def _draw_corner(
     axes: "Axes", met: Encounters, i: int, planners: Mapping[str, CornerDrives], ego: EgoVehicle
 ) -> None:
-    """Draw the moment at which who knows nothing and who listens are farthest from being one."""
+    """Draw the first moment at which the planners without knowledge and with it are a metre apart."""
     from matplotlib.patches import Rectangle
 
-    apart = planners[NOBODY].loud.front_m[i] - planners[CHANCE].loud.front_m[i]
+    apart = planners[UNAWARE].loud.front_m[i] - planners[CHANCE].loud.front_m[i]
     step = int(np.flatnonzero(apart > 1.0)[0])
     ahead, (left, right) = met.corner_ahead_m[i], met.corner_m[i]
     for y, width in ((left, _ARM_M), (-right - _ARM_M, _ARM_M)):
         axes.add_patch(Rectangle((y, -_BEHIND_M), width, ahead + _BEHIND_M, color="0.75", linewidth=0))
-    for name in (NOBODY, CHANCE):
+    for name in (UNAWARE, CHANCE):
         front = planners[name].loud.front_m[i, step]
         body = (-0.5 * ego.width_m, front - ego.length_m), ego.width_m, ego.length_m
         axes.add_patch(Rectangle(*body, fill=False, edgecolor=_COLOURS[name], linewidth=1.8))
@@ -209,7 +202,7 @@ def _draw_corner(
 
 
 def _draw_speeds(axes: "Axes", empty: Encounters, planners: Mapping[str, CornerDrives]) -> None:
-    # The corner at which who listens brakes as long as in the mean: no picked one.
+    # The corner at which the planner that listens brakes as long as in the mean: no picked one.
     braking = planners[CHANCE].empty.braking_s
     i = int(np.abs(braking - np.median(braking)).argmin())
     for name, told in (*_TOLD.items(), (CHANCE, "chance of the state")):
