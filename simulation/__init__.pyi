@@ -1,6 +1,6 @@
+from .dataset.dataset import DatasetSettings as DatasetSettings
 from .dataset.dataset import write_dataset as write_dataset
 from .dataset.dataset import write_recording as write_recording
-from .dataset.plan import DatasetSettings as DatasetSettings
 from .dataset.recording import SimulatedRecording as SimulatedRecording
 from .dataset.recording import simulate_recording as simulate_recording
 from .scene.junction import MOVING_SITES as MOVING_SITES
@@ -14,9 +14,9 @@ from .scene.presets import DEFAULT_PRESET as DEFAULT_PRESET
 from .scene.presets import PRESETS as PRESETS
 from .scene.presets import Preset as Preset
 from .scene.presets import preset as preset
-from .scene.route import EgoMotion as EgoMotion
 from .scene.settings import SOUNDS as SOUNDS
 from .scene.settings import SimulationSettings as SimulationSettings
 from .scene.settings import SoundSettings as SoundSettings
 from .scene.settings import VehicleSettings as VehicleSettings
 from .scene.settings import draw_settings as draw_settings
+from .scene.vehicle import EgoMotion as EgoMotion

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
-from worldstate_lab.planner.closed_loop import drive_through
 from worldstate_lab.planner.encounters import (
     FROM_STANDING,
     STEP_S,
@@ -20,6 +19,7 @@ from worldstate_lab.planner.planner_exam import (
     PHANTOM,
     UNAWARE,
     draw_corners,
+    drive_through,
     every_planner,
     planner_figures,
     safe_threshold,

@@ -13,8 +13,7 @@ from worldstate_lab.cli.main import main
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.simulation.dataset.dataset import write_dataset
-from worldstate.simulation.dataset.plan import DatasetSettings
+from worldstate.simulation.dataset.dataset import DatasetSettings, write_dataset
 
 TABLE_ONE = (
     "Vision-only",

@@ -12,8 +12,7 @@ from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.simulation.scene.driving import camera_sees
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import LIGHT, VehicleKind
-from worldstate.simulation.scene.route import ARRAY_HEIGHT_M
-from worldstate.simulation.scene.vehicle import LENGTH_M, WIDTH_M, Trajectory
+from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, LENGTH_M, WIDTH_M, Trajectory
 
 LEAST_VISIBLE = 0.2  # share of the vehicle's length that a detector needs
 # Miss rates measured in the paper: 4 % at boresight, 14 % at 20-30 deg.

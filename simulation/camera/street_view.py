@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageArray, IndexArray
 from worldstate.simulation.scene.junction import Site, site_generator
-from worldstate.simulation.scene.route import ARRAY_HEIGHT_M
+from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M
 
 # From two coordinates on a surface to red, green, blue in 0..255, shape (..., 3).
 Paint = Callable[[Float32Array, Float32Array], Float32Array]

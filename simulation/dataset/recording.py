@@ -23,7 +23,7 @@ from worldstate.simulation.camera.simulated_detector import (
     lost,
     park,
 )
-from worldstate.simulation.emitters.placed_sound import add_signal, add_sound
+from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, add_vehicle
 from worldstate.simulation.scene.driving import comes_into_view_s, trajectories
 from worldstate.simulation.scene.settings import SimulationSettings, SoundSettings
 from worldstate.simulation.scene.vehicle import Trajectory
@@ -32,7 +32,6 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego_echo, ego_noise
 from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.vehicle_sound import add_vehicle
 
 SCHEMA = "worldstate.simulation.truth"
 SCHEMA_VERSION = "1.2.0"

@@ -10,9 +10,8 @@ from worldstate.ground.typing import BoolArray, FloatArray
 from .junction import Site
 from .kinds import vehicle_kind
 from .occluders import hidden_by
-from .route import along, turn_in
 from .settings import SimulationSettings, VehicleSettings
-from .vehicle import Trajectory, drive, follow
+from .vehicle import Trajectory, along, drive, follow, turn_in
 
 
 def image_edges_rad(camera: PinholeCamera) -> tuple[float, float]:

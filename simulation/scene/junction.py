@@ -311,7 +311,11 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A site, and the ways of vehicles that drive there."""
+    """A site besides the junctions, and the ways of vehicles that drive there.
+
+    Most are in the open: no walls, only bodies that stand in the line of sight. A vehicle is a hazard where
+    the camera does not see it at first, for a body in between or because it comes from beside or behind.
+    """
 
     site: Site
     ways: tuple[Way, ...]

@@ -202,7 +202,11 @@ TURNED_RAD = 0.12  # no street is exactly in line with another
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ambience:
-    """Ambient field of one site, or of one recording there."""
+    """Ambient field of one site, or of one recording there.
+
+    A court at night and a street beside a main road differ by more than two recordings of either. Level,
+    spectrum and openings of a site are drawn once from its name and kept from recording to recording.
+    """
 
     octaves_db: FloatArray  # shape (8,): Level of the whole field, dB re 20 uPa
     wind_db: float  # Of the wind at the microphones, against the preset's

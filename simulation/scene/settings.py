@@ -16,7 +16,7 @@ from worldstate.ground.typing import FloatArray
 from .junction import MOVING_SITES, Site, Way, place_of, site
 from .kinds import FLAT, Octaves, VehicleKind, vehicle_kind
 from .presets import Preset, preset
-from .route import EgoMotion, along
+from .vehicle import EgoMotion, along
 
 PLACE, VEHICLE, MICROPHONES = "a place", "a vehicle", "the microphones"
 

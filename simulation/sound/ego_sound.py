@@ -33,11 +33,10 @@ from worldstate.simulation.scene.vehicle import (
     rolling_level_db,
 )
 
-from .background import noise_frequencies, shaped_noise, wind_density
+from .background import BlockGrid, WaveField, noise_frequencies, shaped_noise, wind_density
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from .receiver import Receiver
 from .static_field import StaticSources, azimuths_all_round, plane_wave_delays, unit_vectors
-from .wave_field import BlockGrid, WaveField
 
 # Places in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
 TYRES_M = np.array([[1.1, 0.75, 0.1], [1.1, -0.75, 0.1], [-1.5, 0.75, 0.1], [-1.5, -0.75, 0.1]])

@@ -11,7 +11,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, resample_whole, smooth_step
-from worldstate.simulation.scene.route import ARRAY_HEIGHT_M, EgoMotion
+from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, EgoMotion
 
 from .delay import KNOT_SAMPLES, PHASES, Phases, Table, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS

@@ -153,7 +153,9 @@ def add_late_field(
     rng: np.random.Generator,
     field: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Add a diffuse tail of a dry signal.
+    """Add a diffuse tail of a dry signal: its energy without its direction.
+
+    Every direction has a tail of its own. One common tail on all microphones would be a source at broadside.
 
     Shapes: dry (pre + samples,), positions_m (M, 3), field (ndarray, ndarray).
     """

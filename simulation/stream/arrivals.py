@@ -9,13 +9,13 @@ from worldstate.ground.typing import FloatArray
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.simulation.scene.presets import Preset
-from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.scene.settings import (
     EGO_STOPS_AFTER_S,
     SimulationSettings,
     SoundSettings,
     with_sounds,
 )
+from worldstate.simulation.scene.vehicle import EgoMotion
 
 from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
 from .settings import HAZARDS, StreamSettings, Traffic

@@ -11,7 +11,6 @@ from worldstate.simulation.scene.driving import entry_y_m
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind
 from worldstate.simulation.scene.presets import Preset
-from worldstate.simulation.scene.route import TURN_RADIUS_M, Route, along
 from worldstate.simulation.scene.settings import (
     BRAKING_MPS2,
     BRAKING_SHARE,
@@ -20,7 +19,10 @@ from worldstate.simulation.scene.settings import (
 )
 from worldstate.simulation.scene.vehicle import (
     POWER_TO_1M_DB,
+    TURN_RADIUS_M,
+    Route,
     Trajectory,
+    along,
     propulsion_level_db,
     rolling_level_db,
 )

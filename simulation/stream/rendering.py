@@ -15,17 +15,16 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.simulation.emitters.placed_sound import add_signal, add_sound
+from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, add_vehicle
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.presets import Ambience, Preset, recording_ambience, site_ambience
-from worldstate.simulation.scene.route import EgoMotion
+from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego_echo, ego_noise
 from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.vehicle_sound import add_vehicle
 
 from .arrivals import STANDING, Event, SoundEvent, VehicleEvent
 from .settings import StreamSettings

@@ -10,8 +10,8 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.scene.junction import Site, ego_moves
 from worldstate.simulation.scene.kinds import KINDS
 from worldstate.simulation.scene.presets import Preset, preset
-from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SAMPLE_RATE_HZ, SIGNALS, SOUNDS
+from worldstate.simulation.scene.vehicle import EgoMotion
 
 # What a flow is, is drawn in `manoeuvres.py`; these bring vehicles out of a hidden arm.
 HAZARDS = ("left", "right", "both", "waits", "queue")

@@ -24,7 +24,7 @@ from worldstate.simulation.camera.simulated_detector import (
 )
 from worldstate.simulation.dataset.recording import SCHEMA, SCHEMA_VERSION
 from worldstate.simulation.scene.junction import Site
-from worldstate.simulation.scene.route import EgoMotion
+from worldstate.simulation.scene.vehicle import EgoMotion
 
 from .arrivals import STANDING, SoundEvent, VehicleEvent
 from .rendering import row_times

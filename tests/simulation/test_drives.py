@@ -12,7 +12,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.simulation import preset
 from worldstate.simulation.scene.junction import drawn_site
 from worldstate.simulation.scene.kinds import LIGHT
-from worldstate.simulation.scene.route import EgoMotion
+from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.stream.arrivals import STANDING, VehicleEvent
 from worldstate.simulation.stream.manoeuvres import Driver, emerges
 from worldstate.simulation.stream.rendering import draw_microphones, event_sound, loudness_db

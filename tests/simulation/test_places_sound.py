@@ -12,7 +12,7 @@ from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.occluders import OccludingBody
-from worldstate.simulation.scene.route import EgoMotion, along
+from worldstate.simulation.scene.vehicle import EgoMotion, along
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.propagation import add_sources

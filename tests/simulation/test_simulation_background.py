@@ -11,18 +11,16 @@ from worldstate_lab.streets.simulated_windows import RATE_HZ
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.simulation import preset, site
+from worldstate.simulation.emitters.placed_sound import add_vehicle
 from worldstate.simulation.scene.junction import Site, place
 from worldstate.simulation.scene.presets import site_ambience
-from worldstate.simulation.scene.route import EgoMotion
-from worldstate.simulation.scene.vehicle import Trajectory, drive, load_db
-from worldstate.simulation.sound.background import add_background, opening_images
+from worldstate.simulation.scene.vehicle import EgoMotion, Trajectory, drive, load_db
+from worldstate.simulation.sound.background import BlockGrid, WaveField, add_background, opening_images
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes, ego_noise
 from worldstate.simulation.sound.receiver import Receiver
 from worldstate.simulation.sound.static_field import StaticSources, plane_wave_delays, unit_vectors
-from worldstate.simulation.sound.vehicle_sound import add_vehicle
-from worldstate.simulation.sound.wave_field import BlockGrid, WaveField
 
 FS = 8000.0
 

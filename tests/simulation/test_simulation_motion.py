@@ -23,7 +23,7 @@ from worldstate.simulation import (
 )
 from worldstate.simulation.scene.driving import trajectories
 from worldstate.simulation.scene.junction import Site
-from worldstate.simulation.scene.route import EgoMotion
+from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.sound import scatter
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS

@@ -15,11 +15,12 @@ from worldstate.simulation.scene.junction import place
 from worldstate.simulation.scene.kinds import KINDS, LIGHT, vehicle_kind
 from worldstate.simulation.scene.occluders import OccludingBody, box, detours, hidden_by
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks
-from worldstate.simulation.scene.route import BRAKING_MPS2, EgoMotion
 from worldstate.simulation.scene.vehicle import (
+    BRAKING_MPS2,
     GEARS_HZ_PER_MPS,
     IDLE_HZ,
     TURN_MPS,
+    EgoMotion,
     Trajectory,
     drive,
     emit,

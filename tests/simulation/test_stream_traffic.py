@@ -15,8 +15,8 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.junction import place
 from worldstate.simulation.scene.kinds import LIGHT, vehicle_kind
-from worldstate.simulation.scene.route import along
 from worldstate.simulation.scene.settings import SoundSettings
+from worldstate.simulation.scene.vehicle import along
 from worldstate.simulation.stream.arrivals import (
     SoundEvent,
     VehicleEvent,

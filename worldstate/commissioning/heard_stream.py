@@ -14,7 +14,6 @@ import numpy as np
 from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.approach.tone import ENGINE_BAND_HZ, ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.frame import AcousticFrame
@@ -284,7 +283,6 @@ def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
     # Simulated microphones do not fail, and watching them takes a third of the time.
     return FrontEndSettings(
         nfft=feature_nfft(sample_rate_hz),
-        tone_band_hz=ENGINE_BAND_HZ,
         level_band_hz=LEVEL_BAND_HZ,
         watch_channels=False,
     )
@@ -292,7 +290,6 @@ def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
 
 def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.ndarray]:
     looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
-    tones = [one.tone if isinstance(one.tone, ToneReading) else None for one in frames]
     return {
         "time_s": np.array([one.stamp_ns for one in frames]) * 1e-9,
         "feature": np.array([one.feature for one in frames], np.float32),
@@ -302,8 +299,6 @@ def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.
         "band_log_energy": np.array([one.band_log_energy for one in frames], np.float32),
         "looming_hz": np.array([np.nan if one is None else one.inverse_tta_hz for one in looming]),
         "looming_std_hz": np.array([np.nan if one is None else one.std_hz for one in looming]),
-        "tone_hz": np.array([np.nan if one is None else one.frequency_hz for one in tones]),
-        "tone_std_hz": np.array([np.nan if one is None else one.frequency_std_hz for one in tones]),
         "middle": _last_hops(middle, [one.sample_index for one in frames]),
     }
 

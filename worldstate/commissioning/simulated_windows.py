@@ -184,7 +184,10 @@ _HEAD_S, _WINDOW_S, _SCALE_PA = 0.4, 1.0, 20.0
 
 @dataclass(frozen=True, slots=True)
 class OpenSource:
-    """One source in the open: where it is in the middle of the window, how it moves, how loud it is."""
+    """One source in the open: where it is in the middle of the window, how it moves, how loud it is.
+
+    Nothing of it is of a site: such windows teach a model a source whose bearing is its direction.
+    """
 
     azimuth_rad: float
     distance_m: float

@@ -298,8 +298,7 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     from dataclasses import replace
 
     from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset
-    from worldstate.simulation.dataset.dataset import write_dataset
-    from worldstate.simulation.dataset.plan import DatasetSettings
+    from worldstate.simulation.dataset.dataset import DatasetSettings, write_dataset
 
     root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)

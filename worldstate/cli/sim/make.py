@@ -38,7 +38,7 @@ from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from worldstate.simulation.dataset.plan import DatasetSettings
+    from worldstate.simulation.dataset.dataset import DatasetSettings
     from worldstate.simulation.stream.settings import StreamSettings
 
 # Named here again: the help is built without importing the simulation. A test compares them.
@@ -153,7 +153,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from dataclasses import replace
 
     from worldstate.ground.checks import in_range
-    from worldstate.simulation.dataset.plan import BANDWIDTHS_HZ
+    from worldstate.simulation.dataset.dataset import BANDWIDTHS_HZ
     from worldstate.simulation.scene.junction import site
     from worldstate.simulation.scene.presets import preset
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
@@ -177,7 +177,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
 
 
 def _settings(arguments: argparse.Namespace) -> "DatasetSettings":
-    from worldstate.simulation.dataset.plan import DatasetSettings
+    from worldstate.simulation.dataset.dataset import DatasetSettings
 
     static = arguments.static
     return DatasetSettings(
