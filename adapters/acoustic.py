@@ -2,14 +2,38 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
-from worldstate.abduction.road_users import ClassShares, RoadUserModel
+from worldstate.abduction.grounding.grounded_likelihood import (
+    Descriptor,
+    GroundedAnswer,
+    GroundedObservation,
+    GroundedSettings,
+    Observable,
+    car,
+    ground,
+    motorcycle,
+)
+from worldstate.abduction.road_users import (
+    SEEN_AS,
+    SIREN,
+    UNKNOWN,
+    ClassShares,
+    RoadUserModel,
+    likeliest,
+    with_siren,
+)
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
-from worldstate.abduction.signature.domain_guard import DomainGuard, DomainVerdict, Foreign, neutral
+from worldstate.abduction.signature.domain_guard import (
+    DomainGuard,
+    DomainVerdict,
+    Foreign,
+    WarningSignal,
+    neutral,
+)
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.camera.several_cameras import SeveralCameras
 from worldstate.adapters.files.acoustic_domain import feature_order
@@ -18,7 +42,7 @@ from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.sound_character import MEASURES
+from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import OutOfDomainError
@@ -33,9 +57,12 @@ from worldstate.measurement.measurement import (
     Side,
 )
 
-from .acoustic_grounding import Grounding, observe
-from .acoustic_kinds import check_road_users, expected_labels, heard_kinds
 from .acoustic_sequence import LEVEL_BAND_HZ, read_hop
+
+# Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
+# would take a wrong guess of the ear for a look at the right thing.
+_ASKED = 0.95
+LINE_SPACING = "line_spacing_hz"
 
 
 class Signature(Protocol):
@@ -85,6 +112,42 @@ class AcousticSettings:
     def __post_init__(self) -> None:
         in_range("min_prominence", self.min_prominence, 1.0, math.inf)
         in_range("coarse_std_rad", self.coarse_std_rad, 0.0, math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class Grounding:
+    """Which road users are reckoned with, and which ties between their sound and their motion.
+
+    Parameters
+    ----------
+    descriptors : tuple of Descriptor
+        Classes of road users, at least one.
+    settings : GroundedSettings
+        Sectors, and couplings that are switched off.
+
+    Examples
+    --------
+    >>> scores = SignatureEvidence(("left", "right"), (1.0, -1.0), 0.0, 0.0)
+    >>> observation = GroundedObservation(inverse_tta_hz=Observable(0.4, 0.05))
+    >>> answer = Grounding().answer(scores, observation)
+    >>> answer.best.entity_class, answer.evidence.hidden[0] > 1.0
+    ('motor_vehicle', True)
+    """
+
+    descriptors: tuple[Descriptor, ...] = (car(), motorcycle())
+    settings: GroundedSettings = field(default_factory=GroundedSettings)
+
+    def answer(self, signature: SignatureEvidence, observation: GroundedObservation) -> GroundedAnswer:
+        """Return likelihoods of the explanations and the hidden state that explains the observation best.
+
+        Parameters
+        ----------
+        signature : SignatureEvidence
+            From calibrated scores.
+        observation : GroundedObservation
+            From `observe`.
+        """
+        return ground(signature, observation, self.descriptors, self.settings)
 
 
 class AcousticAdapter(MeasurementAdapter[Float32Array]):
@@ -326,3 +389,56 @@ def _likelier_side(signature: SignatureEvidence) -> Side | None:
     if left is None or right is None or left == right:
         return None
     return "left" if left > right else "right"
+
+
+def check_road_users(model: RoadUserModel) -> None:
+    """Refuse a model that reads other numbers than the front-end measures."""
+    if model.measures != (*MEASURES, *BANDS):
+        expected = f"one of {len(MEASURES) + len(BANDS)} measures of this version"
+        raise OutOfDomainError(f"road users: expected {expected}, got {len(model.measures)} others")
+
+
+def heard_kinds(model: RoadUserModel, character: FloatArray, domain: DomainVerdict | None) -> ClassShares:
+    """Return the classes of one hop; none where the sound is foreign."""
+    if isinstance(domain, Foreign):
+        return ()
+    shares = model.classify(character)
+    if isinstance(domain, WarningSignal) and domain.signal == SIREN:
+        return with_siren(shares, domain.log_odds)
+    return shares
+
+
+def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
+    """Return the detector's classes that what is heard may be; None where it may be anything.
+
+    Examples
+    --------
+    >>> sorted(expected_labels((("car", 0.9), ("unknown", 0.01), ("van", 0.09))))
+    ['car', 'truck']
+    >>> expected_labels((("car", 0.9), ("unknown", 0.1))) is expected_labels(()) is None
+    True
+    """
+    likely = likeliest(kinds, _ASKED)
+    if not likely or likely & {UNKNOWN, SIREN}:
+        return None
+    return frozenset().union(*(SEEN_AS[name] for name in likely))
+
+
+def observe(
+    frame: AcousticFrame, bearing: Bearing | NotUsable, approach: Approach | NotUsable
+) -> GroundedObservation:
+    """Return what a frame says beside its feature; spreads are those of the estimators' own bounds."""
+    # Where the front-end looks for an engine line (`FrontEndSettings.tone_band_hz`), it is the spacing of the
+    # harmonics: two firings a turn leave the first of them the strongest.
+    tone, lines = frame.tone, {}
+    if not isinstance(tone, NotUsable):
+        lines[LINE_SPACING] = Observable(tone.frequency_hz, tone.frequency_std_hz)
+    return GroundedObservation(
+        bearing_rad=bearing
+        if isinstance(bearing, NotUsable)
+        else Observable(bearing.azimuth_rad, bearing.std_rad),
+        inverse_tta_hz=approach
+        if isinstance(approach, NotUsable)
+        else Observable(approach.inverse_tta_hz, approach.std_hz),
+        signature=lines,
+    )

@@ -7,9 +7,8 @@ import numpy as np
 from worldstate.ground.typing import ImageArray
 from worldstate.ground.values import nanoseconds
 
-from .camera_health import DegradationLog, HealthMonitor
+from .camera_health import DegradationLog, HealthMonitor, image_quality
 from .detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
-from .image_quality import image_quality
 from .miss_rates import MissRates
 from .video import Video
 

@@ -7,7 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
 
 from .box_linking import overlaps
@@ -161,10 +162,7 @@ def open_onnx(path: str | Path, labels: tuple[str, ...]) -> OnnxDetector:
             raise InputFileError(name, f"expected a model of at most {MAX_BYTES >> 30} GiB")
     except OSError as error:
         raise InputFileError(name, f"expected an ONNX model ({error.strerror})") from error
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise MissingExtraError("onnxruntime", "onnx") from error
+    onnxruntime = optional("onnxruntime")
     try:
         session = onnxruntime.InferenceSession(str(name), providers=["CPUExecutionProvider"])
         return OnnxDetector(session, labels)

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
@@ -24,7 +24,7 @@ class SeveralCameras:
 
     .. math:: \beta = \sum_P s(P) \prod_{i \in c(P)} \beta_i(P)
 
-    which is s(P) where nobody looks. Given where the vehicle is, cameras are taken to miss it independently:
+    which is s(P) where none looks. Given where the vehicle is, cameras are taken to miss it independently:
     what blinds all at once, as rain does, has to stand in the miss rate of each, through its degradation.
 
     Parameters
@@ -82,21 +82,19 @@ class SeveralCameras:
 
     def looks(self, stamp_ns: int) -> tuple[CameraLook, ...]:
         """Return the image of every camera that has one at this instant, searched in its own view."""
-        return tuple(self._each(stamp_ns))
+        return tuple(
+            CameraLook(replace(look, sensor=name, sector_rad=one.camera.view_rad), one.sightings(stamp_ns))
+            for name, one in self.cameras.items()
+            if (look := one.last_look(stamp_ns)) is not None
+        )
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         """Return the boxes of the first camera that has an image; `looks` has those of all."""
-        return next((one.sightings for one in self._each(stamp_ns)), ())
+        return next((one.sightings for one in self.looks(stamp_ns)), ())
 
     def last_look(self, stamp_ns: int) -> Look | None:
         """Return the look of the first camera that has an image, None without one."""
-        return next((one.look for one in self._each(stamp_ns)), None)
-
-    def _each(self, stamp_ns: int) -> Iterator[CameraLook]:
-        for name, one in self.cameras.items():
-            if (look := one.last_look(stamp_ns)) is not None:
-                own = replace(look, sensor=name, sector_rad=one.camera.view_rad)
-                yield CameraLook(own, one.sightings(stamp_ns))
+        return next((one.look for one in self.looks(stamp_ns)), None)
 
 
 def _parts(sector: Sector, views: Sequence[Sector]) -> list[tuple[float, Sector]]:

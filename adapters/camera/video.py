@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from worldstate.ground.errors import InputFileError, MissingExtraError
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import ImageArray
 
 from .detections import MAX_FRAMES
@@ -24,11 +25,7 @@ def opencv() -> Any:
     >>> opencv().__name__
     'cv2'
     """
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingExtraError("opencv-python-headless", "vision") from error
-    return cv2
+    return optional("cv2")
 
 
 @dataclass(frozen=True, slots=True)

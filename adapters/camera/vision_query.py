@@ -131,11 +131,11 @@ class VisionQuery:
         # The field of view is applied here, so that the default table covers the whole half plane.
         self.miss_rate = miss_rate or default_miss_rates(half_view_deg=90.0)
         self.settings = settings or VisionSettings()
-        self._degradation = degradation
+        self._degradation = degradation if callable(degradation) else lambda stamp_ns: degradation
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
         self.view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
-        self._clutter = clutter
+        self._clutter = clutter or (lambda d: self.settings.clutter_rate)
         # As background subtraction does: asked for a truck it would never find one.
         named = () if detections is None else (frame.labels for frame in detections.frames)
         self._calls_all_cars = set().union(*named) == {"car"}
@@ -182,11 +182,11 @@ class VisionQuery:
         if not any(label in self.settings.keep.labels for label in labels):
             return Unqueried("the signature predicts no class that a camera would see")
         sector = self.sector(bearing, side)
-        d = self._degraded(stamp_ns)
+        d = self._degradation(stamp_ns)
         beta = self._expected_miss_rate(sector, d, labels)
         if beta is None:
             return Unqueried("sector outside the field of view")
-        clutter = self._clutter_rate(d)
+        clutter = self._clutter(d)
         found = any(
             sighting.moving
             and sighting.label in labels
@@ -241,17 +241,11 @@ class VisionQuery:
         frame = self._frame(stamp_ns)
         if frame is None or self.detections is None:
             return None
-        d = self._degraded(stamp_ns)
+        d = self._degradation(stamp_ns)
         beta = self._expected_miss_rate(self.view, d, self.settings.keep.labels)
         moving = any(sighting.moving for sighting in self.sightings(stamp_ns))
-        answer = (Present if moving else Absent)(1.0 if beta is None else beta, self._clutter_rate(d))
+        answer = (Present if moving else Absent)(1.0 if beta is None else beta, self._clutter(d))
         return Look(SENSOR, int(self.detections.stamps_ns[frame]), answer)
-
-    def _degraded(self, stamp_ns: int) -> float:
-        return self._degradation(stamp_ns) if callable(self._degradation) else self._degradation
-
-    def _clutter_rate(self, d: float) -> float:
-        return self.settings.clutter_rate if self._clutter is None else self._clutter(d)
 
     def _frame(self, stamp_ns: int) -> int | None:
         if self.detections is None:
@@ -268,7 +262,7 @@ class VisionQuery:
 
     def miss_rate_over(self, sector: Sector, stamp_ns: int, labels: Collection[str] | None) -> float:
         """Return the expected miss rate in a sector, 1 where nothing of it is in view."""
-        beta = self._expected_miss_rate(sector, self._degraded(stamp_ns), self._asked_for(labels))
+        beta = self._expected_miss_rate(sector, self._degradation(stamp_ns), self._asked_for(labels))
         return 1.0 if beta is None else beta
 
     def _asked_for(self, expected: Collection[str] | None) -> Collection[str]:

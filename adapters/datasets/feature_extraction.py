@@ -1,4 +1,4 @@
-"""Extraction of labelled feature windows from recordings of any array."""
+"""Labelled one-second windows of recordings, from a list or from OVAD's layout, and their features."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,11 +21,13 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .feature_table import FeatureTable, t0_of
-from .ovad import AUDIO_NAME
+from .ovad import AUDIO_NAME, FRAME_RATE_HZ, OvadDataset, Recording
 
 WINDOW_S = 1.0
 REQUIRED = ("ID", "Class", "Environment", "Recording ID")
 OPTIONAL = ("File", "End", "T0")
+MOVING_LATER_S, FRONT_LATER_S = 0.5, 1.5
+FRONT = "front"
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,12 +141,12 @@ def feature_table(
     columns = zip(*((w.label, w.window_id, w.environment, w.recording) for w in windows), strict=True)
     labels, ids, environments, recordings = (np.array(column) for column in columns)
     t0_frames = tuple(w.t0_frame for w in windows)
-    rates = {source_rate_hz(path) for path in {w.path for w in windows}}
+    rates = {_rate_hz(path) for path in {w.path for w in windows}}
     domain = domain_of(array, sorted(rates), environments.tolist(), version)
     return FeatureTable(np.array(features), labels, ids, environments, recordings, t0_frames, domain)
 
 
-def source_rate_hz(path: Path) -> int:
+def _rate_hz(path: Path) -> int:
     """Return the sample rate of a sound file."""
     with open_audio(path, strict=False) as source:
         return source.sample_rate_hz
@@ -152,7 +154,7 @@ def source_rate_hz(path: Path) -> int:
 
 def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
     """Return the second before the end of the window, shape (n, M)."""
-    length = _second(source)
+    length = round(WINDOW_S * source.sample_rate_hz)
     return source.span(_ends_at(source, window) - length, length)
 
 
@@ -160,14 +162,10 @@ def _ends_at(source: AudioSource, window: LabelledWindow) -> int:
     """Return the sample that a window of a second ends before."""
     rate = source.sample_rate_hz
     end = source.frames if window.end_s is None else round(window.end_s * rate)
-    if end > source.frames or end < _second(source):
+    if end > source.frames or end < round(WINDOW_S * rate):
         at = "" if window.end_s is None else f" before {window.end_s:g} s"
         raise InputFileError(source.path, f"expected a second of sound{at}, got {source.duration_s:.3g} s")
     return end
-
-
-def _second(source: AudioSource) -> int:
-    return round(WINDOW_S * source.sample_rate_hz)
 
 
 def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> LabelledWindow:
@@ -196,3 +194,51 @@ def _sound_file(name: Path, root: Path, line: int, row: dict[str, str]) -> Path:
         if (root / relative).is_file():
             return root / relative
     raise InputFileError(name, f"line {line}: expected a file {' or '.join(candidates)} in the data set")
+
+
+def window_ends_s(label: str, t0_s: float, moving_ego: bool) -> dict[str, float]:
+    """Return by label when the windows of a recording end.
+
+    Examples
+    --------
+    >>> window_ends_s("left", 7.0, moving_ego=False), window_ends_s("none", 7.0, moving_ego=True)
+    ({'left': 7.0, 'front': 8.5}, {'none': 7.5})
+    """
+    # With a standing ego the window of the recording's own label ends at T0, with a moving one 0.5 s later;
+    # an approach has a front window besides, which ends 1.5 s after that.
+    end_s = t0_s + (MOVING_LATER_S if moving_ego else 0.0)
+    return {label: end_s} if label == "none" else {label: end_s, FRONT: end_s + FRONT_LATER_S}
+
+
+def sample_windows(root: str | Path) -> tuple[list[LabelledWindow], int]:
+    """List the windows of every recording that ``DataLog.csv`` names."""
+    # Front windows are numbered among themselves, class number 0, as in the released list.
+    windows: list[LabelledWindow] = []
+    fronts = left_out = 0
+    for order, recording in enumerate(OvadDataset(root).recordings):
+        found = _windows(recording, str(order), fronts)
+        fronts += sum(window.label == FRONT for window in found)
+        with recording.open_audio() as source:
+            inside = [w for w in found if w.end_s and WINDOW_S <= w.end_s <= source.duration_s]
+        windows += inside
+        left_out += len(found) - len(inside)
+    return windows, left_out
+
+
+def _windows(recording: Recording, number: str, fronts: int) -> list[LabelledWindow]:
+    label, place, frame = recording.label, recording.environment, recording.logged_frame
+    if label is None or place is None or frame is None:
+        return []
+    front_id = f"0{recording.recording_id[1:5]}{fronts:04d}"
+    return [
+        LabelledWindow(
+            window_id=front_id if what == FRONT else recording.recording_id,
+            label=what,
+            environment=place,
+            recording=number,
+            t0_frame=frame,
+            path=recording.audio_path,
+            end_s=end_s,
+        )
+        for what, end_s in window_ends_s(label, frame / FRAME_RATE_HZ, bool(recording.moving_ego)).items()
+    ]

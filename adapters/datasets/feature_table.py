@@ -8,9 +8,9 @@ degrees and grow to the right, as in the released data and in `frontend.directio
 import csv
 import json
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,6 +28,7 @@ LONGEST_NAME = 100
 LABEL_COLUMNS = ("Class", "ID", "Environment", "T0", "Recording ID")
 
 Group = Literal["static", "dynamic", "all"]
+_ROWS = ("features", "labels", "ids", "environments", "recordings")
 _PREFIX = {"static": "S", "dynamic": "D", "all": ""}
 
 
@@ -85,15 +86,8 @@ class FeatureTable:
     def select(self, chosen: BoolArray) -> "FeatureTable":
         """Return the rows where `chosen` is true."""
         kept = np.flatnonzero(chosen)
-        return FeatureTable(
-            self.features[kept],
-            self.labels[kept],
-            self.ids[kept],
-            self.environments[kept],
-            self.recordings[kept],
-            tuple(self.t0_frames[i] for i in kept),
-            self.domain,
-        )
+        rows: dict[str, Any] = {name: getattr(self, name)[kept] for name in _ROWS}
+        return replace(self, t0_frames=tuple(self.t0_frames[i] for i in kept), **rows)
 
     def group(self, group: Group) -> "FeatureTable":
         """Return the windows of a standing ego (static), a moving one (dynamic) or all.
@@ -108,15 +102,10 @@ class FeatureTable:
 
     def joined(self, other: "FeatureTable") -> "FeatureTable":
         """Return these windows and those of another table below them; the domain is this table's."""
-        return FeatureTable(
-            np.concatenate([self.features, other.features]),
-            np.concatenate([self.labels, other.labels]),
-            np.concatenate([self.ids, other.ids]),
-            np.concatenate([self.environments, other.environments]),
-            np.concatenate([self.recordings, other.recordings]),
-            self.t0_frames + other.t0_frames,
-            self.domain,
-        )
+        rows: dict[str, Any] = {
+            name: np.concatenate([getattr(one, name) for one in (self, other)]) for name in _ROWS
+        }
+        return replace(self, t0_frames=self.t0_frames + other.t0_frames, **rows)
 
     def only(self, ids: Collection[str]) -> "FeatureTable":
         """Return all windows of the recordings that hold a window of one of these IDs.

@@ -6,7 +6,6 @@
 
 import re
 from collections import Counter
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, final, get_args
@@ -141,9 +140,6 @@ class OvadDataset:
     ----------
     root : str or Path
         Folder with ``DataLog.csv``.
-    ids : collection of str, optional
-        Keep these only, as `read_ids` reads them from an official list. Some may be in another data set;
-        at least one must be here.
 
     Attributes
     ----------
@@ -156,7 +152,7 @@ class OvadDataset:
     ------
     InputFileError
         If the log is missing or damaged: columns missing, an ID twice, an environment or class that is none,
-        T0 no integer, or nothing of `ids` in it.
+        T0 no integer.
 
     Examples
     --------
@@ -168,14 +164,9 @@ class OvadDataset:
     [('1_00_0002', 'A1', 'left', 7.0)]
     """
 
-    def __init__(self, root: str | Path, ids: Collection[str] | None = None) -> None:
+    def __init__(self, root: str | Path) -> None:
         self.root = Path(root)
-        listed = _read_log(self.root)
-        kept = tuple(r for r in listed if ids is None or r.recording_id in ids)
-        if ids is not None and not kept:
-            problem = f"expected some of the {len(ids)} wanted IDs, found none"
-            raise InputFileError(self.root / LOG_NAME, problem)
-        self.recordings = kept
+        self.recordings = _read_log(self.root)
 
     def __len__(self) -> int:
         return len(self.recordings)

@@ -4,12 +4,11 @@ import struct
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from worldstate.adapters.files.atomic import atomic_path
-from worldstate.ground.errors import MissingExtraError
+from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.values import seconds
 from worldstate.state import WorldState
 
@@ -29,9 +28,9 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
     >>> osi_sensor_data(WorldState(1_500_000_000, 7)).moving_object_header.cycle_counter
     7
     """
-    osi3 = _osi3()
-    data = osi3.SensorData()
-    data.version.CopyFrom(osi3.version)
+    described, data = optional("osi3.osi_version_pb2"), optional("osi3.osi_sensordata_pb2").SensorData()
+    version = described.DESCRIPTOR.GetOptions().Extensions[described.current_interface_version]
+    data.version.CopyFrom(version)
     for stamp in (data.timestamp, data.last_measurement_time, data.moving_object_header.measurement_time):
         stamp.seconds, stamp.nanos = divmod(state.stamp_ns, 1_000_000_000)
     data.sensor_id.value = 1
@@ -51,7 +50,7 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
 @contextmanager
 def osi_trace(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
     """Lend a function that writes states to a single-channel trace: length, little endian, and message."""
-    _osi3()
+    check_extra("osi3")
     with atomic_path(path) as temporary, temporary.open("wb") as file:
 
         def write(state: WorldState) -> None:
@@ -81,7 +80,7 @@ def _fill(moving: Any, one: LaneObject) -> None:
     size = base.dimension
     size.length, size.width, size.height = SIZES_M.get(likeliest_label(one), CAR_M)
     moving.movement_state = moving.MOVEMENT_STATE_MOVING
-    kinds = _osi3().MovingObject
+    kinds = optional("osi3.osi_object_pb2").MovingObject
     for said in entity.classification:
         number, candidate = LABELS.get(said.label, 0), moving.candidate.add()
         candidate.probability = said.probability
@@ -95,22 +94,3 @@ def _fill(moving: Any, one: LaneObject) -> None:
         if number in _VEHICLES:
             name = _VEHICLES[number]
             candidate.vehicle_classification.type = getattr(kinds.VehicleClassification, name)
-
-
-@dataclass(frozen=True, slots=True)
-class _Osi3:
-    """What is used of the modules that protobuf makes one a file."""
-
-    SensorData: Any
-    MovingObject: Any
-    version: Any  # Of the interface, as the package states it
-
-
-def _osi3() -> _Osi3:
-    try:
-        from osi3 import osi_object_pb2, osi_sensordata_pb2, osi_version_pb2
-    except ImportError as error:
-        raise MissingExtraError("osi-python", "osi") from error
-    options = osi_version_pb2.DESCRIPTOR.GetOptions()
-    version = options.Extensions[osi_version_pb2.current_interface_version]
-    return _Osi3(osi_sensordata_pb2.SensorData, osi_object_pb2.MovingObject, version)

@@ -135,20 +135,18 @@ def checked_array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> 
 
 
 def _check_size(path: Path, positions_m: FloatArray) -> None:
-    aperture_m = float(np.ptp(positions_m, axis=0).max())
-    if aperture_m > MAX_APERTURE_M:
-        problem = f"expected positions in metres, got an array {aperture_m:g} wide: millimetres?"
-        raise InputFileError(path, problem)
-    spacings_m = nearest_spacings_m(positions_m)
-    if spacings_m.mean() > MAX_SPACING_M:
-        got = f"microphones {spacings_m.mean():g} apart"
-        raise InputFileError(path, f"expected positions in metres, got {got}: centimetres?")
-    if 0.0 < spacings_m.min() < MIN_SPACING_M:
-        problem = f"expected positions in metres, got microphones {spacings_m.min():g} apart"
-        raise InputFileError(path, problem)
-    if np.ptp(positions_m[:, :2], axis=0).max() < MIN_SPACING_M and spacings_m.min() > 0.0:
-        problem = "expected a horizontal extent, got a vertical line, which hears every azimuth alike"
-        raise InputFileError(path, problem)
+    extent_m, spacings_m = np.ptp(positions_m, axis=0), nearest_spacings_m(positions_m)
+    wide_m, mean_m, least_m = float(extent_m.max()), spacings_m.mean(), spacings_m.min()
+    upright = extent_m[:2].max() < MIN_SPACING_M and least_m > 0.0
+    metres = "expected positions in metres, got"
+    for wrong, problem in (
+        (wide_m > MAX_APERTURE_M, f"{metres} an array {wide_m:g} wide: millimetres?"),
+        (mean_m > MAX_SPACING_M, f"{metres} microphones {mean_m:g} apart: centimetres?"),
+        (0.0 < least_m < MIN_SPACING_M, f"{metres} microphones {least_m:g} apart"),
+        (upright, "expected a horizontal extent, got a vertical line, which hears every azimuth alike"),
+    ):
+        if wrong:
+            raise InputFileError(path, problem)
 
 
 def _xml_positions(path: Path, data: bytes) -> list[list[float]]:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.listen import Source, Step, listen_steps
+from worldstate.adapters.listen import Step, listen_steps
+from worldstate.adapters.source import Source
 from worldstate.ground.errors import InvalidArgumentError
 
 from .live_sound import LiveSound

@@ -122,9 +122,7 @@ class LiveSound(Audio):
 
     def check_size(self, expect_channels: int | None) -> None:
         """Refuse another number of channels than microphones; how long it will be is not known."""
-        if expect_channels is not None and self.channels != expect_channels:
-            expected = f"expected {expect_channels} channels, one per microphone"
-            raise InputFileError(self.path, f"{expected}, got {self.channels}")
+        self.check_channels(expect_channels)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the sound from now until the source ends or is closed, in blocks of the source's length."""

@@ -3,7 +3,8 @@
 import time
 from typing import Any
 
-from worldstate.ground.errors import InvalidArgumentError, MissingExtraError, WorldstateError
+from worldstate.ground.errors import InvalidArgumentError, WorldstateError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array
 
 from .bounded_channel import BoundedChannel
@@ -28,16 +29,13 @@ def portaudio() -> Any:
         If it finds no PortAudio library.
     """
     try:
-        import sounddevice
-    except ImportError as error:
-        raise MissingExtraError("sounddevice", "live") from error
+        return optional("sounddevice")
     except OSError as error:
         raise MissingPortAudioError(
             "expected the system's library PortAudio, found none: install it "
             "(Debian, Ubuntu: apt-get install libportaudio2; Fedora: dnf install portaudio; "
             "macOS and Windows: it comes with sounddevice)"
         ) from error
-    return sounddevice
 
 
 class PortAudioInput:

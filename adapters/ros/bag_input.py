@@ -1,5 +1,7 @@
 """What a bag holds for a world-state: sound, array, detections and the speed of the ego."""
 
+import io
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.audio.open_sound import MAX_CHANNELS
+from worldstate.adapters.audio.open_sound import MAX_CHANNELS, Encoding, RawPcm, SoundStream
+from worldstate.adapters.audio.sound_file import Audio, check_finite, constant_channels
 from worldstate.adapters.camera.detections import (
     MAX_BOXES_A_FRAME,
     MAX_FRAMES,
@@ -18,11 +21,196 @@ from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import Float32Array
+from worldstate.ground.values import seconds
 from worldstate.measurement.odometry import Odometry
 
-from .bag_audio import AUDIO_KINDS, BagSound, first_stamp
 from .bag_reader import BagReader, open_bag
-from .message_types import ARRAY, DETECTIONS, ODOMETRY, stamp_of
+from .message_types import ARRAY, AUDIO, DETECTIONS, ODOMETRY, PCM, PCM_INFO, STAMPED_PCM, stamp_of
+
+_LOG = logging.getLogger(__name__)
+
+AUDIO_KINDS = AUDIO, STAMPED_PCM, PCM
+# Formats that audio_common names; a compressed one has lost the phase between microphones.
+ENCODINGS: dict[str, Encoding] = {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"}
+MAX_RATE_HZ = 10_000_000
+# Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
+LONGEST_GAP_S = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AudioBlock:
+    """Samples of one message."""
+
+    stamp_ns: int  # Time of the first sample
+    sample_rate_hz: int
+    samples: Float32Array  # Shape (n, M), full scale 1
+
+    @property
+    def duration_s(self) -> float:
+        """Length, seconds."""
+        return len(self.samples) / self.sample_rate_hz
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the sample that would follow."""
+        return self.stamp_ns + round(len(self.samples) * 1_000_000_000 / self.sample_rate_hz)
+
+
+@dataclass(frozen=True, slots=True)
+class BagSound(SoundStream):
+    """A topic of a bag that holds sound, on the clock of its stamps."""
+
+    path: Path
+    topic: str
+    start_ns: int
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return str(self.path)
+
+    def open(self) -> "BagAudio":
+        """Open it at its start."""
+        return BagAudio(self)
+
+    def blocks(self) -> Iterator[AudioBlock]:
+        """Yield what each message holds."""
+        with open_bag(self.path) as bag:
+            yield from audio_blocks(bag, self.topic)
+
+
+class BagAudio(Audio):
+    """Sound of a bag that is being read; lost messages are filled with silence."""
+
+    def __init__(self, sound: BagSound) -> None:
+        self._sound, self.path = sound, sound.path
+        with open_bag(sound.path) as bag:
+            parts = _first_second(audio_blocks(bag, sound.topic), sound)
+            counted = bag.count(sound.topic) * len(parts[0].samples)
+        first = np.concatenate([part.samples for part in parts])
+        self.sample_rate_hz, self.channels = parts[0].sample_rate_hz, first.shape[1]
+        self.silent_channels = constant_channels(first)
+        # As many as there are while all are as long as the first; less than a second is counted exactly.
+        self.frames = max(counted, len(first)) if len(first) >= self.sample_rate_hz else len(first)
+
+    def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
+        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+        held = np.empty((0, self.channels), np.float32)
+        for part in _without_gaps(self._sound.blocks(), self._sound):
+            held = np.concatenate([held, part.samples])
+            for start in range(0, len(held) - frames + 1, frames):
+                yield held[start : start + frames]
+            held = held[len(held) // frames * frames :]
+        if len(held):
+            yield held
+
+    def close(self) -> None:
+        """Do nothing: the bag is open while its blocks are read."""
+
+
+def first_stamp(bag: BagReader, topic: str) -> int:
+    """Return the time of a topic's first sample, ns."""
+    block = next(audio_blocks(bag, topic), None)
+    if block is None:
+        raise InputFileError(bag.path, f"expected samples on {topic}, it holds no message")
+    return block.stamp_ns
+
+
+def audio_blocks(bag: BagReader, topic: str) -> Iterator[AudioBlock]:
+    """Yield what each message of a topic holds, checked against the first."""
+    kind, first, taken = bag.kind_of(topic), None, 0
+    info = None if kind == AUDIO else _pcm_info(bag, topic)
+    for recorded_ns, message in bag.messages(topic):
+        block = _own_block(bag.path, message) if info is None else _pcm_block(info, message, recorded_ns)
+        first = first or block
+        got = block.sample_rate_hz, block.samples.shape[1]
+        if got != (wanted := (first.sample_rate_hz, first.samples.shape[1])):
+            told = "expected {} Hz and {} channels as in the first message of {}, got {} and {}"
+            raise InputFileError(bag.path, told.format(*wanted, topic, *got))
+        check_finite(bag.path, block.samples, taken)
+        taken += len(block.samples)
+        yield block
+
+
+def _own_block(path: Path, message: Any) -> AudioBlock:
+    rate_hz, channels, data = int(message.sample_rate), int(message.channels), message.data
+    if not (1 <= rate_hz <= MAX_RATE_HZ and 1 <= channels <= MAX_CHANNELS):
+        expected = f"expected 1 to {MAX_RATE_HZ} samples a second and 1 to {MAX_CHANNELS} channels"
+        raise InputFileError(path, f"{expected}, got {rate_hz} and {channels}")
+    if len(data) % channels or not len(data):
+        raise InputFileError(path, f"expected samples of {channels} channels, got {len(data)} numbers")
+    if message.layout not in ("interleaved", "planar"):
+        raise InputFileError(path, f"layout: expected interleaved or planar, got {message.layout!r:.40}")
+    flat = np.asarray(data, dtype=np.float32)
+    planar = message.layout == "planar"
+    samples = flat.reshape(channels, -1).T if planar else flat.reshape(-1, channels)
+    return AudioBlock(stamp_of(message.header), rate_hz, np.ascontiguousarray(samples))
+
+
+def _pcm_info(bag: BagReader, topic: str) -> RawPcm:
+    """Return how the bytes of audio_common are to be read, as its AudioInfo says."""
+    where = bag.topic("the topic of AudioInfo", None, PCM_INFO)
+    said = None if where is None else next(bag.messages(where), None)
+    if said is None:
+        problem = f"expected {PCM_INFO} beside {topic}: rate, channels and format of its bytes"
+        raise InputFileError(bag.path, problem)
+    info = said[1]
+    if info.sample_format not in ENCODINGS or info.coding_format.lower() not in ("wave", "raw", ""):
+        got = f"{info.sample_format!r:.20} as {info.coding_format!r:.20}"
+        problem = f"{where}: expected one of {', '.join(ENCODINGS)}, uncompressed (wave), got {got}"
+        raise InputFileError(bag.path, problem)
+    encoding = ENCODINGS[info.sample_format]
+    return RawPcm(io.BytesIO(), int(info.sample_rate), int(info.channels), encoding, str(bag.path))
+
+
+def _pcm_block(info: RawPcm, message: Any, recorded_ns: int) -> AudioBlock:
+    stamped = hasattr(message, "header")
+    data = bytes(message.audio.data if stamped else message.data)
+    if not data or len(data) % info.frame_bytes:
+        expected = f"expected whole samples of {info.channels} channels"
+        raise InputFileError(info.name, f"{expected}, got {len(data)} bytes")
+    samples = info.to_samples(data)
+    # Without a stamp it was recorded when its last sample was there.
+    early_ns = round(len(samples) * 1_000_000_000 / info.sample_rate_hz)
+    stamp_ns = stamp_of(message.header) if stamped else max(recorded_ns - early_ns, 0)
+    return AudioBlock(stamp_ns, info.sample_rate_hz, samples)
+
+
+def _without_gaps(blocks: Iterator[AudioBlock], sound: BagSound) -> Iterator[AudioBlock]:
+    """Yield blocks with silence where messages are missing; refuse long gaps and stamps that go back."""
+    before: AudioBlock | None = None
+    for block in blocks:
+        if before is not None:
+            late_s = seconds(block.stamp_ns - before.end_ns)
+            at_s = seconds(before.end_ns - sound.start_ns)
+            if block.stamp_ns <= before.stamp_ns or late_s > LONGEST_GAP_S:
+                expected = f"expected messages on {sound.topic} in order, at most {LONGEST_GAP_S:g} s apart"
+                got = f"at {at_s:.3f} s the next is {late_s:.3f} s off"
+                raise InputFileError(sound.path, f"{expected}; {got}")
+            # Drivers stamp blocks give or take some milliseconds; a lost one is a whole block.
+            if late_s > 0.5 * min(block.duration_s, before.duration_s):
+                _LOG.warning("%s: %.3f s of %s are missing at %.3f s", sound.path, late_s, sound.topic, at_s)
+                yield _silence(before, late_s)
+        yield block
+        before = block
+
+
+def _silence(before: AudioBlock, length_s: float) -> AudioBlock:
+    samples = np.zeros((round(length_s * before.sample_rate_hz), before.samples.shape[1]), np.float32)
+    return AudioBlock(before.end_ns, before.sample_rate_hz, samples)
+
+
+def _first_second(blocks: Iterator[AudioBlock], sound: BagSound) -> list[AudioBlock]:
+    """Return the blocks of the first second, fewer where there is less."""
+    parts: list[AudioBlock] = []
+    for block in _without_gaps(blocks, sound):
+        parts.append(block)
+        if sum(part.duration_s for part in parts) >= 1.0:
+            break
+    if not parts:
+        raise InputFileError(sound.path, f"expected samples on {sound.topic}, it holds no message")
+    return parts
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.ground.errors import MissingExtraError
+from worldstate.ground.extras import optional
 
 AUDIO, ARRAY = "worldstate_msgs/msg/MultiChannelAudio", "worldstate_msgs/msg/MicrophoneArray"
 ADVISORIES = "worldstate_msgs/msg/RiskAdvisories"
@@ -33,13 +33,10 @@ def typestore() -> Any:
     MissingExtraError
         Without rosbags.
     """
-    try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise MissingExtraError("rosbags", "ros") from error
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    typesys = optional("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     for name, text in _definitions():
-        store.register(get_types_from_msg(text, name))
+        store.register(typesys.get_types_from_msg(text, name))
     return store
 
 

@@ -14,9 +14,10 @@ from worldstate.abduction.grounding.grounded_likelihood import (
     Observable,
     car,
 )
-from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.acoustic_grounding import LINE_SPACING, Grounding, observe
-from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
+from worldstate.adapters.acoustic import LINE_SPACING, AcousticAdapter, Grounding, observe
+from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading

@@ -23,7 +23,9 @@ from worldstate.abduction.sequence.street_sides import (
 from worldstate.adapters.acoustic_sequence import street_listener
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listen import ListenSettings, listen_steps, open_source
+from worldstate.adapters.listen import listen_steps
+from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source_files import open_source
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, forgotten, with_pass
@@ -158,7 +160,7 @@ def test_in_the_company_of_the_other_arm_nobody_knows_whose_sound_it_is():
 def test_a_hand_over_is_a_lesson(adapts, approach):
     settings = ListenSettings(site_adaptation=adapts)
     *_, last = listen_steps(open_source(approach.folder, settings=settings))
-    assert (sum(last.street.known.weights) > 0.0) == adapts
+    assert (sum(last.checkpoint.street.known.weights) > 0.0) == adapts
 
 
 def test_a_street_keeps_them_and_forgets_slowly():

@@ -8,8 +8,7 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.adapters.audio.riff import data_size
-from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.audio.sound_file import data_size, open_audio
 from worldstate.ground.errors import InvalidArgumentError
 
 RATE_HZ = 8000

@@ -11,7 +11,7 @@ from street_frames import HEIGHT, WIDTH, reference, street
 
 from worldstate.adapters.camera import motion_detector
 from worldstate.adapters.camera.box_linking import overlaps
-from worldstate.adapters.camera.detection_formats import (
+from worldstate.adapters.camera.detections import (
     read_any_detections,
     read_coco_results,
     read_yolo_text,

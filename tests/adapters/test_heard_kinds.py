@@ -11,8 +11,7 @@ from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
-from worldstate.adapters.acoustic import AcousticAdapter, asked_again
-from worldstate.adapters.acoustic_kinds import expected_labels, heard_kinds
+from worldstate.adapters.acoustic import AcousticAdapter, asked_again, expected_labels, heard_kinds
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings

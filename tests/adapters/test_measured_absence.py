@@ -18,11 +18,12 @@ from worldstate.adapters.camera.camera_health import (
     CameraHealth,
     DegradationLog,
     HealthMonitor,
+    ImageQuality,
+    image_quality,
     learn_health,
 )
 from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, STRENGTHS, degrade, level_of, strength
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
-from worldstate.adapters.camera.image_quality import ImageQuality, image_quality
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates, save_miss_rates
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera

@@ -20,7 +20,7 @@ MOST_KIB = 1_000_000_000 // 1024
 MEASURE = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
-from worldstate.adapters.camera.detection_formats import read_any_detections
+from worldstate.adapters.camera.detections import read_any_detections
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.checkpoint_file import read_checkpoint

@@ -94,14 +94,6 @@ def test_a_folder_without_sound(tmp_path: Path) -> None:
         Recording.open(tmp_path)
 
 
-def test_keeps_an_official_list(tmp_path: Path) -> None:
-    (tmp_path / "test.csv").write_text("ID\n3_08_0119\n9_99_9999\n")
-    kept = OvadDataset(write_log(tmp_path, *ROWS), read_ids(tmp_path / "test.csv"))
-    assert [recording.recording_id for recording in kept.recordings] == ["3_08_0119"]
-    with pytest.raises(InputFileError, match="found none"):
-        OvadDataset(tmp_path, {"9_99_9999"})
-
-
 def test_the_official_lists() -> None:
     folder = FOLDER or Path()
     if not (folder / "timeHorizonStaticTestset.csv").is_file():

@@ -22,7 +22,9 @@ from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model, save_model
-from worldstate.adapters.listen import ListenSettings, Step, listen_steps, open_source
+from worldstate.adapters.listen import Step, listen_steps
+from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source_files import open_source
 from worldstate.commissioning.commission import stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.frontend.approach.looming import Looming
@@ -136,7 +138,7 @@ def test_lost_sound_interrupts_the_sequence_and_leaves_nothing_behind(folder: Pa
     # Ten hops later a sequence is read again.
     assert set(reasons[silent[-1] + 1 : silent[-1] + 10]) == {"less than 10 hops of evidence"}
     assert set(reasons[silent[-1] + 10 :]) == {""}
-    end = heard[-1].history
+    end = heard[-1].checkpoint.history
     assert end is not None
     assert np.isfinite(end.minute).all()
     assert len(end.minute) == len(heard) - len(silent)
@@ -145,5 +147,5 @@ def test_lost_sound_interrupts_the_sequence_and_leaves_nothing_behind(folder: Pa
 def test_a_model_that_states_no_times_says_so(folder: Path) -> None:
     plain = replace(read_model(folder / "model.json"), sequence=None)
     state = next(listen_steps(open_source(folder / "sound.wav", model=plain))).state
-    assert state.no_sequence is not None and "commission" in state.no_sequence.reason
+    assert state.no_sequence is not None and "model make" in state.no_sequence.reason
     assert {cue.within for cue in state.cues} == {None}

@@ -17,7 +17,9 @@ from worldstate.abduction.signature.site_reference import site_reference
 from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
-from worldstate.adapters.listen import ListenSettings, listen_steps, measure_steps, open_source
+from worldstate.adapters.listen import listen_steps, measure_steps
+from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
@@ -111,9 +113,10 @@ def test_a_checkpoint_of_the_chain_continues_bit_for_bit(heard, cut, tmp_path):
 def test_a_site_known_beforehand_is_taken_up(heard):
     source, window = heard[0], np.exp(heard[0].model.empty)
     louder = SiteEstimate(source.model.empty + AZIMUTH, heard_s=300.0)
-    assert replace(source, site=louder).signature().evidence(window) != source.signature().evidence(window)
+    before = Checkpoint(source.world(), louder)
+    assert replace(source, before=before).signature().evidence(window) != source.signature().evidence(window)
     with pytest.raises(InvalidArgumentError, match="estimate"):
-        replace(source, site=SiteEstimate.start(59)).signature()
+        replace(source, before=Checkpoint(source.world(), SiteEstimate.start(59))).signature()
 
 
 def test_a_filter_s_own_checkpoint_reads_as_one_without_a_site():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.listen import ListenSettings, open_source
+from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
 

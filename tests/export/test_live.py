@@ -10,8 +10,8 @@ import time
 import pytest
 from scripted_states import scripted_states
 
-from worldstate.adapters.export.live_server import live_server
 from worldstate.adapters.export.log_message import state_messages
+from worldstate.adapters.export.log_sinks import live_server
 from worldstate.ground.errors import InvalidArgumentError
 
 pytest.importorskip("foxglove")

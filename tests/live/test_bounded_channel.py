@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from worldstate.adapters.live.bounded_channel import BoundedChannel
-from worldstate.adapters.live.image_feed import image_channel
+from worldstate.adapters.live.live_camera import image_channel
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 DAY_IMAGES = 24 * 3600 * 10

@@ -13,12 +13,12 @@ import pytest
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.listen import ListenSettings, Source, open_source
 from worldstate.adapters.live.bounded_channel import BoundedChannel
 from worldstate.adapters.live.datagram_socket import DetectionSocket
-from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
-from worldstate.adapters.live.live_camera import REMEMBERED, LiveCamera
+from worldstate.adapters.live.live_camera import REMEMBERED, CameraFeed, ImageLooks, LiveCamera, image_channel
 from worldstate.adapters.live.live_sound import LiveSound
+from worldstate.adapters.source import ListenSettings, Source
+from worldstate.adapters.source_files import open_source
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import nanoseconds
@@ -188,7 +188,7 @@ class Capture:
 @pytest.fixture
 def cameras(monkeypatch):
     monkeypatch.setattr(
-        "worldstate.adapters.live.image_feed.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
+        "worldstate.adapters.live.live_camera.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
     )
 
 

@@ -22,10 +22,11 @@ from rich.console import Console
 
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
-from worldstate.adapters.listen import ListenSettings, open_source
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound
 from worldstate.adapters.live.playback import Playback
+from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source_files import open_source
 from worldstate.cli.common.live_view import view_of
 from worldstate.cli.main import main
 from worldstate.state import WorldState
@@ -163,7 +164,7 @@ def looked_at(states):
 
 def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
-        "worldstate.adapters.live.image_feed.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
+        "worldstate.adapters.live.live_camera.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
     )
     lens, states = tmp_path / "lens.json", tmp_path / "states.jsonl"
     lens.write_text(json.dumps({"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}))

@@ -8,11 +8,13 @@ import pytest
 import soundfile
 
 from worldstate.adapters.audio.open_sound import open_sound
-from worldstate.adapters.listen import ListenSettings, listen_steps, open_source
+from worldstate.adapters.listen import listen_steps
 from worldstate.adapters.live.bounded_channel import BoundedChannel
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound, SoundBlock
 from worldstate.adapters.live.playback import Playback
+from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source_files import open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 

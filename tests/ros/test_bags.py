@@ -288,7 +288,9 @@ def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
 
 
 def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
-    from worldstate.adapters.listen import ListenSettings, listen_steps, open_source
+    from worldstate.adapters.listen import listen_steps
+    from worldstate.adapters.source import ListenSettings
+    from worldstate.adapters.source_files import open_source
     from worldstate.frontend import MicrophoneArray
 
     path = write_blocks(tmp_path / "bag", sound_of(2 * RATE_HZ))
@@ -410,7 +412,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, capsys):
     from worldstate.adapters.ros import message_types
 
     message_types.typestore.cache_clear()
-    monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
+    monkeypatch.setitem(__import__("sys").modules, "rosbags", None)
     states = tmp_path / "states.jsonl"
     states.write_text("".join(state.to_json() + "\n" for state in STATES))
     assert main(["log", "replay", str(states), "--export", f"rosbag={tmp_path / 'out'}"]) == 2

@@ -1,6 +1,6 @@
 """Rendered streets: what hides what, when, and whether a motion detector finds the vehicle and loses it."""
 
-import builtins
+import sys
 from dataclasses import replace
 
 import cv2
@@ -292,14 +292,7 @@ def test_video_refuses_nothing_and_nowhere(tmp_path):
 
 
 def test_without_opencv_the_extra_is_named(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def refuse(name, *rest):
-        if name == "cv2":
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"worldstate\[vision\]"):
         write_video(tmp_path / "v.mp4", [np.zeros((16, 16, 3), np.uint8)])
 

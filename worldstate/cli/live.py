@@ -51,8 +51,8 @@ from worldstate.cli.common.sensors import (
 )
 
 if TYPE_CHECKING:
-    from worldstate.adapters.listen import Source
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
+    from worldstate.adapters.source import Source
 
     Losses = Callable[[], dict[str, object]]
 
@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 def _source(arguments: argparse.Namespace, given: GivenSensors, sound: "LiveSound | Path") -> "Source":
     from worldstate.adapters.files.checkpoint_file import read_checkpoint
-    from worldstate.adapters.listen import open_source
+    from worldstate.adapters.source_files import open_source
     from worldstate.ground.values import seconds
 
     before = None if arguments.resume is None else read_checkpoint(arguments.resume)
@@ -213,8 +213,7 @@ def _with_device(
     sound: "LiveSound",
     opened: ExitStack,
 ) -> "tuple[Source, Losses]":
-    from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
-    from worldstate.adapters.live.live_camera import LiveCamera
+    from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, LiveCamera, image_channel
 
     images, detector = image_channel(), detector_maker(arguments.detector, given.setup.labels)()
     size = source.camera.width_px, source.camera.height_px

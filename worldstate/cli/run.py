@@ -58,8 +58,8 @@ if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionLog
     from worldstate.adapters.files.odometry_file import EngineSpeed, OdometryLog
-    from worldstate.adapters.listen import Source
     from worldstate.adapters.own_parts import OtherModality
+    from worldstate.adapters.source import Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 EXAMPLE = """\
@@ -154,7 +154,7 @@ def _heard(arguments: argparse.Namespace, given: GivenSensors) -> CommandResult:
 def _source(arguments: argparse.Namespace, given: GivenSensors) -> "Source":
     from dataclasses import replace
 
-    from worldstate.adapters.listen import open_source
+    from worldstate.adapters.source_files import open_source
     from worldstate.operations.recordings.car_cameras import with_cameras
 
     boxes, named = boxes_of(arguments, given.setup), arguments.detector

@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.datasets.feature_extraction import read_windows
+from worldstate.adapters.datasets.feature_extraction import read_windows, sample_windows
 from worldstate.adapters.datasets.feature_table import read_features
-from worldstate.adapters.datasets.sample_windows import sample_windows
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.feature_options import add_group
 from worldstate.cli.common.inputs import add_array_options, given_array

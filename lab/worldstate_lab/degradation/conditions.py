@@ -20,7 +20,7 @@ from worldstate.adapters.camera.degradation import (
     normal_quantiles,
     strength,
 )
-from worldstate.adapters.listen import Source
+from worldstate.adapters.source import Source
 from worldstate.ground.typing import Float32Array, ImageArray
 
 # Conditions that every sweep has: the recording as it is, and no camera at all.

@@ -10,14 +10,16 @@ import numpy as np
 
 from worldstate.adapters.camera.camera_channel import any_motion
 from worldstate.adapters.camera.camera_health import (
+    LARGEST_PX,
     CameraHealth,
     DegradationLog,
     HealthMonitor,
+    ImageQuality,
     health_scale,
+    image_quality,
 )
 from worldstate.adapters.camera.degradation import LEVELS
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
-from worldstate.adapters.camera.image_quality import LARGEST_PX, ImageQuality, image_quality
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.motion_detector import Background, MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera

@@ -21,7 +21,9 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listen import Source, measure_steps, open_source, unoccluded_sector
+from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.source import Source, unoccluded_sector
+from worldstate.adapters.source_files import open_source
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray

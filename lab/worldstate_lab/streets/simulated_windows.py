@@ -13,10 +13,9 @@ from functools import lru_cache, partial
 import numpy as np
 import scipy.signal
 
-from worldstate.adapters.datasets.feature_extraction import WINDOW_S
+from worldstate.adapters.datasets.feature_extraction import WINDOW_S, window_ends_s
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.adapters.datasets.sample_windows import window_ends_s
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.array.steering import cross_spectra

@@ -10,9 +10,15 @@ import numpy as np
 from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.array_choice import choose_array
-from worldstate.adapters.datasets.feature_extraction import LabelledWindow, extract_features, feature_table
+from worldstate.adapters.datasets.feature_extraction import (
+    FRONT,
+    FRONT_LATER_S,
+    LabelledWindow,
+    extract_features,
+    feature_table,
+    sample_windows,
+)
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
-from worldstate.adapters.datasets.sample_windows import FRONT, FRONT_LATER_S, sample_windows
 from worldstate.adapters.files.acoustic_domain import check_array, ovad_domain
 from worldstate.adapters.files.model_file import save_model
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError

@@ -19,7 +19,7 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sensors import add_camera_options, add_car_option, given_sensors
 
 if TYPE_CHECKING:
-    from worldstate.adapters.listen import Source
+    from worldstate.adapters.source import Source
 
 EXAMPLE = """\
 examples:
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def _source(arguments: argparse.Namespace, path: Path) -> "Source":
     from dataclasses import replace
 
-    from worldstate.adapters.listen import open_source
+    from worldstate.adapters.source_files import open_source
 
     # Only its sound, boxes and camera are used: no model has to fit the array.
     given = given_sensors(arguments)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_message import LogMessage, LogSink
-    from worldstate.adapters.listen import Source, Step
+    from worldstate.adapters.listen import Step
+    from worldstate.adapters.source import Source
     from worldstate.state import WorldState
 
     Stack = AbstractContextManager[Callable[[WorldState], object]]
@@ -103,11 +104,11 @@ def open_exports(
 
 def _viewer(name: str, target: str, *, paced: bool) -> "AbstractContextManager[LogSink] | None":
     if name == "mcap":
-        from worldstate.adapters.export.mcap_file import mcap_file
+        from worldstate.adapters.export.log_sinks import mcap_file
 
         return mcap_file(Path(target))
     if name == "rerun":
-        from worldstate.adapters.export.rerun_file import rerun_file
+        from worldstate.adapters.export.log_sinks import rerun_file
 
         return rerun_file(Path(target))
     return _websocket(target, paced=paced) if name == "foxglove" else None
@@ -115,7 +116,7 @@ def _viewer(name: str, target: str, *, paced: bool) -> "AbstractContextManager[L
 
 @contextmanager
 def _websocket(port: str, *, paced: bool) -> "Iterator[LogSink]":
-    from worldstate.adapters.export.live_server import live_server
+    from worldstate.adapters.export.log_sinks import live_server
     from worldstate.ground.errors import InvalidArgumentError
 
     if not port.isdecimal():

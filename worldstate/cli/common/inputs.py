@@ -8,8 +8,8 @@ from .command import add_choice
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import Encoding, SoundInput
-    from worldstate.adapters.listen import ListenSettings
     from worldstate.adapters.ros.bag_input import BagTopics
+    from worldstate.adapters.source import ListenSettings
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 SOUND_HELP = """\
@@ -121,7 +121,7 @@ def given_array(arguments: argparse.Namespace) -> "MicrophoneArray | None":
 
 def search_of(arguments: argparse.Namespace) -> "ListenSettings":
     """Return where a bearing is looked for, all else by default."""
-    from worldstate.adapters.listen import ListenSettings
+    from worldstate.adapters.source import ListenSettings
 
     band = arguments.band
     return ListenSettings(

@@ -10,7 +10,8 @@ from .progress import progress_bar, track
 
 if TYPE_CHECKING:
     from worldstate.abduction.sequence.street_sides import SidePatterns
-    from worldstate.adapters.listen import ListenSettings, Source, Step
+    from worldstate.adapters.listen import Step
+    from worldstate.adapters.source import ListenSettings, Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray
     from worldstate.operations.recordings.hop_table import HopTable
     from worldstate.operations.recordings.recording_report import RecordingReport
@@ -53,7 +54,7 @@ def listen_settings(arguments: argparse.Namespace) -> "ListenSettings":
     """Return how it is listened to, boxes and silent channels by default."""
     from dataclasses import replace
 
-    from worldstate.adapters.acoustic_grounding import Grounding
+    from worldstate.adapters.acoustic import Grounding
 
     return replace(
         search_of(arguments),

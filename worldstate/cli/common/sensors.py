@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
     from worldstate.adapters.camera.onnx_detector import OnnxDetector
     from worldstate.adapters.camera.pinhole import PinholeCamera
-    from worldstate.adapters.listen import Source
+    from worldstate.adapters.source import Source
     from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 
@@ -102,7 +102,7 @@ class GivenSensors:
 
     def detections(self, arguments: argparse.Namespace) -> "Path | DetectionLog | None":
         """Return what the one camera that is asked reported, read where its images do not come at 10 Hz."""
-        from worldstate.adapters.camera.detection_formats import read_any_detections
+        from worldstate.adapters.camera.detections import read_any_detections
         from worldstate.adapters.camera.pinhole import PinholeCamera
         from worldstate.ground.errors import InvalidArgumentError
 
@@ -141,7 +141,8 @@ def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[
     InputFileError
         If there are no boxes of a camera.
     """
-    from worldstate.adapters.listen import ListenSettings, open_source
+    from worldstate.adapters.source import ListenSettings
+    from worldstate.adapters.source_files import open_source
     from worldstate.ground.errors import InputFileError
 
     given = given_sensors(arguments)

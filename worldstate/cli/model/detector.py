@@ -80,7 +80,7 @@ def _scene(
     from dataclasses import replace
     from math import radians
 
-    from worldstate.adapters.camera.detection_formats import read_any_detections
+    from worldstate.adapters.camera.detections import read_any_detections
     from worldstate.adapters.camera.pinhole import PinholeCamera
     from worldstate.adapters.camera.video import open_video
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, reference_by

@@ -72,9 +72,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _windows(arguments: argparse.Namespace) -> "tuple[list[LabelledWindow], int]":
-    from worldstate.adapters.datasets.feature_extraction import read_labels
+    from worldstate.adapters.datasets.feature_extraction import read_labels, sample_windows
     from worldstate.adapters.datasets.ovad import LOG_NAME
-    from worldstate.adapters.datasets.sample_windows import sample_windows
     from worldstate.ground.errors import InputFileError
 
     if arguments.labels is not None:

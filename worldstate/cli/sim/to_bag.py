@@ -31,8 +31,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it wrote."""
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.ovad import Recording
-    from worldstate.adapters.ros.bag_writer import check_bag_target
-    from worldstate.adapters.ros.recording_bag import odometry_of, write_bag
+    from worldstate.adapters.ros.bag_writer import check_bag_target, odometry_of, write_bag
     from worldstate.cli.common.progress import track
     from worldstate.ground.checks import in_range
     from worldstate.ground.values import nanoseconds

@@ -22,7 +22,7 @@ from worldstate.cli.common.sensors import add_camera_options, add_car_option, ca
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from worldstate.adapters.listen import Source
+    from worldstate.adapters.source import Source
     from worldstate.operations.labelling.box_tracks import BoxTrack
     from worldstate.operations.labelling.pass_labels import PassLabel
 

@@ -14,7 +14,9 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
-from worldstate.adapters.listen import Source, measure_steps, open_source
+from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.source import Source
+from worldstate.adapters.source_files import open_source
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, seconds

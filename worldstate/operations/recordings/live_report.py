@@ -1,8 +1,8 @@
 """What came of a run on running sensors, and what it cost: a few numbers, however long it lasts."""
 
-from worldstate.adapters.listen import Source
 from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter, LiveStep
 from worldstate.adapters.live.live_sound import LiveSound
+from worldstate.adapters.source import Source
 
 from .warning import WarningMeter
 

@@ -1,6 +1,7 @@
-"""Recordings for the Rerun viewer: the scene that Foxglove draws, and the snapshots as text."""
+"""Where the messages of a log go: MCAP files, Rerun recordings, and Foxglove on a websocket."""
 
 import base64
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.files.atomic import atomic_path
-from worldstate.ground.errors import MissingExtraError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import decode, decode_json
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import seconds
 
 from .log_message import IMAGE_TOPIC, SCENE_TOPIC, SNAPSHOT_TOPIC, SRP_TOPIC, LogMessage, LogSink
 from .scene_messages import CompressedImage, Rgba, SceneItem, SceneUpdate, Xyz
@@ -23,7 +26,7 @@ TIMELINE = "stream"
 @contextmanager
 def rerun_file(path: Path) -> Iterator[LogSink]:
     """Lend a function that writes messages to a Rerun recording, which takes its name when the block ends."""
-    rr = _rerun()
+    rr = optional("rerun")
     with atomic_path(path) as temporary:
         recording = rr.RecordingStream("worldstate")
         recording.save(temporary)
@@ -102,17 +105,78 @@ def _color(color: Rgba) -> tuple[int, int, int, int]:
     return red, green, blue, opaque
 
 
-def _rerun() -> Any:
-    try:
-        import rerun
-    except ImportError as error:
-        raise MissingExtraError("rerun-sdk", "rerun") from error
-    return rerun
-
-
 _WRITERS: dict[str, Callable[[ModuleType, Any, LogMessage], None]] = {
     SNAPSHOT_TOPIC: _snapshot,
     IMAGE_TOPIC: _image,
     SCENE_TOPIC: _scene,
     SRP_TOPIC: _scene,
 }
+
+
+@contextmanager
+def mcap_file(path: Path) -> Iterator[LogSink]:
+    """Lend a function that writes messages to an MCAP file, which takes its name when the block ends."""
+    check_extra("mcap")
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        writer = optional("mcap.writer").Writer(file)
+        writer.start()
+        channels: dict[str, int] = {}
+
+        def write(message: LogMessage) -> None:
+            if message.topic not in channels:
+                schema = writer.register_schema(message.schema_name, "jsonschema", message.schema)
+                channels[message.topic] = writer.register_channel(message.topic, "json", schema)
+            writer.add_message(channels[message.topic], message.stamp_ns, message.data, message.stamp_ns)
+
+        yield write
+        writer.finish()
+
+
+def read_snapshot_lines(path: Path) -> Iterator[str]:
+    """Yield the snapshots of an MCAP file as the text that was written, in the order of their writing."""
+    make_reader, damaged = optional("mcap.reader").make_reader, optional("mcap.exceptions").McapError
+    with path.open("rb") as file:
+        try:
+            # By time of writing and not by stamp: a late measurement may have moved a stamp back.
+            for _, _, message in make_reader(file).iter_messages([SNAPSHOT_TOPIC], log_time_order=False):
+                yield message.data.decode()
+        except (damaged, UnicodeDecodeError) as error:
+            raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
+
+
+@contextmanager
+def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int]]:
+    """Lend a function that sends messages to connected viewers, and the port; 0 takes a free one.
+
+    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound;
+    not so where `paced` is False: microphones that run set the pace themselves.
+    """
+    foxglove = optional("foxglove")
+    # A context of its own: the global one keeps its channels for all servers of the process.
+    context = foxglove.Context()
+    try:
+        server = foxglove.start_server(name="worldstate", port=port, context=context)
+    except (RuntimeError, OverflowError) as error:
+        raise InvalidArgumentError(
+            f"--export foxglove: expected a free port, got {port} ({error})"
+        ) from error
+    channels: dict[str, Any] = {}
+    begun_s: float | None = None
+
+    def send(message: LogMessage) -> None:
+        nonlocal begun_s
+        stamp_s = seconds(message.stamp_ns)
+        begun_s = time.monotonic() - stamp_s if begun_s is None else begun_s
+        if paced:
+            time.sleep(max(begun_s + stamp_s - time.monotonic(), 0.0))
+        if message.topic not in channels:
+            schema = foxglove.Schema(name=message.schema_name, encoding="jsonschema", data=message.schema)
+            channels[message.topic] = foxglove.Channel(
+                message.topic, schema=schema, message_encoding="json", context=context
+            )
+        channels[message.topic].log(message.data, log_time=message.stamp_ns)
+
+    try:
+        yield send, server.port
+    finally:
+        server.stop()
