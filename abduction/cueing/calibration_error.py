@@ -184,7 +184,7 @@ def brier_skill(risk: ArrayLike, hazards: ArrayLike) -> float | None:
     >>> brier_skill([0.5, 0.5], [False, True]), brier_skill([0.5, 0.0], [False, True])
     (0.0, -1.5)
     """
-    # The constant is the true share of hazards, which nobody knows beforehand. Said in every window, it has
+    # The constant is the true share of hazards, not known beforehand. Stated in every window, it has
     # an ECE of 0: calibration alone is no merit.
     _, labels = _checked_sample(risk, hazards)
     constant = float(labels.var())

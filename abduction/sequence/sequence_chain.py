@@ -1,6 +1,6 @@
 r"""How the groups of a sequence model follow one another where nothing is heard, and what looks say of them.
 
-Whoever comes counts down through the groups into view, behind somebody in view or not; .004 of the hops begin
+A vehicle that comes counts down through the groups into view, behind another or not; .004 of the hops begin
 anew anywhere, and the whole is balanced, so that it leaves the context's distribution c as it is. As a
 chain in continuous time,
 
@@ -30,8 +30,8 @@ _SMALLEST = 1e-12
 _ROUNDS = 1000  # After 200 the prior still drifts by a percent, after these by 1e-9
 
 _COMING = len(COMING_S)
-# Who comes does so with nobody in view or behind somebody who is: of the sequence's groups each coming one is
-# two states here. Taken as one, every second of an empty view would count against whoever comes.
+# A vehicle comes with none in view or behind another: of the sequence's groups each coming one is two states
+# here. Taken as one, every second of an empty view would count against a vehicle that comes.
 STATES = (*GROUPS[:_COMING], *(f"{group}_behind" for group in GROUPS[:_COMING]), *GROUPS[_COMING:])
 _SEEN = STATES.index("seen")
 COMES = np.array([state.startswith("coming") for state in STATES])
@@ -55,9 +55,9 @@ _FOLLOWS_S = {
 def states_of(groups: FloatArray, prior: FloatArray) -> FloatArray:
     """Return the states of some groups' probabilities, shape (..., groups) to (..., states).
 
-    Whoever comes has somebody ahead in view as often as the mean of what the prior and what the sound has of
-    the street without whoever comes. By the prior alone what is heard is one or the other and a look tells
-    which, by the sound alone a look tells nothing of who comes: on streams the truth lies between.
+    A vehicle that comes has another ahead in view as often as the mean of what the prior and what the sound
+    has of the street without it. By the prior alone what is heard is one or the other and a look decides,
+    by the sound alone a look decides nothing: on streams the truth lies between.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def _rates_hz(prior: tuple[float, ...]) -> FloatArray:
 
 
 def look_log_likelihoods(answer: CoEvidence) -> FloatArray:
-    """Return log p(look | state), shape (states,), nats: of a view with somebody in it, or with nobody.
+    """Return log p(look | state), shape (states,), nats: of a view with a vehicle in it, or with none.
 
     Examples
     --------

@@ -2,7 +2,7 @@ r"""What the last seconds say of each side: will something come into view, when,
 
 Boosted trees sort every hop and side into groups: a vehicle that comes into view within so many seconds, one
 that is far off and grows louder or fainter, one in view, one that has left the view, one that comes on the
-other side, nobody. With q the posterior of the groups at the share of hazards that the model was trained at,
+other side, no vehicle. With q the posterior of the groups at the share of hazards in training,
 
 .. math:: P(T \le h) = \sum_{g:\, T_g \le h} q_g, \qquad
           \hat T = \frac{\sum_{g\ \mathrm{coming}} q_g t_g}{\sum_{g\ \mathrm{coming}} q_g}
@@ -114,7 +114,7 @@ class BoostedTrees:
         return np.asarray(self.baseline + sums.reshape(-1, classes))
 
 
-# Ends of the groups of those who come, seconds before line of sight; what is further off is told as far.
+# Ends of the groups of vehicles that come, seconds before line of sight; what is further off is far.
 COMING_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0)
 OTHERS = ("seen", "other", "past", "rising", "falling", "none")
 GROUPS = (*(f"coming_{end_s:g}s" for end_s in COMING_S), *OTHERS)
@@ -180,7 +180,7 @@ class SequenceAlarm:
 def named_sides(
     log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
 ) -> BoolArray:
-    r"""Return which sides an alarm may name: the likelier one; the other one if somebody comes there, too.
+    r"""Return which sides an alarm may name: the likelier one; the other one if a vehicle comes there, too.
 
     Where it is not known from which side one vehicle comes, both are likely; that two come is told by how
     rarely the other one is believed to come alone: beside the likelier side one is named where

@@ -6,8 +6,8 @@ window leans to one of them by a linear discriminant,
 
 .. math:: s = g\, c \tanh\!\Big( \frac{w^\top x + b}{c} \Big)
 
-with g the certainty that few passes leave, and of those who come, the share on either side moves by s in
-log-odds; whether somebody comes does not.
+with g the certainty that few passes leave. Of the vehicles that come, the share on either side moves by s in
+log-odds; the probability that one comes does not change.
 """
 
 from dataclasses import dataclass, field, replace
@@ -45,7 +45,7 @@ def arrival_pattern(feature: FloatArray) -> FloatArray:
 
 
 def somebody_comes(groups: FloatArray) -> FloatArray:
-    """Return the chance that somebody comes from either side, shape (...,) of posteriors (..., 2, groups)."""
+    """Return the probability that a vehicle comes, shape (...,) of posteriors (..., 2, groups)."""
     return np.asarray((groups[..., :_COMING].sum(axis=-1) + groups[..., _OTHER]).mean(axis=-1))
 
 
@@ -77,7 +77,7 @@ class StreetSides:
         return np.asarray(self.certainty * _MOST_NATS * np.tanh(leaning / _MOST_NATS))
 
     def turned(self, groups: FloatArray, feature: FloatArray) -> FloatArray:
-        """Return posteriors of the groups with those who come put where the street says.
+        """Return posteriors of the groups, vehicles that come moved to the side of the street's pattern.
 
         Shapes: groups (n, 2, groups), feature (n, azimuths), positive.
         """
@@ -107,7 +107,7 @@ class PassSound:
     """How the sound of one pass arrived while the vehicle was hidden."""
 
     patterns: FloatArray  # shape (n, 12)
-    weights: FloatArray  # shape (n,): Chance that anybody was heard to come
+    weights: FloatArray  # shape (n,): Probability that a vehicle was heard to come
     heard_by: str
 
 
@@ -115,7 +115,7 @@ class PassSound:
 class SidePatterns:
     r"""Weights, sums and squares of patterns of both arms; left before right.
 
-    Patterns x of the three seconds before T0, weighed by the chance a that anybody was heard to come. Every
+    Patterns x of the three seconds before T0, weighed by the probability a that one was heard to come. Every
     pass counts by its mean weight; means are drawn together as by half a pass that was heard on either side,
 
     .. math:: m_g = \frac{\sum_g a x + \tfrac{1}{2} \bar m}{n_g + \tfrac{1}{2}}, \qquad
@@ -183,13 +183,13 @@ class SidePatterns:
         return StreetSides(direction, float(offset), float(certainty), self.heard_by)
 
 
-# Who comes is heard for some three seconds; in the company of the other arm nobody knows whose sound it is.
+# A vehicle that comes is heard for some three seconds; with one in the other arm the sound has no known side.
 HEARD_HOPS = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreetHearing:
-    """What is known of the arms' sound, and that of the last three seconds, whose arm nobody knows yet.
+    """What is known of the arms' sound, and that of the last three seconds, whose arm is not known yet.
 
     Examples
     --------
@@ -198,9 +198,9 @@ class StreetHearing:
     """
 
     known: SidePatterns
-    # shape (up to 30, 13): Pattern and chance that somebody comes; the last hop last
+    # shape (up to 30, 13): Pattern and probability that a vehicle comes; the last hop last
     recent: FloatArray = field(default_factory=partial(np.zeros, (0, SECTORS + 1)))
-    since: tuple[int, int] = (HEARD_HOPS, HEARD_HOPS)  # Hops since somebody came out of either arm
+    since: tuple[int, int] = (HEARD_HOPS, HEARD_HOPS)  # Hops since a vehicle came out of either arm
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "recent", np.reshape(self.recent, (-1, SECTORS + 1)))
@@ -226,7 +226,7 @@ class StreetHearing:
         return StreetHearing(self.known, since=self.since)
 
     def passed(self, arm: str) -> "StreetHearing":
-        """Return it after somebody came into view out of an arm."""
+        """Return it after a vehicle came into view out of an arm."""
         own = SIDES.index(arm)
         alone = self.since[1 - own] >= HEARD_HOPS
         left, right = (0 if k == own else hops for k, hops in enumerate(self.since))
@@ -238,7 +238,7 @@ class StreetHearing:
 
 
 class StreetListener:
-    """Puts those who come where the street says, hop by hop, and learns the street from whoever comes.
+    """Moves vehicles to the side of the street's patterns, hop by hop, and learns these from each that comes.
 
     Examples
     --------
@@ -271,6 +271,6 @@ class StreetListener:
         self.hearing = self.hearing.interrupted()
 
     def passed(self, arm: str) -> None:
-        """Learn from somebody who came into view out of an arm just now."""
+        """Learn from a vehicle that came into view out of an arm just now."""
         self.hearing = self.hearing.passed(arm)
         self._sides = self.hearing.known.sides()

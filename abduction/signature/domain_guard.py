@@ -24,7 +24,7 @@ from worldstate.ground.typing import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Familiar:
-    """A sound as the model knows them.
+    """A sound of the kind that the model was made for.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Foreign:
 
 @dataclass(frozen=True, slots=True)
 class WarningSignal:
-    """What a vehicle warns with: evidence of it is left as it is.
+    """A warning signal of a vehicle: evidence of it is left as it is.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ class SiteReference:
     mean: FloatArray  # shape (features,): Over all windows
     median: FloatArray
     # shape (features,): Mean over the 35 % of the windows whose loudest feature is the least: close to what
-    # the site is like while nobody comes, whatever share of the windows that is.
+    # the site is like while no vehicle comes, whatever share of the windows that is.
     quiet: FloatArray
 
     @property

@@ -132,7 +132,7 @@ def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatAr
 
 
 def visible_ratios(posteriors: FloatArray, prior: FloatArray) -> FloatArray:
-    r"""Return what a window says of a vehicle in view against nobody, shape (n,), nats.
+    r"""Return what a window says of a vehicle in view against none, shape (n,), nats.
 
     .. math:: \log \frac{P_{front}}{\pi_{front}} - \log \frac{P_{none}}{\pi_{none}}
 
