@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Fault
 from worldstate.frontend.health.dropouts import Dropout
 from worldstate.frontend.health.sample_clock import RateEstimate
+from worldstate.ground.serialisation import Via
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.operations.figure_style import (
     BLUE,
@@ -66,7 +68,7 @@ class ChannelVerdict:
     """
 
     channel: int  # From 0
-    fault: Fault  # What is wrong
+    fault: Annotated[Fault, Via(str, str, Fault)]  # What is wrong
     share: float  # Of the hops in which it was seen
     first_s: float  # End of the first of these hops, seconds
     value: float  # How wrong, when last seen: see `worldstate.frontend.health.channel_health.ChannelFault`
