@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.cli.sim.stream_figure import FLOW_COLOURS
+from worldstate.commissioning.stream_figure import FLOW_COLOURS
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.junction import place

@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _run_stream(arguments: argparse.Namespace) -> CommandResult:
-    from worldstate.cli.sim.stream_figure import write_stream_figure
+    from worldstate.commissioning.stream_figure import write_stream_figure
     from worldstate.simulation.stream.writing import write_stream
 
     if arguments.static or arguments.dynamic or arguments.video or arguments.scene != SCENES[0]:
