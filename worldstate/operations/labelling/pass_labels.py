@@ -8,6 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.ground.extras import check_extra
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 from worldstate.smoothing.fixed_lag_smoother import FixedLagSmoother
@@ -72,6 +73,8 @@ def label_passes(
 
     By the factor graph; where gtsam is not installed, by the RTS smoother of filterpy.
     """
+    if find_spec("gtsam") is None:
+        check_extra("filterpy")
     coming = [one for one in tracks if one.arm is not None]
     edges = {arm: _edge(coming, arm) for arm in ("left", "right")}
     found = []
