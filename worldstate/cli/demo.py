@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.output import CommandResult, output_folder, write_report
 
 if TYPE_CHECKING:
     import numpy as np

@@ -22,35 +22,22 @@ by --start from a later one.
 
 import argparse
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common import exports, inputs, listening, sensors
 from worldstate.cli.common.command import stopped_by_signals
 from worldstate.cli.common.early_checks import check_call
-from worldstate.cli.common.exports import add_export_options, exported_files, exported_hops
-from worldstate.cli.common.inputs import add_array_options, add_search_options, stance
-from worldstate.cli.common.listening import (
-    add_listen_options,
-    add_memory_options,
-    given_place,
-    listen_settings,
-)
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
-from worldstate.cli.common.sensors import (
-    GivenSensors,
-    add_car_option,
-    add_detector_option,
-    add_lens_options,
-    boxes_of,
-    detector_maker,
-    given_sensors,
-)
+from worldstate.cli.common.output import CommandResult, check_outputs
+from worldstate.ground.extras import check_extra
+from worldstate.ground.values import seconds
 
 if TYPE_CHECKING:
+    from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
     from worldstate.adapters.source import Source
 
@@ -64,6 +51,8 @@ examples:
   worldstate live --play ovad_dataset/SA1/left/1_00_0002
   worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4"""
 
+# Lost sound is said at most so often.
+SAID_EVERY_NS = 1_000_000_000
 # What a first user needs.
 FIRST_OPTIONS = (
     *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--device", "--play"),
@@ -73,12 +62,12 @@ FIRST_OPTIONS = (
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_array_options(parser)
-    add_car_option(parser)
+    inputs.add_array_options(parser)
+    sensors.add_car_option(parser)
     _add_sound_options(parser)
-    add_search_options(parser)
-    add_listen_options(parser)
-    add_memory_options(parser, "the end of STATE")
+    inputs.add_search_options(parser)
+    listening.add_listen_options(parser)
+    listening.add_memory_options(parser, "the end of STATE")
     told = "listen there to how the car moves"
     parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
     _add_camera_options(parser)
@@ -87,7 +76,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
     view = "show bearing, risk and entities (default: where standard error is a terminal)"
     add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
-    add_export_options(parser)
+    exports.add_export_options(parser)
 
 
 def _add_sound_options(parser: argparse.ArgumentParser) -> None:
@@ -105,16 +94,17 @@ def _add_camera_options(parser: argparse.ArgumentParser) -> None:
     which = group.add_mutually_exclusive_group()
     which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
     which.add_argument("--detections", metavar="HOST:PORT", help="listen there to a detector of your own")
-    add_lens_options(parser, group)
-    add_detector_option(parser)
+    sensors.add_lens_options(parser, group)
+    sensors.add_detector_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
-    check_outputs(arguments, "out", "keep_sound", "save_state", exported=exported_files(arguments))
-    given = given_sensors(arguments)
+    check_outputs(arguments, "out", "keep_sound", "save_state", exported=exports.exported_files(arguments))
+    given = sensors.given_sensors(arguments)
+    check_extra(*(["rich"] if arguments.view else []))
     check_call(arguments, given, [] if arguments.play is None else [arguments.play])
     with ExitStack() as opened:
         recorded = None if arguments.play is None else _source(arguments, given, arguments.play)
@@ -126,19 +116,20 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         source, camera_losses = _with_camera(arguments, given, source, sound, opened)
         source, odometry_losses = _with_odometry(arguments, source, sound, opened)
         figures = _listen(arguments, given, source, sound) | camera_losses() | odometry_losses()
-        return CommandResult(figures | {"array": stance(source.array)})
+        return CommandResult(figures | {"array": inputs.stance(source.array)})
 
 
-def _source(arguments: argparse.Namespace, given: GivenSensors, sound: "LiveSound | Path") -> "Source":
+def _source(
+    arguments: argparse.Namespace, given: sensors.GivenSensors, sound: "LiveSound | Path"
+) -> "Source":
     from worldstate.adapters.files.checkpoint_file import read_checkpoint
     from worldstate.adapters.source_files import open_source
-    from worldstate.ground.values import seconds
 
     before = None if arguments.resume is None else read_checkpoint(arguments.resume)
     ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
     looks = arguments.camera_device is not None
-    boxes = boxes_of(arguments, given.setup) if looks else given.setup.boxes
-    context, sides = given_place(arguments)
+    boxes = sensors.boxes_of(arguments, given.setup) if looks else given.setup.boxes
+    context, sides = listening.given_place(arguments)
     return open_source(
         sound,
         array=given.car.array,
@@ -150,11 +141,11 @@ def _source(arguments: argparse.Namespace, given: GivenSensors, sound: "LiveSoun
         resume=before,
         start_s=ended_s if arguments.start is None else arguments.start,
         # A channel that is silent is told by the front-end, which leaves it out.
-        settings=replace(listen_settings(arguments), mask_dead=True, boxes=boxes),
+        settings=replace(listening.listen_settings(arguments), mask_dead=True, boxes=boxes),
     )
 
 
-def _microphones(arguments: argparse.Namespace, given: GivenSensors) -> "SoundFeed":
+def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "SoundFeed":
     from worldstate.adapters.live.microphones import PortAudioInput
     from worldstate.ground.checks import in_range
     from worldstate.ground.errors import InvalidArgumentError
@@ -179,7 +170,7 @@ def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
 
 def _with_camera(
     arguments: argparse.Namespace,
-    given: GivenSensors,
+    given: sensors.GivenSensors,
     source: "Source",
     sound: "LiveSound",
     opened: ExitStack,
@@ -208,14 +199,14 @@ def _with_detections(
 
 def _with_device(
     arguments: argparse.Namespace,
-    given: GivenSensors,
+    given: sensors.GivenSensors,
     source: "Source",
     sound: "LiveSound",
     opened: ExitStack,
 ) -> "tuple[Source, Losses]":
     from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, LiveCamera, image_channel
 
-    images, detector = image_channel(), detector_maker(arguments.detector, given.setup.labels)()
+    images, detector = image_channel(), sensors.detector_maker(arguments.detector, given.setup.labels)()
     size = source.camera.width_px, source.camera.height_px
     looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
     opened.enter_context(CameraFeed(arguments.camera_device, images))
@@ -240,23 +231,20 @@ def _with_odometry(
 
 
 def _listen(
-    arguments: argparse.Namespace, given: GivenSensors, source: "Source", sound: "LiveSound"
+    arguments: argparse.Namespace, given: sensors.GivenSensors, source: "Source", sound: "LiveSound"
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
     from worldstate.adapters.live.live_listening import live_steps
     from worldstate.adapters.state_log import states_writer
-    from worldstate.cli.common.live_view import live_view, loss_notices
-    from worldstate.ground.values import seconds
     from worldstate.operations.recordings.live_report import LiveReport
 
-    shown = sys.stderr.isatty() if arguments.view is None else arguments.view
-    report, notice = LiveReport(source), loss_notices()
+    report, notice = LiveReport(source), _loss_notices()
     start_s, last = seconds(source.start_ns), None
     with (
         states_writer(arguments.out) as write,
-        exported_hops(arguments, source, given.car.crossing_m, paced=False) as export,
-        live_view(shown) as show,
+        exports.exported_hops(arguments, source, given.car.crossing_m, paced=False) as export,
+        _view(arguments) as show,
         stopped_by_signals(sound.close),
     ):
         for live in live_steps(source):
@@ -273,3 +261,33 @@ def _listen(
     if arguments.save_state is not None and last is not None:
         save_checkpoint(arguments.save_state, last.checkpoint)
     return report.to_dict(sound)
+
+
+@contextmanager
+def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
+    """Lend a function that shows a hop where --view or a terminal asks for it."""
+    shown = arguments.view
+    if shown is None:
+        shown = sys.stderr.isatty() and find_spec("rich") is not None
+    if not shown:
+        yield lambda live: None
+        return
+    from worldstate.cli.common.live_view import live_view
+
+    with live_view() as show:
+        yield show
+
+
+def _loss_notices() -> "Callable[[LiveStep], None]":
+    """Return a function that says on standard error when sound was lost, at most once a second."""
+    said, said_ns = 0, -SAID_EVERY_NS
+
+    def notice(live: "LiveStep") -> None:
+        nonlocal said, said_ns
+        stamp_ns = live.step.state.stamp_ns
+        if live.overruns > said and stamp_ns - said_ns >= SAID_EVERY_NS:
+            said, said_ns = live.overruns, stamp_ns
+            lost = f"{live.overruns} overruns, {live.lost_s:.2f} s of sound lost"
+            print(f"worldstate: {seconds(stamp_ns):.1f} s: {lost}", file=sys.stderr)
+
+    return notice

@@ -22,36 +22,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common import exports, inputs, listening, sensors
 from worldstate.cli.common.early_checks import check_call
-from worldstate.cli.common.exports import add_export_options, exported_files, exported_hops
-from worldstate.cli.common.inputs import (
-    add_array_options,
-    add_search_options,
-    add_sound_options,
-    bag_of,
-    sound_of,
-    stance,
-    topics_of,
-)
-from worldstate.cli.common.listening import (
-    add_listen_options,
-    add_memory_options,
-    given_place,
-    listen_settings,
-    listen_with_progress,
-)
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
-from worldstate.cli.common.sensors import (
-    GivenSensors,
-    add_camera_options,
-    add_car_option,
-    add_detector_option,
-    box_counts,
-    boxes_of,
-    detector_maker,
-    given_sensors,
-)
+from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.ground.errors import InputFileError
 
 if TYPE_CHECKING:
@@ -80,17 +53,17 @@ FIRST_OPTIONS = (
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_sound_options(parser)
-    add_array_options(parser)
-    add_car_option(parser)
-    add_search_options(parser)
-    add_listen_options(parser)
-    add_memory_options(parser, "0")
+    inputs.add_sound_options(parser)
+    inputs.add_array_options(parser)
+    sensors.add_car_option(parser)
+    inputs.add_search_options(parser)
+    listening.add_listen_options(parser)
+    listening.add_memory_options(parser, "0")
     _add_recording_options(parser)
-    add_camera_options(parser)
-    add_detector_option(parser, default=None)
+    sensors.add_camera_options(parser)
+    sensors.add_detector_option(parser, default=None)
     _add_output_options(parser)
-    add_export_options(parser)
+    exports.add_export_options(parser)
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
@@ -113,14 +86,14 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    files = exported_files(arguments)
+    files = exports.exported_files(arguments)
     check_outputs(arguments, "out", "save_state", figures=("figure", "gating"), exported=files)
-    given = given_sensors(arguments)
-    check_call(arguments, given, arguments.input if bag_of(arguments) is None else [])
+    given = sensors.given_sensors(arguments)
+    check_call(arguments, given, arguments.input if inputs.bag_of(arguments) is None else [])
     return _heard(arguments, given)
 
 
-def _heard(arguments: argparse.Namespace, given: GivenSensors) -> CommandResult:
+def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> CommandResult:
     """Listen to the recording; return what was found."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
@@ -129,8 +102,8 @@ def _heard(arguments: argparse.Namespace, given: GivenSensors) -> CommandResult:
 
     source = _source(arguments, given)
     try:
-        with exported_hops(arguments, source, given.car.crossing_m) as export:
-            report = listen_with_progress(
+        with exports.exported_hops(arguments, source, given.car.crossing_m) as export:
+            report = listening.listen_with_progress(
                 source, title=str(source.audio_path), states_path=arguments.out, on_hop=export
             )
     except SilentChannelsError as error:
@@ -142,8 +115,8 @@ def _heard(arguments: argparse.Namespace, given: GivenSensors) -> CommandResult:
     if arguments.figure is not None:
         write_timeline(report.timeline, arguments.figure)
     summary = report.to_dict() | {
-        "array": stance(source.array),
-        "detections": box_counts(source, as_json=arguments.json),
+        "array": inputs.stance(source.array),
+        "detections": sensors.box_counts(source, as_json=arguments.json),
     }
     if arguments.gating is not None:
         write_gating_figure(report.bearings, arguments.gating, title=str(source.audio_path))
@@ -151,16 +124,16 @@ def _heard(arguments: argparse.Namespace, given: GivenSensors) -> CommandResult:
     return CommandResult(summary)
 
 
-def _source(arguments: argparse.Namespace, given: GivenSensors) -> "Source":
+def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "Source":
     from dataclasses import replace
 
     from worldstate.adapters.source_files import open_source
     from worldstate.operations.recordings.car_cameras import with_cameras
 
-    boxes, named = boxes_of(arguments, given.setup), arguments.detector
+    boxes, named = sensors.boxes_of(arguments, given.setup), arguments.detector
     several = given.several(arguments)
     sound, array, detections, ego = _input(arguments, given, None if several else given.detections(arguments))
-    context, sides = given_place(arguments)
+    context, sides = listening.given_place(arguments)
     source = open_source(
         sound,
         array=array,
@@ -173,33 +146,34 @@ def _source(arguments: argparse.Namespace, given: GivenSensors) -> "Source":
         sides=sides,
         resume=arguments.resume,
         start_s=arguments.start or 0.0,
-        detector=None if named is None else detector_maker(named, given.setup.labels)(),
+        detector=None if named is None else sensors.detector_maker(named, given.setup.labels)(),
         others=_others(arguments, given),
         engine=_engine(given),
-        settings=replace(listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes),
+        settings=replace(listening.listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes),
     )
     return with_cameras(source, given.car, several) if several else source
 
 
 def _input(
-    arguments: argparse.Namespace, given: GivenSensors, seen: "Path | DetectionLog | None"
+    arguments: argparse.Namespace, given: sensors.GivenSensors, seen: "Path | DetectionLog | None"
 ) -> "tuple[SoundInput, MicrophoneArray | None, Path | DetectionLog | None, OdometryLog | None]":
     """Return sound, array, detections and odometry: options, the car's, or what a bag holds."""
     from worldstate.adapters.files.odometry_file import read_odometry
     from worldstate.adapters.ros.bag_input import needed_array, read_bag
     from worldstate.ground.errors import InvalidArgumentError
 
-    bag, moves = bag_of(arguments), arguments.odometry or given.car.odometry
+    bag, moves = inputs.bag_of(arguments), arguments.odometry or given.car.odometry
     if bag is None:
-        return sound_of(arguments), given.car.array, seen, None if moves is None else read_odometry(moves)
+        ego = None if moves is None else read_odometry(moves)
+        return inputs.sound_of(arguments), given.car.array, seen, ego
     if arguments.start:
         raise InvalidArgumentError("--start: expected none with a bag, whose messages have stamps")
-    held = read_bag(bag, topics_of(arguments))
+    held = read_bag(bag, inputs.topics_of(arguments))
     seen = held.detections if seen is None else seen
     return held.sound, needed_array(bag, given.car.array or held.array), seen, held.ego
 
 
-def _others(arguments: argparse.Namespace, given: GivenSensors) -> "list[OtherModality]":
+def _others(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "list[OtherModality]":
     """Return what other sensors measured, by option and in the car file."""
     from worldstate.adapters.own_parts import other_modality
 
@@ -207,7 +181,7 @@ def _others(arguments: argparse.Namespace, given: GivenSensors) -> "list[OtherMo
     return [other_modality("--measurements", text) for text in (*known, *arguments.measurements)]
 
 
-def _engine(given: GivenSensors) -> "EngineSpeed | None":
+def _engine(given: sensors.GivenSensors) -> "EngineSpeed | None":
     from worldstate.adapters.files.odometry_file import read_engine
 
     rpm = given.car.engine_rpm

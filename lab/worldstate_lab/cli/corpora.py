@@ -28,8 +28,7 @@ from worldstate.adapters.datasets.idmt_traffic import idmt_traffic
 from worldstate.adapters.datasets.melaudis import melaudis
 from worldstate.adapters.datasets.traffic_clips import TrafficClip
 from worldstate.adapters.files.atomic import write_text
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
 from worldstate.operations.figure_style import BLUE, ORANGE, RED, figure_file, legend_beside

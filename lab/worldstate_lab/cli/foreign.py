@@ -19,8 +19,7 @@ import numpy as np
 
 from worldstate.abduction.signature.domain_guard import DomainGuard, Foreign, WarningSignal
 from worldstate.adapters.files.atomic import write_text
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import (
     FOREIGN,

@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import characters
 from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams

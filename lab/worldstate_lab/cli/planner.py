@@ -15,8 +15,7 @@ import numpy as np
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.parallel import in_processes
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
 from worldstate_lab.planner.encounters import FROM_STANDING, BelievedStream, EgoVehicle, believed_stream

@@ -25,11 +25,10 @@ import numpy as np
 from worldstate.adapters.datasets.feature_extraction import read_windows, sample_windows
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.feature_options import add_group
 from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import track
+from worldstate.cli.model.fit import add_group
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.checks import in_range
 from worldstate.operations.figure_style import figure_file, legend_beside

@@ -28,8 +28,7 @@ import numpy as np
 
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.parallel import in_processes
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import pass_figures

@@ -32,8 +32,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar, track
 from worldstate.cli.common.sensors import detector_maker, detector_name
 

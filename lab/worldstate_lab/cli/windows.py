@@ -47,10 +47,9 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, read_featur
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.feature_options import add_table_options, read_beside
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.model.fit import add_table_options, read_beside
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.inputs import add_array_options, add_search_options, search_of
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.sensors import add_camera_options, add_car_option, given_sensors
 
 if TYPE_CHECKING:

@@ -11,16 +11,8 @@ criterion: reflections count, so it is no number of vehicles.
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.inputs import (
-    add_array_options,
-    add_search_options,
-    add_sound_options,
-    search_of,
-    sound_and_array,
-    stance,
-)
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common import inputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 
 EXAMPLE = """\
 examples:
@@ -30,9 +22,9 @@ examples:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_sound_options(parser)
-    add_array_options(parser)
-    add_search_options(parser)
+    inputs.add_sound_options(parser)
+    inputs.add_array_options(parser)
+    inputs.add_search_options(parser)
     parser.add_argument("--sources", action="store_true", help="count the sources of every second")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw azimuth over time")
@@ -51,9 +43,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     )
 
     check_outputs(arguments, "out", figures=("figure",))
-    sound, array = sound_and_array(arguments)
+    sound, array = inputs.sound_and_array(arguments)
     with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
-        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        settings = inputs.search_of(arguments).front_end(array, audio.sample_rate_hz)
         front_end = FrontEnd(array, audio.sample_rate_hz, settings)
         with sound_bar(audio) as bar:
             track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
@@ -63,7 +55,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         write_bearings_figure(track, arguments.figure, path_of(sound).name)
     summary = {
         "out": str(arguments.out),
-        "array": stance(array),
+        "array": inputs.stance(array),
         "band_hz": list(settings.srp_band_hz),
         "hops": len(track),
         "silent_channels": silent,

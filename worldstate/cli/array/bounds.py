@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.inputs import add_array_options, given_array, stance
-from worldstate.cli.common.output import CommandResult, write_report
-from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:

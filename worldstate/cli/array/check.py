@@ -13,15 +13,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import (
-    add_array_options,
-    add_search_options,
-    add_sound_options,
-    search_of,
-    sound_and_array,
-)
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common import inputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
@@ -36,9 +29,9 @@ examples:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_sound_options(parser)
-    add_array_options(parser)
-    add_search_options(parser)
+    inputs.add_sound_options(parser)
+    inputs.add_array_options(parser)
+    inputs.add_search_options(parser)
     add = parser.add_argument
     add("--duration", type=float, metavar="S", help="its length by another clock, seconds")
     add("--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)")
@@ -57,9 +50,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from .check_report import as_json, as_text
 
     check_outputs(arguments, figures=("figure",))
-    sound, array = sound_and_array(arguments)
+    sound, array = inputs.sound_and_array(arguments)
     with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
-        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        settings = inputs.search_of(arguments).front_end(array, audio.sample_rate_hz)
         health = examine(audio, FrontEnd(array, audio.sample_rate_hz, settings))
         if arguments.duration is not None:
             rate = rate_from_duration(

@@ -1,7 +1,6 @@
 """What a terminal shows of a run: bearing, risk of each side, entities, and what was lost."""
 
 import math
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -17,10 +16,8 @@ if TYPE_CHECKING:
     from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.state import Entity, RiskCue, WorldState
 
-# Every second state: nobody reads ten a second, and drawing costs some milliseconds.
+# Every second state: ten a second cannot be read, and drawing costs some milliseconds.
 _SHOWN_EVERY_NS = 200_000_000
-# Lost sound is said at most so often.
-_SAID_EVERY_NS = 1_000_000_000
 # Characters of the scale of azimuths from 90 degrees left to 90 degrees right: one for five degrees.
 _SCALE = 37
 _BAR = 20
@@ -29,11 +26,8 @@ _MOST_ENTITIES = 6
 
 
 @contextmanager
-def live_view(shown: bool) -> "Iterator[Callable[[LiveStep], None]]":
-    """Lend a function that shows a hop on standard error; one that does nothing where it is not wanted."""
-    if not shown:
-        yield lambda live: None
-        return
+def live_view() -> "Iterator[Callable[[LiveStep], None]]":
+    """Lend a function that shows a hop on standard error."""
     console, last_ns = Console(stderr=True), -_SHOWN_EVERY_NS
     with Live(console=console, auto_refresh=False, transient=True) as screen:
 
@@ -45,21 +39,6 @@ def live_view(shown: bool) -> "Iterator[Callable[[LiveStep], None]]":
                 screen.update(view_of(live), refresh=True)
 
         yield show
-
-
-def loss_notices() -> "Callable[[LiveStep], None]":
-    """Return a function that says on standard error when sound was lost, at most once a second."""
-    said, said_ns = 0, -_SAID_EVERY_NS
-
-    def notice(live: "LiveStep") -> None:
-        nonlocal said, said_ns
-        stamp_ns = live.step.state.stamp_ns
-        if live.overruns > said and stamp_ns - said_ns >= _SAID_EVERY_NS:
-            said, said_ns = live.overruns, stamp_ns
-            lost = f"{live.overruns} overruns, {live.lost_s:.2f} s of sound lost"
-            print(f"worldstate: {seconds(stamp_ns):.1f} s: {lost}", file=sys.stderr)
-
-    return notice
 
 
 def view_of(live: "LiveStep") -> RenderableType:

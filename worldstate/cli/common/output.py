@@ -1,11 +1,14 @@
-"""What a command found: tables for people, one JSON object for machines."""
+"""What a command found, in print and in files, which are checked before the work: no input is overwritten."""
 
+import argparse
 import json
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from worldstate.adapters.files.atomic import write_text
+from worldstate.ground.errors import InputFileError
 
 _SINCE_1970_S = 1e9
 
@@ -54,3 +57,63 @@ def _readable(value: object) -> str:
     if isinstance(value, tuple | list):
         return ", ".join(_readable(item) for item in value)
     return str(value)
+
+
+def check_outputs(
+    arguments: argparse.Namespace,
+    *options: str,
+    figures: tuple[str, ...] = (),
+    exported: Mapping[str, Path] | None = None,
+) -> None:
+    """Refuse output files that cannot be written, that replace an input, or that are one and the same.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     sound = Path(folder, "a.wav")
+    ...     sound.touch()
+    ...     check_outputs(argparse.Namespace(input=sound, out=Path(folder, "b.jsonl")), "out")
+    """
+    from worldstate.adapters.files.atomic import check_target
+    from worldstate.operations.figure_style import check_suffix
+
+    given = vars(arguments)
+    outputs = {name: given[name] for name in (*options, *figures) if given[name] is not None}
+    outputs |= exported or {}
+    lists = [
+        value if isinstance(value, list) else [value] for name, value in given.items() if name not in outputs
+    ]
+    inputs = [value for values in lists for value in values if isinstance(value, Path)]
+    taken: dict[Path, str] = {}
+    for name, path in outputs.items():
+        if name in figures:
+            check_suffix(path)
+        target = check_target(path)
+        if any(_is_read(target, source) for source in inputs):
+            raise InputFileError(path, "expected another file to write to, this one is read")
+        if target in taken:
+            raise InputFileError(path, f"expected another file for --{name} than for --{taken[target]}")
+        taken[target] = name
+
+
+def output_folder(folder: Path, *files: str) -> Path:
+    """Make the folder that a command writes to, and refuse one in which its files cannot be written."""
+    from worldstate.adapters.files.atomic import check_target
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        check_target(folder / name)
+    return folder
+
+
+def _is_read(target: Path, source: Path) -> bool:
+    """Whether an output is the input file itself, or one of the files of an input in the layout of OVAD."""
+    from worldstate.adapters.camera.video import VIDEO_NAME
+    from worldstate.adapters.datasets import ovad
+
+    if source.is_dir():
+        sound_and_log = ovad.ARRAY_NAME, ovad.AUDIO_NAME, ovad.LOG_NAME, ovad.TRUTH_NAME
+        names = (*sound_and_log, VIDEO_NAME, *ovad.DETECTION_NAMES)
+        return target.name in names and target.is_relative_to(os.path.realpath(source))
+    return target.exists() and source.exists() and target.samefile(source)

@@ -9,14 +9,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import (
-    add_array_options,
-    add_search_options,
-    search_of,
-    sound_and_array,
-)
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common import inputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 
 if TYPE_CHECKING:
     from worldstate.operations.viewing.state_figure import SoundPower
@@ -39,8 +33,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the largest risk)")
     add("--animate", type=Path, metavar="GIF", help="draw every snapshot from above")
     parser.set_defaults(topic=[])
-    add_array_options(parser)
-    add_search_options(parser)
+    inputs.add_array_options(parser)
+    inputs.add_search_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -84,9 +78,9 @@ def _sound(arguments: argparse.Namespace) -> "SoundPower":
     from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.viewing.state_figure import sound_power
 
-    sound, array = sound_and_array(arguments)
+    sound, array = inputs.sound_and_array(arguments)
     with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
-        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        settings = inputs.search_of(arguments).front_end(array, audio.sample_rate_hz)
         front_end = FrontEnd(array, audio.sample_rate_hz, settings)
         with progress_bar("listening", audio.duration_s) as bar:
             return sound_power(audio, front_end, on_second=bar.advance)

@@ -8,8 +8,7 @@ import argparse
 from pathlib import Path
 
 from worldstate.cli.common.exports import CROSSING_M, add_export_options, exported_files, open_exports
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 
 EXAMPLE = """\
 examples:

@@ -16,8 +16,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import progress_bar
 from worldstate.cli.common.sensors import add_detector_option, detector_maker, detector_name
 

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.inputs import add_array_options, given_array, stance
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.output import CommandResult, check_outputs
 
 if TYPE_CHECKING:
     from worldstate.operations.calibration.cueing_calibration import CueingCalibration
