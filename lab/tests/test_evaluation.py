@@ -235,7 +235,7 @@ def test_windows_of_a_tested_recording_are_left_out_or_refused(streets, tmp_path
     assert set(kept.ids.tolist()) == {t.name for t in (*streets[:3], *streets[12:])}
     assert "9 of tested recordings left out" in said
     with pytest.raises(InvalidArgumentError, match="left03"):
-        Classifiers(table_of(streets)).classify(streets[3:4], "all", streets[:3], streets[3:4], 1)
+        Classifiers(table_of(streets)).classify("all", streets[:3], streets[3:4], 1)
 
 
 @pytest.mark.slow

@@ -29,24 +29,59 @@ recordings are named and not scored.
 
 import argparse
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from worldstate.adapters.camera.detections import DetectionFilter
+from worldstate.adapters.datasets.array_choice import choose_array
+from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset
+from worldstate.adapters.files.acoustic_domain import check_array
+from worldstate.adapters.files.array_match import microphone_order
+from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar, track
 from worldstate.cli.common.sensors import detector_maker, detector_name
+from worldstate.frontend.array.microphone_array import ovad_array
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.simulation.dataset.dataset import write_dataset
+from worldstate.simulation.scene.junction import MOVING_SITES, SITES
+from worldstate_lab.degradation.degradation_study import DegradationSettings
+from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
+from worldstate_lab.evaluation.against import Comparison, compare, save_scores
+from worldstate_lab.evaluation.evaluation import (
+    Evaluation,
+    EvaluationSettings,
+    evaluate,
+    lacking_data,
+    whole_sweep,
+)
+from worldstate_lab.evaluation.figures import FIGURES
+from worldstate_lab.evaluation.report.contents import evaluation_document
+from worldstate_lab.evaluation.report.degradation_section import (
+    degradation_record,
+    stream_table,
+    sweep_tables,
+)
+from worldstate_lab.evaluation.report.warning_sections import equal_table
+from worldstate_lab.report.pages import write_document
+from worldstate_lab.report.table import Cell, Table, Value, plain
+from worldstate_lab.signatures.clip_signatures import ClipSignatures
+from worldstate_lab.signatures.signature_study import QUESTIONS, SignatureStudy, signature_study
+from worldstate_lab.signatures.simulated_corpora import LAYOUT, STREETS, simulated_corpora
+from worldstate_lab.trials import classification as windows
+from worldstate_lab.trials.classification import Classifiers, model_from_windows
+from worldstate_lab.trials.engine import Engine
+from worldstate_lab.trials.hearing import Hearing
+from worldstate_lab.trials.listening import model_refusal
+from worldstate_lab.trials.pass_cache import PassCache
+from worldstate_lab.trials.takes import Take, TakeList, find_takes
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from worldstate.operations.recordings.hop_table import HopTable
-    from worldstate_lab.degradation.degradation_study import DegradationSettings
-    from worldstate_lab.evaluation.against import Comparison
-    from worldstate_lab.evaluation.evaluation import Evaluation
-    from worldstate_lab.report.table import Cell, Table
-    from worldstate_lab.signatures.signature_study import SignatureStudy
-    from worldstate_lab.trials.classification import Classifiers
-    from worldstate_lab.trials.takes import Take, TakeList
+from .corpora import published_corpora
 
 EXAMPLE = """\
 examples:
@@ -96,13 +131,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate_lab.evaluation.against import save_scores
-    from worldstate_lab.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
-    from worldstate_lab.evaluation.report.contents import evaluation_document
-    from worldstate_lab.report.pages import write_document
-    from worldstate_lab.trials.engine import Engine
-    from worldstate_lab.trials.hearing import Hearing
-
     _check(arguments)
     if arguments.scheduler is not None:
         _in_full(arguments)
@@ -135,23 +163,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     return CommandResult(report, table=shown, lines=[*_lines(found), *_against_lines(compared)])
 
 
-def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
+def _signatures(arguments: argparse.Namespace) -> SignatureStudy:
     """Return the signature study on the corpora that were given, else on simulated passages."""
-    import numpy as np
-
-    from worldstate_lab.signatures.clip_signatures import ClipSignatures
-    from worldstate_lab.signatures.signature_study import QUESTIONS, signature_study
-    from worldstate_lab.signatures.simulated_corpora import LAYOUT, STREETS, simulated_corpora
-    from worldstate_lab.trials.pass_cache import PassCache
-
-    from .corpora import published_corpora
-
     # Apart, so that more recordings leave the folds and draws of a row as they are.
     simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
     if arguments.idmt is not None or arguments.melaudis is not None:
         return signature_study(*published_corpora(arguments), draws)
 
-    def simulate() -> "dict[str, HopTable]":
+    def simulate() -> dict[str, HopTable]:
         with progress_bar("simulating passages", PASSAGES * len(STREETS)) as bar:
             made = simulated_corpora(PASSAGES, simulation, arguments.jobs, bar.advance)
         return {name: corpus.table() for name, corpus in zip(("roads", "city"), made, strict=True)}
@@ -165,19 +184,13 @@ def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
 
 
 def _degradation(
-    arguments: argparse.Namespace, classifiers: "Classifiers", takes: "TakeList"
-) -> "DegradationSettings":
+    arguments: argparse.Namespace, classifiers: Classifiers, takes: TakeList
+) -> DegradationSettings:
     """Return the sweep over camera states; in a smoke test of one detector on small images.
 
     It listens with --model, else with the model that ships, and where that was not made for this sound with
     one that is trained on the training windows.
     """
-    from worldstate.adapters.camera.detections import DetectionFilter
-    from worldstate_lab.degradation.degradation_study import DegradationSettings
-    from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
-    from worldstate_lab.evaluation.evaluation import whole_sweep
-    from worldstate_lab.trials.classification import model_from_windows
-
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
     foreign = any(_is_foreign(take) for take in takes.static if take.filmed)
     if foreign and model is None and classifiers.windows is not None and not arguments.smoke:
@@ -192,12 +205,8 @@ def _degradation(
     return whole_sweep(takes, settings) if arguments.full else settings
 
 
-def _is_foreign(take: "Take") -> bool:
+def _is_foreign(take: Take) -> bool:
     """Tell whether the model that ships was not made for the sound of a recording."""
-    from worldstate.adapters.files.model_file import read_model
-    from worldstate.ground.errors import InputFileError
-    from worldstate_lab.trials.listening import model_refusal
-
     try:
         return model_refusal(take, read_model(None)) is not None
     except InputFileError:
@@ -206,8 +215,6 @@ def _is_foreign(take: "Take") -> bool:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from worldstate.ground.checks import in_range
-    from worldstate.ground.errors import InvalidArgumentError
 
     in_range("--jobs", arguments.jobs, 1, 256)
     if arguments.stage_streams and not arguments.hazard_free:
@@ -237,26 +244,21 @@ def _told(value: object) -> str:
     return "none" if value is None else value.name if isinstance(value, Path) else str(value)
 
 
-def _compared(arguments: argparse.Namespace) -> "Sequence[Comparison]":
-    import numpy as np
-
-    from worldstate_lab.evaluation.against import compare
+def _compared(arguments: argparse.Namespace) -> Sequence[Comparison]:
 
     if arguments.against is None:
         return ()
     return compare(arguments.out, arguments.against, np.random.default_rng(arguments.seed))
 
 
-def _difference(one: "Comparison") -> dict[str, object]:
+def _difference(one: Comparison) -> dict[str, object]:
     """Return JSON-able values; a figure that neither evaluation has is left out."""
     known = {name: values for name, values in one.differences.items() if values[0] == values[0]}
     return {"protocol": one.protocol, "method": one.method, "shared": one.shared, "differences": known}
 
 
-def _against_lines(compared: "Sequence[Comparison]") -> list[str]:
+def _against_lines(compared: Sequence[Comparison]) -> list[str]:
     """Return the differences of the main figures to the other evaluation, with their intervals."""
-    from worldstate_lab.report.table import Table, Value
-
     rows: list[tuple[Cell, ...]] = [
         (one.protocol, one.method, one.shared, *(Value(*one.differences[name]) for name in COMPARED))
         for one in compared
@@ -265,8 +267,7 @@ def _against_lines(compared: "Sequence[Comparison]") -> list[str]:
     return ["", *table.lines()] if rows else []
 
 
-def _takes(arguments: argparse.Namespace) -> "TakeList":
-    from worldstate_lab.trials.takes import find_takes
+def _takes(arguments: argparse.Namespace) -> TakeList:
 
     if arguments.model is not None:
         _check_model(arguments.model, arguments.dataset)
@@ -281,11 +282,6 @@ def _takes(arguments: argparse.Namespace) -> "TakeList":
 
 def _check_model(model: Path, dataset: Path | None) -> None:
     """Refuse a model that was made for another array: every row of it would be of no meaning."""
-    from worldstate.adapters.datasets.array_choice import choose_array
-    from worldstate.adapters.files.acoustic_domain import check_array
-    from worldstate.adapters.files.model_file import read_model
-    from worldstate.frontend.array.microphone_array import ovad_array
-
     domain = read_model(model).domain
     if domain is not None:
         # Streets are simulated with OVAD's array: a mismatch is found before, not after a quarter of an hour.
@@ -294,10 +290,7 @@ def _check_model(model: Path, dataset: Path | None) -> None:
 
 def _simulated(arguments: argparse.Namespace) -> Path:
     """Simulate the streets that are not there yet."""
-    from dataclasses import replace
-
-    from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset
-    from worldstate.simulation.dataset.dataset import DatasetSettings, write_dataset
+    from worldstate.simulation.dataset.dataset import DatasetSettings
 
     root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
@@ -315,13 +308,7 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     return root
 
 
-def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifiers":
-    from worldstate.adapters.datasets.array_choice import choose_array
-    from worldstate.adapters.files.array_match import microphone_order
-    from worldstate.frontend.array.microphone_array import ovad_array
-    from worldstate.simulation.scene.junction import MOVING_SITES, SITES
-    from worldstate_lab.trials import classification as windows
-    from worldstate_lab.trials.classification import Classifiers
+def _classifiers(arguments: argparse.Namespace, takes: TakeList) -> Classifiers:
 
     folder = arguments.out / "cache"
     folder.mkdir(parents=True, exist_ok=True)
@@ -345,9 +332,7 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
     return Classifiers(*(found or (None, "the calibration recordings of each fold")))
 
 
-def _report(found: "Evaluation", compared: "Sequence[Comparison]") -> dict[str, object]:
-    from worldstate_lab.evaluation.report.degradation_section import degradation_record
-    from worldstate_lab.report.table import plain
+def _report(found: Evaluation, compared: Sequence[Comparison]) -> dict[str, object]:
 
     report: dict[str, object] = plain(
         {
@@ -375,9 +360,7 @@ def _report(found: "Evaluation", compared: "Sequence[Comparison]") -> dict[str, 
     return report
 
 
-def _lines(found: "Evaluation") -> list[str]:
-    from worldstate_lab.evaluation.report.degradation_section import stream_table, sweep_tables
-    from worldstate_lab.evaluation.report.warning_sections import equal_table
+def _lines(found: Evaluation) -> list[str]:
 
     lines = [f"not heard: {one.name}: {one.problem}" for one in found.failed]
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
@@ -391,11 +374,8 @@ def _lines(found: "Evaluation") -> list[str]:
     return [*lines, *(line for table in tables for line in ("", *table.lines()))]
 
 
-def _warnings(found: "Evaluation", protocol: str) -> "Table":
+def _warnings(found: Evaluation, protocol: str) -> Table:
     """Return the warning figures of every method, with the exact interval of its false alarms."""
-    from worldstate_lab.evaluation.figures import FIGURES
-    from worldstate_lab.report.table import Table, Value
-
     rows: list[tuple[Cell, ...]] = []
     for method, score in found.scores[protocol].items():
         if not method.startswith("curve"):

@@ -130,7 +130,7 @@ def health_of(readings: Sequence[HopTable]) -> CameraHealth:
 
 
 def degradation_in(readings: HopTable, condition: str, rates: MissRates) -> DegradationLog:
-    """Return d as the camera's own images show it: nobody says what is staged."""
+    """Return d as the camera's own images show it, without what is staged."""
     if rates.health is None:
         raise InvalidArgumentError("rates: expected miss rates with the camera's scale of health")
     monitor, chosen = HealthMonitor(rates.health), readings.condition == condition

@@ -81,7 +81,7 @@ def filter_in_conditions(
     """Return what the filter made of one recording with each detector, all conditions end to end.
 
     Columns are those of a hop stream and `condition`; `degradation`, d as it was estimated; `presence`, the
-    chance that anybody is there, hidden or visible, by the entities that the filter publishes; and `found`,
+    chance that a vehicle is there, hidden or visible, by the entities that the filter publishes; and `found`,
     whether a moving object that is in view was detected, where `seen` takes any detection.
     """
     rms = level_rms(source)
@@ -170,7 +170,7 @@ def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Seque
 
 
 def _presence(source: Source, measurements: Sequence[Measurement]) -> list[float]:
-    r"""Return the chance that anybody is there at every hop, :math:`1 - \prod_i (1 - r_i)`.
+    r"""Return the chance that a vehicle is there at every hop, :math:`1 - \prod_i (1 - r_i)`.
 
     Of the entities, not of the explanations: what the camera has shown, or the sequence has told, stays in
     them while the window at hand tells nothing.

@@ -158,34 +158,16 @@ def run_protocol(
     for seed in used:
         said: dict[str, dict[int, Decisions]] = {method.name: {} for method in methods}
         for calibration, tested in protocol.parts(trials, np.random.default_rng(seed)):
-            _one_part(protocol, trials, methods, classifiers, calibration, tested, seed, said)
+            parts = [trials[i] for i in calibration], [trials[i] for i in tested]
+            before, after = classifiers.classify(protocol.trained_on, *parts, seed)
+            for method in methods:
+                decide = method.fit(before, np.random.default_rng(seed))
+                said[method.name] |= {i: decide(trial) for i, trial in zip(tested, after, strict=True)}
         passes.append(said)
     rows = sorted(next(iter(passes[0].values())))
-    return ProtocolRun(
-        protocol,
-        tuple(trials[i] for i in rows),
-        {
-            method.name: tuple(tuple(one[method.name][i] for i in rows) for one in passes)
-            for method in methods
-        },
-        used,
-        classifiers.trained_on(protocol.trained_on),
-    )
-
-
-def _one_part(
-    protocol: Protocol,
-    heard: Sequence[Trial],
-    methods: Sequence[Method],
-    classifiers: Classifiers,
-    calibration: Sequence[int],
-    tested: Sequence[int],
-    seed: int,
-    said: Mapping[str, dict[int, Decisions]],
-) -> None:
-    before, after = [heard[i] for i in calibration], [heard[i] for i in tested]
-    known = classifiers.classify([*before, *after], protocol.trained_on, before, after, seed)
-    for method in methods:
-        decide = method.fit(known[: len(before)], np.random.default_rng(seed))
-        for i, trial in zip(tested, known[len(before) :], strict=True):
-            said[method.name][i] = decide(trial)
+    decisions = {
+        name: tuple(tuple(one[name][i] for i in rows) for one in passes)
+        for name in (method.name for method in methods)
+    }
+    trained_on = classifiers.trained_on(protocol.trained_on)
+    return ProtocolRun(protocol, tuple(trials[i] for i in rows), decisions, used, trained_on)

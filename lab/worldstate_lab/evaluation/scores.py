@@ -288,7 +288,7 @@ def _bins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
     pairs = list(zip(trials, said, strict=True))
     risks = [reduction.scored_windows(trial, one.risk) for trial, one in pairs]
     raw = [reduction.scored_windows(trial, one.score) for trial, one in pairs]
-    # Log odds and ratios are scores as well, but they are read as a probability by nobody.
+    # Log odds and ratios are scores as well, but no probabilities.
     if any(((score < 0.0) | (score > 1.0)).any() for score in raw):
         raw = [np.zeros(0)] * len(raw)
     return np.array([[reduction.probability_bins(one) for one in some] for some in (risks, raw)])

@@ -155,7 +155,7 @@ class RadarFieldOfView:
         in_range("detection", self.detection, 0.0, 1.0)
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
-        """Return the model with the randomness of its misses: the same for a trial whoever asks, and when."""
+        """Return the model with the randomness of its misses: the same for a trial in every order."""
         seed = int(rng.integers(1 << 32))
         return lambda trial: self._scanned(trial, seed)
 
@@ -219,7 +219,7 @@ class OcSortRecovery:
         return Decisions.of(time_s, found, side=sides(bearing), bearing_rad=bearing, tracks=tracks)
 
     def _holds(self, one: TrackedBox) -> bool:
-        # A box that flashed up once never was a track: nobody would coast on it.
+        # A box that flashed up once never was a track to coast on.
         return one.certain if self.reading == "stock" else one.known
 
     def _azimuth_rad(self, one: TrackedBox) -> float:

@@ -70,14 +70,9 @@ class Classifiers:
         return "calibration" if self.windows is None else kind
 
     def classify(
-        self,
-        trials: Sequence[Trial],
-        kind: TrainedOn,
-        calibration: Sequence[Trial],
-        tested: Sequence[Trial],
-        seed: int,
-    ) -> list[Trial]:
-        """Return trials with the posteriors of the classifier that belongs to a fold."""
+        self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial], seed: int
+    ) -> tuple[list[Trial], list[Trial]]:
+        """Return both parts of a fold with the posteriors of the classifiers that belong to it."""
         key = self._key(kind, calibration, tested, seed)
         if key not in self._trained:
             table = self._table(kind, calibration, tested)
@@ -88,16 +83,17 @@ class Classifiers:
                 "published": published.fit(table.features, table.labels).model_,
                 "ensemble": fit_ensemble(with_site_references(table)),
             }
-        done = []
-        for trial in trials:
-            # The same classifiers hear the same trial in many folds and protocols.
-            if (key, trial.name) not in self._heard:
-                heard = trial
-                for name, signature in self._trained[key].items():
-                    heard = classified(heard, name, signature)
-                self._heard[key, trial.name] = heard
-            done.append(self._heard[key, trial.name])
-        return done
+        before, after = ([self._classified(key, one) for one in part] for part in (calibration, tested))
+        return before, after
+
+    def _classified(self, key: tuple[str, ...], trial: Trial) -> Trial:
+        # The same classifiers hear the same trial in many folds and protocols.
+        if (key, trial.name) not in self._heard:
+            heard = trial
+            for name, signature in self._trained[key].items():
+                heard = classified(heard, name, signature)
+            self._heard[key, trial.name] = heard
+        return self._heard[key, trial.name]
 
     def _key(
         self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial], seed: int

@@ -80,7 +80,7 @@ def _on_cluster(
         waiting = deque(client.map(work, items, pure=False))
         try:
             while waiting:
-                # Nobody else holds the future: the cluster forgets the result as soon as it is here.
+                # This loop alone holds the future: the cluster forgets the result as soon as it is here.
                 yield waiting.popleft().result()
         except lost as error:
             raise WorldstateError(

@@ -166,7 +166,7 @@ def _hazard_free(path: Path) -> list[Take]:
 
 
 def _hazard_free_stream(path: Path) -> Take:
-    """Take a stream that nobody labelled; what a simulated one knows of itself counts."""
+    """Take a stream without a label; the truth of a simulated one is looked up."""
     hazards = stream_hazards(path)
     if hazards:
         raise InputFileError(
