@@ -27,7 +27,7 @@ demo: $(VENV)/.core
 # While working: the core first, so that what it breaks shows within seconds, then the rest of what every commit
 # can break. Types are fast with a warm cache.
 check: $(VENV)/.test
-	$(BIN)/python -m pytest -x tests/core
+	$(BIN)/python -m pytest -x -n 2 --dist loadgroup tests/core
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p worldstate
 	$(BIN)/lint-imports
@@ -43,6 +43,7 @@ slow: $(VENV)/.test
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p worldstate
+	MYPYPATH=lab $(BIN)/mypy -p worldstate_lab
 	$(BIN)/lint-imports
 
 # After a change of the snapshot's types.

@@ -27,8 +27,8 @@ ORDER = [
     "frontend",
     "abduction",
     "adapters",
+    "simulation",
     "operations",
-    "studies",
 ]
 
 
@@ -79,7 +79,9 @@ def summary(value: object) -> str:
         if isinstance(value, UnionType):
             return "Type: " + " or ".join(f":py:obj:`{one.__name__}`" for one in value.__args__)
         several = isinstance(value, Iterable) and not isinstance(value, str)
-        return f"Constant: {', '.join(map(str, value)) if several else value}."
+        told = ", ".join(map(str, value)) if several else str(value)
+        # A type alias holds asterisks.
+        return "Constant: " + told.replace("*", r"\*") + "."
     return " ".join((inspect.getdoc(value) or "").split("\n\n")[0].split())
 
 
