@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
-from worldstate_lab.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
+from worldstate_lab.trials.pass_cache import PassCache, fingerprint
 
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_table import HopTable
@@ -21,7 +21,7 @@ class Levels:
     pause_s: float = 0.0  # As if it took that long
 
     def __call__(self, path):
-        mark = fingerprint(path, FingerprintMemo(self.folder / "fingerprints"))
+        mark = fingerprint(path, self.folder / "fingerprints")
         tables = PassCache(self.folder).tables("levels", [1, mark], lambda: {"hops": self.make(path)})
         return tables["hops"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worldstate_lab.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
+from worldstate_lab.trials.pass_cache import PassCache, fingerprint
 
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_table import HopTable, load_named, load_tables, save_named
@@ -98,10 +98,10 @@ def recording(folder):
 
 
 def test_a_fingerprint_is_of_the_content_and_of_nothing_else(tmp_path):
-    memo = FingerprintMemo(tmp_path / "memo")
+    memo = tmp_path / "memo"
     one, other = recording(tmp_path / "one"), recording(tmp_path / "other")
     same = fingerprint(one, memo)
-    assert fingerprint(other, memo) == same == fingerprint(one, FingerprintMemo(tmp_path / "another"))
+    assert fingerprint(other, memo) == same == fingerprint(one, tmp_path / "another")
     (one / "notes.txt").write_text("windy")
     os.utime(one / "out_multi.wav")
     assert fingerprint(one, memo) == same
@@ -115,7 +115,7 @@ def test_a_fingerprint_is_of_the_content_and_of_nothing_else(tmp_path):
 
 
 def test_unchanged_files_are_not_read_again(tmp_path):
-    memo, place = FingerprintMemo(tmp_path / "memo"), recording(tmp_path / "one")
+    memo, place = tmp_path / "memo", recording(tmp_path / "one")
     before = fingerprint(place, memo)
     sound = place / "out_multi.wav"
     state = sound.stat()
@@ -123,20 +123,20 @@ def test_unchanged_files_are_not_read_again(tmp_path):
     sound.write_text("X" * state.st_size)
     os.utime(sound, ns=(state.st_atime_ns, state.st_mtime_ns))
     assert fingerprint(place, memo) == before
-    assert fingerprint(place, FingerprintMemo(tmp_path / "new")) != before
+    assert fingerprint(place, tmp_path / "new") != before
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"out_multi.wav": "0"}', "\xff"])
 def test_a_damaged_memory_costs_a_reading(damage, tmp_path):
-    memo, place = FingerprintMemo(tmp_path / "memo"), recording(tmp_path / "one")
+    memo, place = tmp_path / "memo", recording(tmp_path / "one")
     before = fingerprint(place, memo)
-    [path] = memo.folder.iterdir()
+    [path] = memo.iterdir()
     path.write_text(damage, encoding="latin-1")
     assert fingerprint(place, memo) == before
 
 
 def test_a_single_sound_file_has_a_fingerprint_and_nothing_has_none(tmp_path):
-    memo = FingerprintMemo(tmp_path / "memo")
+    memo = tmp_path / "memo"
     (tmp_path / "a.wav").write_text("sound")
     assert len(fingerprint(tmp_path / "a.wav", memo)) == 32
     with pytest.raises(InputFileError, match=r"out_multi\.wav"):

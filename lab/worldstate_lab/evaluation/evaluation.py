@@ -35,7 +35,7 @@ from worldstate_lab.trials.classification import Classifiers
 from worldstate_lab.trials.engine import Engine, Failed
 from worldstate_lab.trials.hearing import Hearing, hear, within_hours
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
+from worldstate_lab.trials.pass_cache import PassCache, fingerprint
 from worldstate_lab.trials.takes import Take, TakeList
 from worldstate_lab.trials.trial import Trial
 
@@ -202,7 +202,7 @@ def _degradation(
         done = track(engine.over(work, items), "degrading the camera", len(items))
         return (one.problem if isinstance(one, Failed) else one for one in done)
 
-    named = partial(fingerprint, memo=FingerprintMemo(hearing.folder / "fingerprints"))
+    named = partial(fingerprint, memo=hearing.folder / "fingerprints")
     recordings = [Recording.open(take.path) for take in filmed]
     keep = PassCache(hearing.folder).tables
     return degradation_study(recordings, settings, over=over, keep=keep, fingerprint=named)
@@ -218,7 +218,7 @@ class _StagedStream:
     def __call__(self, take: Take) -> HopTable:
         """Return the advisories of every state of the camera, or what an earlier run found."""
         folder, model = self.hearing.folder, self.hearing.model
-        mark = fingerprint(take.path, FingerprintMemo(folder / "fingerprints"))
+        mark = fingerprint(take.path, folder / "fingerprints")
         key = [STREAM_VERSION, mark, states_told(), model_to_dict(read_model(model)), self.seed]
 
         def make() -> dict[str, HopTable]:

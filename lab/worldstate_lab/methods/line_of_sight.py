@@ -10,7 +10,6 @@ import numpy as np
 
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.ground.checks import in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
@@ -133,6 +132,14 @@ def _early_s(trial: Trial) -> float:
     return early_s if early_s > SLACK_S else 0.0
 
 
+# Field of view and range of the near scan of a common 77 GHz front radar (Continental ARS 408-21: 60 deg
+# to either side, 70 m, a scan in 72 ms); the probability is what tracking papers assume of such a radar.
+# The range decides nothing at a junction: whatever is in line of sight there is nearer than 70 m, and
+# a real recording does not say how far. Waves of 4 mm neither bend round a corner nor pass a wall; what
+# they reflect off one is clutter to a production radar, so hidden vehicles are not found at all.
+RADAR_HALF_VIEW_RAD = math.radians(60.0)
+
+
 @dataclass(frozen=True, slots=True)
 class RadarFieldOfView:
     """A forward radar that finds a vehicle in line of sight and within its field of view, scan by scan.
@@ -141,18 +148,8 @@ class RadarFieldOfView:
     true one, whose error says nothing.
     """
 
-    # Field of view and range of the near scan of a common 77 GHz front radar (Continental ARS 408-21: 60 deg
-    # to either side, 70 m, a scan in 72 ms); the probability is what tracking papers assume of such a radar.
-    # The range decides nothing at a junction: whatever is in line of sight there is nearer than 70 m, and
-    # a real recording does not say how far. Waves of 4 mm neither bend round a corner nor pass a wall; what
-    # they reflect off one is clutter to a production radar, so hidden vehicles are not found at all.
-    half_view_rad: float = math.radians(60.0)
     detection: float = 0.9
     name: str = "Radar field-of-view model"
-
-    def __post_init__(self) -> None:
-        in_range("half_view_rad", self.half_view_rad, 0.0, math.pi)
-        in_range("detection", self.detection, 0.0, 1.0)
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
         """Return the model with the randomness of its misses: the same for a trial in every order."""
@@ -165,7 +162,7 @@ class RadarFieldOfView:
             missed = np.random.default_rng([seed, zlib.crc32(trial.name.encode())])
             found = missed.random(len(trial.truth)) < self.detection
             found &= trial.truth.in_view.astype(bool)
-            found &= np.abs(trial.truth.azimuth_rad) <= self.half_view_rad
+            found &= np.abs(trial.truth.azimuth_rad) <= RADAR_HALF_VIEW_RAD
             time_s = trial.truth.time_s[found]
             # The first hop that ends after the scan reports it, if it is not a whole hop later.
             hop_s = trial.hops.time_s

@@ -24,7 +24,7 @@ from .listening import (
     model_refusal,
     unfiltered_decisions,
 )
-from .pass_cache import FingerprintMemo, PassCache, content_hash, fingerprint
+from .pass_cache import PassCache, content_hash, fingerprint
 from .takes import Take
 from .trial import DECISION_COLUMNS, Decisions, Trial
 
@@ -46,7 +46,7 @@ class Hearing:
 
     def __call__(self, take: Take) -> Trial:
         """Listen to one recording, or read back what an earlier run heard of the same content."""
-        mark = fingerprint(take.path, FingerprintMemo(self.folder / "fingerprints"))
+        mark = fingerprint(take.path, self.folder / "fingerprints")
         model = read_model(self.model)
         array = named_array(take.path)
         about = [VERSION, take.name, take.label, take.t0_s, take.site, mark]

@@ -30,33 +30,16 @@ def origin_of(made_of: object) -> str:
 RECORDING_NAMES = (AUDIO_NAME, *DETECTION_NAMES, VIDEO_NAME, TRUTH_NAME)
 
 
-@dataclass(frozen=True, slots=True)
-class FingerprintMemo:
-    """Content hashes of files by path, size and time of change, one small file a recording in `folder`."""
-
-    # One file for all recordings would lose entries where two processes write it at once.
-    folder: Path
-
-    def hashes(self, owner: Path, files: list[Path]) -> dict[str, str]:
-        """Return the hash of each file by name; those that did not change are not read again."""
-        path = self.folder / f"{origin_of(str(owner.absolute()))}.json"
-        known = _known(path)
-        stamps = {file: _stamp(file) for file in files}
-        found = {stamp: known.get(stamp) or content_hash(file) for file, stamp in stamps.items()}
-        if found != known:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_text(path, json.dumps(found))
-        return {file.name: found[stamp] for file, stamp in stamps.items()}
-
-
-def fingerprint(place: Path, memo: FingerprintMemo) -> str:
+def fingerprint(place: Path, memo: Path) -> str:
     """Name the content of a recording, a folder in OVAD's layout or one file, in 32 characters.
+
+    Hashes of files by path, size and time of change are kept in the folder `memo`.
 
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
-    ...     memo, recording = FingerprintMemo(Path(folder) / "memo"), Path(folder) / "1_00_0002"
+    ...     memo, recording = Path(folder) / "memo", Path(folder) / "1_00_0002"
     ...     recording.mkdir()
     ...     _ = (recording / "out_multi.wav").write_bytes(b"sound")
     ...     before = fingerprint(recording, memo)
@@ -68,7 +51,20 @@ def fingerprint(place: Path, memo: FingerprintMemo) -> str:
     files = [path for path in named if path.is_file()]
     if not files:
         raise InputFileError(place, f"expected a sound file or a recording folder with {AUDIO_NAME}")
-    return origin_of(memo.hashes(place, files))
+    return origin_of(_hashes(memo, place, files))
+
+
+def _hashes(memo: Path, owner: Path, files: list[Path]) -> dict[str, str]:
+    """Return the hash of each file by name; those that did not change are not read again."""
+    # One file for all recordings would lose entries where two processes write it at once.
+    path = memo / f"{origin_of(str(owner.absolute()))}.json"
+    known = _known(path)
+    stamps = {file: _stamp(file) for file in files}
+    found = {stamp: known.get(stamp) or content_hash(file) for file, stamp in stamps.items()}
+    if found != known:
+        memo.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(found))
+    return {file.name: found[stamp] for file, stamp in stamps.items()}
 
 
 def _known(path: Path) -> dict[str, str]:
