@@ -11,7 +11,6 @@ from scipy.signal import coherence, stft
 
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
-from worldstate.cli.sim import make as cli
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
@@ -283,8 +282,3 @@ def test_the_command_adds_sounds_and_tells_them(tmp_path, capsys):
     assert [sound["kind"] for sound in truth["sounds"]] == ["gusts"]
     assert main([*arguments, "--sounds", "vuvuzela", "--out", str(tmp_path / "e")]) == 2
     assert "vuvuzela" in capsys.readouterr().err
-
-
-def test_the_command_offers_the_sounds_there_are():
-    assert sorted(cli.SOUNDS) == sorted(SOUNDS)
-    assert SOUNDS.keys() >= set(SIGNALS)

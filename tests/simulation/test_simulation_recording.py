@@ -14,13 +14,10 @@ from worldstate.adapters.camera.detections import read_detections
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.cli.main import main
-from worldstate.cli.sim import make as cli
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.simulation import (
-    KINDS,
-    PLACES,
     SITES,
     DatasetSettings,
     SimulationSettings,
@@ -33,7 +30,7 @@ from worldstate.simulation import (
     write_recording,
 )
 from worldstate.simulation.camera.simulated_detector import line_of_sight
-from worldstate.simulation.scene.presets import DEFAULT_PRESET, PRESETS
+from worldstate.simulation.scene.presets import PRESETS
 from worldstate.simulation.scene.vehicle import drive, propulsion_level_db, rolling_level_db
 from worldstate.simulation.sound.background import far_passages_s
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
@@ -294,13 +291,6 @@ def test_the_command_writes_and_reports(tmp_path, capsys):
     assert (truth["settings"]["kind"], truth["settings"]["site"]["name"]) == ("electric", "SM1")
     assert main(["sim", "make", "--out", str(tmp_path / "e"), "--static", "0"]) == 2
     assert "n_static" in capsys.readouterr().err
-
-
-def test_the_command_offers_what_the_simulation_has():
-    assert sorted(cli.KINDS) == sorted(KINDS)
-    assert sorted(cli.SCENES) == sorted(["junction", *PLACES, "all"])
-    assert list(cli.PRESETS) == list(PRESETS)
-    assert cli.PRESETS[0] == DEFAULT_PRESET
 
 
 def test_a_calm_street_is_another_sound_of_the_same_drive(tmp_path, capsys):

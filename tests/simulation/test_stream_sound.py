@@ -18,12 +18,11 @@ from worldstate_lab.trials.takes import find_takes
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.cli.main import main
-from worldstate.cli.sim import make
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array
 from worldstate.operations.recordings.true_track import read_true_tracks
-from worldstate.simulation import SITES, preset, site
+from worldstate.simulation import preset, site
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.presets import site_ambience
 from worldstate.simulation.scene.settings import SoundSettings
@@ -41,7 +40,7 @@ from worldstate.simulation.stream.rendering import (
     render_piece,
     row_times,
 )
-from worldstate.simulation.stream.settings import TRAFFICS, StreamSettings, traffic_named
+from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.truth import visible_s
 from worldstate.simulation.stream.writing import write_stream
 
@@ -203,8 +202,6 @@ def test_a_stream_on_disk_is_read_like_a_recording(
 def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert list(make.TRAFFICS) == list(TRAFFICS)
-    assert make.STREAM_SITES == SITES
     refused = {
         "--minutes 1 --site DA1": "drives are heard",
         "--minutes 1 --static 2": "--static",

@@ -51,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     ids = "CSV files with a column ID: leave out the recordings of these labelled windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
-    quiet = "recordings in which nobody came: the alarm is set on them"
+    quiet = "recordings without a vehicle: the alarm is set on them"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
     add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
     allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"

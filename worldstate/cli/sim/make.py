@@ -41,19 +41,7 @@ if TYPE_CHECKING:
     from worldstate.simulation.dataset.dataset import DatasetSettings
     from worldstate.simulation.stream.settings import StreamSettings
 
-# Named here again: the help is built without importing the simulation. A test compares them.
-SCENES = (
-    "junction", "lead-vehicle", "bridge-pier", "merge", "open-road", "wide-crossing", "one-corner",
-    "parked-van", "all",
-)  # fmt: skip
-KINDS = ("light", "medium", "heavy", "motorcycle", "electric", "bicycle", "scooter", "tram")
-SOUNDS = (
-    *("voice", "steps", "bell", "saw", "drill", "music", "birds", "siren", "wail", "horn", "beeper"),
-    *("bicycle-bell", "rain", "gusts", "tone"),
-)
-PRESETS = ("street-6", "street-6-calm")
-STREAM_SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")
-TRAFFICS = ("calm", "busy", "approaches", "no-hazard", "empty")
+JUNCTION = "junction"  # the scene where none is named
 FIGURE_NAME = "stream.png"
 PER_HOUR = 12.0  # of every kind of --sounds in a stream that is no vehicle's
 SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds
@@ -68,11 +56,16 @@ examples:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    from worldstate.simulation.scene.junction import PLACES
+    from worldstate.simulation.scene.kinds import KINDS
+    from worldstate.simulation.scene.presets import PRESETS
+    from worldstate.simulation.scene.settings import SOUNDS
+
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="D", help="folder of the data set")
     add("--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)")
     add("--dynamic", type=int, default=0, metavar="N", help="of a moving one (default: 0)")
-    add_choice(parser, "--scene", "what hides the vehicle", *SCENES)
+    add_choice(parser, "--scene", "what hides the vehicle", JUNCTION, *PLACES, "all")
     add_choice(parser, "--kind", "vehicle", *KINDS)
     add_choice(parser, "--preset", "how busy the street is", *PRESETS)
     told = f"what else sounds, separated by commas: {', '.join(SOUNDS)}"
@@ -89,11 +82,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_stream_options(parser: argparse.ArgumentParser) -> None:
+    from worldstate.simulation.scene.junction import SITES
+    from worldstate.simulation.stream.settings import TRAFFICS
+
     add = parser.add_argument_group("a continuous stream").add_argument
     add("--minutes", type=float, metavar="M", help="its length")
     # Any word is taken: the library refuses a moving ego with its reason.
-    add("--site", default=STREAM_SITES[0], help=f"{', '.join(STREAM_SITES)} (default: {STREAM_SITES[0]})")
-    add("--traffic", choices=TRAFFICS, default=TRAFFICS[0], help=f"how much drives (default: {TRAFFICS[0]})")
+    add("--site", default=SITES[0], help=f"{', '.join(SITES)} (default: {SITES[0]})")
+    add("--traffic", choices=[*TRAFFICS], default="calm", help="how much drives (default: calm)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -125,7 +121,7 @@ def _run_stream(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.commissioning.stream_figure import write_stream_figure
     from worldstate.simulation.stream.writing import write_stream
 
-    if arguments.static or arguments.dynamic or arguments.video or arguments.scene != SCENES[0]:
+    if arguments.static or arguments.dynamic or arguments.video or arguments.scene != JUNCTION:
         raise InvalidArgumentError("--minutes: expected without --static, --dynamic, --video and --scene")
     settings = _stream_settings(arguments)
     with progress_bar("simulating", settings.duration_s) as bar:
