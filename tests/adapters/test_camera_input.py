@@ -126,7 +126,7 @@ def test_images_that_carry_no_stamp_come_at_the_rate_that_is_said(tmp_path, caps
     def reported(camera: dict) -> object:
         (tmp_path / "camera.json").write_text(json.dumps(lens | camera))
         arguments = PROGRAM.parser("run").parse_args([*words, "--camera", str(tmp_path / "camera.json")])
-        return given_sensors(arguments).detections(arguments)
+        return given_sensors(arguments).detections()
 
     assert reported({"image_rate_hz": 30}).stamps_ns[45] == 1_500_000_000
     assert reported({}) == boxes

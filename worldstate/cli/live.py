@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     check_outputs(arguments, "out", "keep_sound", "save_state", exported=exports.exported_files(arguments))
     given = sensors.given_sensors(arguments)
     check_extra(*(["rich"] if arguments.view else []))
-    check_call(arguments, given, [] if arguments.play is None else [arguments.play])
+    check_call(given, [] if arguments.play is None else [arguments.play])
     with ExitStack() as opened:
         recorded = None if arguments.play is None else _source(arguments, given, arguments.play)
         feed = _microphones(arguments, given) if recorded is None else _played(arguments, recorded)
@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         sound = LiveSound(feed, keep)
         source = _source(arguments, given, sound) if recorded is None else replace(recorded, sound=sound)
         sound.start_ns = source.start_ns
-        source, camera_losses = _with_camera(arguments, given, source, sound, opened)
+        source, camera_losses = _with_camera(given, source, sound, opened)
         source, odometry_losses = _with_odometry(arguments, source, sound, opened)
         figures = _listen(arguments, given, source, sound) | camera_losses() | odometry_losses()
         return CommandResult(figures | {"array": inputs.stance(source.array)})
@@ -127,15 +127,14 @@ def _source(
 
     before = None if arguments.resume is None else read_checkpoint(arguments.resume)
     ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
-    looks = arguments.camera_device is not None
-    boxes = sensors.boxes_of(arguments, given.setup) if looks else given.setup.boxes
+    boxes = given.setup.boxes if arguments.camera_device is None else given.boxes()
     context, sides = listening.given_place(arguments)
     return open_source(
         sound,
         array=given.car.array,
         camera=given.camera,
-        miss_rates=arguments.miss_rates or given.setup.miss_rates,
-        model=arguments.model or given.car.model,
+        miss_rates=given.miss_rates,
+        model=given.model,
         context=context,
         sides=sides,
         resume=before,
@@ -169,17 +168,13 @@ def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
 
 
 def _with_camera(
-    arguments: argparse.Namespace,
-    given: sensors.GivenSensors,
-    source: "Source",
-    sound: "LiveSound",
-    opened: ExitStack,
+    given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
 ) -> "tuple[Source, Losses]":
     """Return the source with the camera that was asked for, and what tells what was lost of its looks."""
-    if arguments.detections is not None:
-        return _with_detections(arguments.detections, source, sound, opened)
-    if arguments.camera_device is not None:
-        return _with_device(arguments, given, source, sound, opened)
+    if given.arguments.detections is not None:
+        return _with_detections(given.arguments.detections, source, sound, opened)
+    if given.arguments.camera_device is not None:
+        return _with_device(given, source, sound, opened)
     return source, dict
 
 
@@ -198,18 +193,14 @@ def _with_detections(
 
 
 def _with_device(
-    arguments: argparse.Namespace,
-    given: sensors.GivenSensors,
-    source: "Source",
-    sound: "LiveSound",
-    opened: ExitStack,
+    given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
 ) -> "tuple[Source, Losses]":
     from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, LiveCamera, image_channel
 
-    images, detector = image_channel(), sensors.detector_maker(arguments.detector, given.setup.labels)()
+    images, detector = image_channel(), sensors.detector_maker(given.arguments.detector, given.setup.labels)()
     size = source.camera.width_px, source.camera.height_px
     looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
-    opened.enter_context(CameraFeed(arguments.camera_device, images))
+    opened.enter_context(CameraFeed(given.arguments.camera_device, images))
     camera = LiveCamera(source, looks, looks.degradation)
     return replace(source, co_evidence=camera), lambda: {"images_dropped": images.dropped}
 

@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     files = exports.exported_files(arguments)
     check_outputs(arguments, "out", "save_state", figures=("figure", "gating"), exported=files)
     given = sensors.given_sensors(arguments)
-    check_call(arguments, given, arguments.input if inputs.bag_of(arguments) is None else [])
+    check_call(given, arguments.input if inputs.bag_of(arguments) is None else [])
     return _heard(arguments, given)
 
 
@@ -130,26 +130,26 @@ def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "Sour
     from worldstate.adapters.source_files import open_source
     from worldstate.operations.recordings.car_cameras import with_cameras
 
-    boxes, named = sensors.boxes_of(arguments, given.setup), arguments.detector
-    several = given.several(arguments)
-    sound, array, detections, ego = _input(arguments, given, None if several else given.detections(arguments))
+    several, detector = given.several(), given.detector()
+    sound, array, detections, ego = _input(arguments, given, None if several else given.detections())
     context, sides = listening.given_place(arguments)
+    settings = listening.listen_settings(arguments)
     source = open_source(
         sound,
         array=array,
         detections=detections,
         ego=ego,
         camera=given.camera,
-        miss_rates=arguments.miss_rates or given.setup.miss_rates,
-        model=arguments.model or given.car.model,
+        miss_rates=given.miss_rates,
+        model=given.model,
         context=context,
         sides=sides,
         resume=arguments.resume,
         start_s=arguments.start or 0.0,
-        detector=None if named is None else sensors.detector_maker(named, given.setup.labels)(),
+        detector=None if detector is None else detector(),
         others=_others(arguments, given),
         engine=_engine(given),
-        settings=replace(listening.listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes),
+        settings=replace(settings, mask_dead=arguments.mask_dead, boxes=given.boxes()),
     )
     return with_cameras(source, given.car, several) if several else source
 

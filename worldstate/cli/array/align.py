@@ -77,6 +77,6 @@ def _source(arguments: argparse.Namespace, path: Path) -> "Source":
         path,
         array=given.car.array,
         camera=given.camera,
-        detections=given.detections(arguments),
+        detections=given.detections(),
         settings=replace(search_of(arguments), boxes=given.setup.boxes, uncalibrated=True, mask_dead=True),
     )

@@ -1,6 +1,5 @@
 """What options and headers of files tell of a call, checked before what listens is imported."""
 
-import argparse
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +20,7 @@ _LONGEST_LINE = 1 << 20
 _EXTRAS = {"figure": "matplotlib", "gating": "matplotlib", "camera_device": "cv2"}
 
 
-def check_call(arguments: argparse.Namespace, given: "GivenSensors", sound: list[Path]) -> None:
+def check_call(given: "GivenSensors", sound: list[Path]) -> None:
     """Refuse what cannot be heard: a missing extra, no array for a sound file, not the model's array.
 
     It takes some .5 s of processor time less than to import what listens and to read a model.
@@ -31,29 +30,26 @@ def check_call(arguments: argparse.Namespace, given: "GivenSensors", sound: list
     MissingExtraError, InputFileError, OutOfDomainError
         As the call that listens would, later.
     """
+    arguments = given.arguments
     wanted = {module for option, module in _EXTRAS.items() if getattr(arguments, option, None) is not None}
     looks = arguments.detector in MOVING and "camera_device" not in arguments
     check_extra(*wanted, *needed_extras(arguments), *(["cv2"] if looks else []))
-    made_for = array_of_model(arguments.model or given.car.model)
+    made_for = array_of_model(given.model)
     if made_for is not None:
-        _check_array(arguments, given.car.array, made_for, sound)
+        _check_array(given, made_for, sound)
 
 
-def _check_array(
-    arguments: argparse.Namespace,
-    array: "MicrophoneArray | None",
-    made_for: "MicrophoneArray",
-    sound: list[Path],
-) -> None:
+def _check_array(given: "GivenSensors", made_for: "MicrophoneArray", sound: list[Path]) -> None:
     from worldstate.adapters.datasets.array_choice import check_channels, named_array
     from worldstate.adapters.files.array_match import WAY_OUT, matched_order
 
     if any(named_array(path) is not None for path in sound):
         return
+    array = given.car.array
     if array is None:
         if len(sound) == 1 and sound[0].is_file():
             check_channels(sound[0], made_for)
-    elif not arguments.uncalibrated:
+    elif not given.arguments.uncalibrated:
         matched_order(made_for, array, WAY_OUT)
 
 

@@ -80,35 +80,60 @@ def add_detector_option(parser: argparse.ArgumentParser, default: str | None = "
 class GivenSensors:
     """What --car names, or the single options in its place; None for what is not given."""
 
+    arguments: argparse.Namespace
     car: "CarSensors"
     camera: "PinholeCamera | None"  # The one that is asked
     setup: "CameraSetup"  # Of that camera
 
-    def several(self, arguments: argparse.Namespace) -> dict[str, Path]:
+    @property
+    def model(self) -> Path | None:
+        """The model file, None for the one that ships."""
+        model: Path | None = self.arguments.model or self.car.model
+        return model
+
+    @property
+    def miss_rates(self) -> Path | None:
+        """The file that tells how often the camera's detector misses."""
+        rates: Path | None = self.arguments.miss_rates or self.setup.miss_rates
+        return rates
+
+    def boxes(self) -> "DetectionFilter":
+        """Return which boxes count: all of a motion detector's, whose score is no confidence."""
+        from worldstate.adapters.camera.camera_channel import any_motion
+
+        return any_motion() if self.arguments.detector in MOVING else self.setup.boxes
+
+    def detector(self) -> "MakeDetector | None":
+        """Return what makes the detector of --detector, None without it."""
+        name = self.arguments.detector
+        return None if name is None else detector_maker(name, self.setup.labels)
+
+    def several(self) -> dict[str, Path]:
         """Return what several cameras of --car reported, by their names; empty where one is asked."""
         from worldstate.adapters.own_parts import part_and_target
         from worldstate.ground.errors import InvalidArgumentError
 
-        given = list(map(str, arguments.detections))
-        if arguments.car is None or not any("=" in text for text in given):
+        given = list(map(str, self.arguments.detections))
+        if self.arguments.car is None or not any("=" in text for text in given):
             known = {name: one.detections for name, one in self.car.setups.items()}
             files = {name: path for name, path in known.items() if path is not None}
-            return files if len(files) > 1 and not given and arguments.camera is None else {}
+            return files if len(files) > 1 and not given and self.arguments.camera is None else {}
         pairs = [part_and_target("--detections", text) for text in given]
-        if len(dict(pairs)) < len(pairs) or arguments.camera is not None:
+        if len(dict(pairs)) < len(pairs) or self.arguments.camera is not None:
             problem = "expected NAME=PATH of different cameras, without --camera"
             raise InvalidArgumentError(f"--detections: {problem}, got {' '.join(given)}")
         return {name: Path(path) for name, path in pairs}
 
-    def detections(self, arguments: argparse.Namespace) -> "Path | DetectionLog | None":
+    def detections(self) -> "Path | DetectionLog | None":
         """Return what the one camera that is asked reported, read where its images do not come at 10 Hz."""
         from worldstate.adapters.camera.detections import read_any_detections
         from worldstate.adapters.camera.pinhole import PinholeCamera
         from worldstate.ground.errors import InvalidArgumentError
 
-        if len(arguments.detections) > 1:
+        given = self.arguments.detections
+        if len(given) > 1:
             raise InvalidArgumentError("--detections: expected one, or --car with NAME=PATH of its cameras")
-        path = arguments.detections[0] if arguments.detections else self.setup.detections
+        path = given[0] if given else self.setup.detections
         if path is None or self.setup.image_rate_hz is None:
             return path
         lens = self.camera or PinholeCamera()
@@ -124,13 +149,13 @@ def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
         setup, camera = CameraSetup(), None
         if arguments.camera is not None:
             camera, setup = read_camera_setup(arguments.camera)
-        return GivenSensors(CarSensors(given_array(arguments)), camera, setup)
+        return GivenSensors(arguments, CarSensors(given_array(arguments)), camera, setup)
     if arguments.array is not None:
         raise InvalidArgumentError("--car: expected no --array with it, it holds the array")
     car = read_car(arguments.car)
     name = next(iter(car.cameras), None) if arguments.camera is None else str(arguments.camera)
     setup = CameraSetup() if name is None else car.setups.get(name, CameraSetup())
-    return GivenSensors(car, None if name is None else car.camera(name), setup)
+    return GivenSensors(arguments, car, None if name is None else car.camera(name), setup)
 
 
 def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[Source, DetectionLog]":
@@ -149,7 +174,7 @@ def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[
     source = open_source(
         sound,
         array=given.car.array,
-        detections=given.detections(arguments),
+        detections=given.detections(),
         camera=given.camera,
         settings=ListenSettings(boxes=given.setup.boxes, uncalibrated=True),
     )
@@ -204,10 +229,3 @@ def _opened(path: Path, labels: tuple[str, ...]) -> "OnnxDetector":
 def detector_name(name: str) -> str:
     """Return the name of a detector in reports: of a model that of its file, too."""
     return f"onnx {Path(name).name}" if name.endswith(".onnx") else name
-
-
-def boxes_of(arguments: argparse.Namespace, setup: "CameraSetup") -> "DetectionFilter":
-    """Return which boxes count: all of a motion detector's, whose score is no confidence."""
-    from worldstate.adapters.camera.camera_channel import any_motion
-
-    return any_motion() if arguments.detector in MOVING else setup.boxes
