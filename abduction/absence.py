@@ -7,10 +7,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Layout
-from worldstate.ground.typing import FloatArray
 
 Rows = tuple[tuple[float, ...], ...]
 

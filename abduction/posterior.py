@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import check_shape, finite_array
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
 
 from .co_evidence import CoEvidence
 from .evidence import SignatureEvidence

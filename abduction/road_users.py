@@ -13,9 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import freeze_arrays
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
 
 UNKNOWN, SIREN = "unknown", "siren"
 # As detectors of COCO's classes call them; a van is a car to some and a truck to others.

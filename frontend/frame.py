@@ -8,8 +8,7 @@ from worldstate.frontend.array.geometry import Ambiguity
 from worldstate.frontend.direction.bearing import Peak
 from worldstate.frontend.direction.music import MusicReading
 from worldstate.frontend.health.channel_health import ArrayHealth
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import FloatArray, NotUsable
 
 _NOT_MONITORED = NotUsable("microphones were not monitored")
 CHARACTER_IS_OFF = NotUsable("the character is off: see FrontEndSettings.character")

@@ -16,9 +16,7 @@ from worldstate.frontend.direction.feature import (
     FEATURE_VERSION,
 )
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, InvalidArgumentError, in_range
 
 Band = tuple[float, float]
 

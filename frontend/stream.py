@@ -18,11 +18,10 @@ from worldstate.frontend.hop_spectra import Hop, HopCutter
 from worldstate.frontend.levels import SILENCE
 from worldstate.frontend.spectra.sound_character import SoundCharacter
 from worldstate.frontend.spectra.stft import bin_frequencies_hz
+from worldstate.ground import InvalidArgumentError, NotUsable, nanoseconds
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import check_shape, in_range
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
-from worldstate.ground.values import NotUsable, nanoseconds
 
 from .frame import CHARACTER_IS_OFF, TONE_IS_OFF, AcousticFrame
 from .hop_spectra import HopSpectra, HopSums

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.typing import FloatArray, IndexArray
 
 # Ten equal bins, as in the paper; more of them raise the sampling floor.

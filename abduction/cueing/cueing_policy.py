@@ -10,10 +10,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
-from worldstate.ground.typing import BoolArray, FloatArray
 
 from .risk_map import PlattMap, RiskMap
 

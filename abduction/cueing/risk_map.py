@@ -10,11 +10,9 @@ from typing import ClassVar, TypeAlias, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout
-from worldstate.ground.typing import BoolArray, FloatArray
 
 # As in the note's pseudocode; the tolerance is finer, for values are scaled to one first.
 _ITERATIONS = 100

@@ -10,9 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 
 from .cueing_policy import sustained_statistic
 

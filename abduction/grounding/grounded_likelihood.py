@@ -17,10 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
 
 SPEED_OF_SOUND_M_S = 343.0
 # Total ratio of gearbox and final drive, first to fifth gear: ordinary numbers of a passenger car (3.6, 2.05,

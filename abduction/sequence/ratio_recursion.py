@@ -16,8 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NANOSECONDS_PER_SECOND
+from worldstate.ground import NANOSECONDS_PER_SECOND, FloatArray
 
 # Below it a probability is none, and the ratio of two of them says nothing.
 _SMALLEST = 1e-12

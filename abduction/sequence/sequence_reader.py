@@ -5,10 +5,8 @@ from functools import partial
 
 import numpy as np
 
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable
 from worldstate.ground.checks import freeze_arrays
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable
 
 from .sequence_inputs import (
     COLUMNS,

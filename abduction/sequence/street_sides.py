@@ -15,9 +15,8 @@ from functools import partial
 
 import numpy as np
 
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import freeze_arrays, in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
 
 from .sequence_inputs import SIDES
 from .sequence_model import COMING_S, GROUPS

@@ -16,10 +16,9 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import freeze_arrays
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import Layout
-from worldstate.ground.typing import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import check_shape, finite_array, freeze_arrays, in_range
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Via
-from worldstate.ground.typing import FloatArray
 
 from .expert import (
     SEGMENTS,

@@ -7,8 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 

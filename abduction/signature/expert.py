@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import freeze_arrays
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
 
 from .site_reference import KINDS, log_levels
 

@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike
 
 from worldstate.abduction.cueing.risk_map import sigmoid
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import finite_array, freeze_arrays
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout
-from worldstate.ground.typing import FloatArray
 
 from .model_domain import ModelDomain
 from .window_classes import (

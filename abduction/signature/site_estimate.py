@@ -25,10 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
-from worldstate.ground.typing import FloatArray
 
 from .ensemble import EnsembleModel
 from .model_domain import ModelDomain

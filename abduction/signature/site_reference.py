@@ -9,9 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 
 SMALLEST_LEVEL = 1e-4
 QUIET_SHARE = 0.35

@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 
 CLASSES = ("front", "left", "none", "right")
 DIRECTIONS = ("left", "right")

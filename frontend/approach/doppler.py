@@ -16,10 +16,7 @@ from numpy.polynomial import legendre
 from scipy.optimize import OptimizeResult, least_squares
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
 
 from .engine_line import HarmonicTrack
 

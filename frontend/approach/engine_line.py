@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage, signal
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
 # The Hann window loses 1.4 dB half way between two unpadded bins; with four times as many 0.1 dB.

@@ -32,10 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
 
 # Two parameters and a scatter of their own need two degrees of freedom.
 MIN_POINTS = 4

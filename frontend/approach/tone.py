@@ -17,10 +17,9 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
 from worldstate.frontend.spectra.decimator import Decimator
+from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
 from worldstate.ground.checks import finite_array, finite_complex, in_range
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, ComplexArray, Float32Array, FloatArray
-from worldstate.ground.values import NotUsable, wrap_angle
 
 # Three parameters are fitted; with fewer samples the residual gives no estimate of the noise.
 FEWEST_SAMPLES = 8

@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import FloatArray, NotUsable
 
 SPEED_OF_SOUND_M_S = 343.0
 """Speed of sound in dry air at 20 degrees Celsius."""

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray
 
 from .geometry import SPEED_OF_SOUND_M_S, Ambiguity, ambiguity, direction_vectors, nearest_spacings_m

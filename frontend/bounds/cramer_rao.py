@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S, direction_vectors
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 
 # Information below this share of its largest possible value is taken for zero: rounding of the inner
 # products.

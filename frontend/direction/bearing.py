@@ -25,10 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array, in_range, wrap_angle
 from worldstate.ground.typing import FloatArray, IndexArray
-from worldstate.ground.values import wrap_angle
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,9 @@ from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.microphone_array import ChannelMask
 from worldstate.frontend.array.steering import Steering
+from worldstate.ground import InvalidArgumentError, NotUsable
 from worldstate.ground.checks import finite_array, finite_complex, in_range
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, ComplexArray, FloatArray, RealArray
-from worldstate.ground.values import NotUsable
 
 from .bearing import find_peaks
 

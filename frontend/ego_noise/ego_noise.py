@@ -33,8 +33,7 @@ from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.stft import whiten
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, FloatArray
 
 from .harmonic_cancellation import HarmonicCanceller

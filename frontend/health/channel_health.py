@@ -6,8 +6,7 @@ from enum import StrEnum
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import ChannelMask
-from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import BoolArray, FloatArray, NotUsable
 
 from .dropouts import Dropout
 from .sample_clock import RateEstimate

@@ -11,9 +11,7 @@ least squares over the pairs (number of samples, capture time). A recorder at 47
 import math
 from dataclasses import dataclass
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import NotUsable, seconds
+from worldstate.ground import InvalidArgumentError, NotUsable, in_range, seconds
 
 # With fewer pairs their scatter, and so the standard deviation, is not known.
 _MIN_READINGS = 10

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, in_range
 
 # Attenuation of what aliases into the band, and of the ripple within it: the resolution of 16-bit converters.
 _ATTENUATION_DB = 80.0

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.typing import FloatArray, IntArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import FloatArray, IntArray, NotUsable, in_range
 
 from .decimator import Decimator
 

@@ -27,8 +27,7 @@ from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import atomic_path, deferred_signals, write_text
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
 from worldstate.simulation.camera.street_view import View, paint_street

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import in_range, one_of
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
 
 from .occluders import OccludingBody, box
 

@@ -11,9 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array
 
 from .octave_bands import smooth_step
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import finite_array, in_range, one_of
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
 
 from .junction import MOVING_SITES, Site, Way, place_of, site
 from .kinds import FLAT, Octaves, VehicleKind, vehicle_kind

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.octave_bands import (

@@ -12,8 +12,7 @@ import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.ground.errors import InputFileError
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground import BoolArray, FloatArray, InputFileError
 from worldstate.simulation.camera.simulated_detector import (
     Frame,
     SimulatedDetection,

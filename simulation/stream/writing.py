@@ -12,8 +12,7 @@ from scipy.fft import rfft, rfftfreq
 from worldstate.adapters.datasets.ovad import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.camera.simulated_detector import to_json
 from worldstate.simulation.dataset.recording import (

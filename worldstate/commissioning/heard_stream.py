@@ -19,8 +19,7 @@ from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import AnyArray, Float32Array, FloatArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES, Site, drawn_site, ego_moves, site

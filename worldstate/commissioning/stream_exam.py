@@ -21,9 +21,7 @@ from worldstate.abduction.sequence.sequence_model import (
     held,
     smoothed_log_odds,
 )
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.ground.values import wrap_angle
+from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, wrap_angle
 from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate.operations.metrics.approach_table import (
     AFTER_S,
