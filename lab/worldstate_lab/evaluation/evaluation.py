@@ -50,7 +50,7 @@ Item = TypeVar("Item")
 ALPHA = 0.02
 
 
-class Track(Interface):
+class Progress(Interface):
     """Shows progress: hands on the items of a step with so many of them."""
 
     def __call__(self, items: Iterable[Item], description: str, total: int, /) -> Iterator[Item]:
@@ -106,7 +106,7 @@ def evaluate(
     hearing: Hearing,
     classifiers: Classifiers,
     engine: Engine,
-    track: Track,
+    track: Progress,
     settings: EvaluationSettings,
 ) -> Evaluation:
     """Hear all recordings, run every protocol that they suffice for and score every method."""
@@ -117,19 +117,16 @@ def evaluate(
     left = _left(takes, trials)
     # Again, on what is left: one broken recording of a small data set may be one too many.
     lacking = lacking_data(left, failed)
-    chosen = [protocol for protocol in PROTOCOLS if protocol.name not in lacking]
-    own = {one.name: [t for t in trials if bool(t.hops.about["moving"]) == one.moving] for one in chosen}
+    own = {
+        one: [trial for trial in trials if bool(trial.hops.about["moving"]) == one.moving]
+        for one in PROTOCOLS
+        if one.name not in lacking
+    }
     runs = {
-        one.name: run_protocol(one, own[one.name], methods_for(own[one.name]), classifiers, settings.seeds)
-        for one in track(chosen, "fitting and deciding", len(chosen))
+        one.name: run_protocol(one, some, methods_for(some), classifiers, settings.seeds)
+        for one, some in track(own.items(), "fitting and deciding", len(own))
     }
-    scores = {
-        name: {
-            method: Score.of(run.trials, passes)
-            for method, passes in track(run.decisions.items(), "scoring", len(run.decisions))
-        }
-        for name, run in runs.items()
-    }
+    scores = {name: _scored(run, track) for name, run in runs.items()}
     rng = np.random.default_rng(settings.seeds[0])
     drawn = {
         name: stratified_draws([(t.label, t.site) for t in run.trials], rng, settings.draws)
@@ -138,33 +135,30 @@ def evaluate(
     standing = [trial for trial in trials if not trial.hops.about["moving"]]
     filmed = any(np.isfinite(trial.hops.reference_rad).any() for trial in standing)
     front_end = front_end_study(standing, rng, settings.draws) if filmed else None
-    degradation = staged = None
-    # Broken videos may leave a sweep fewer recordings than it needs: no reason to lose all other figures.
-    if settings.degradation is not None:
-        with _noted(lacking, "degradation sweep"):
-            degradation = _degradation(left, hearing, engine, track, settings.degradation)
-    if settings.stage_streams:
-        with _noted(lacking, "staged streams"):
-            staged = _staged(left, trials, hearing, engine, track, settings.seeds[0])
-    return Evaluation(
-        takes,
-        tuple(trials),
-        tuple(failed),
-        lacking,
-        runs,
-        scores,
-        drawn,
-        front_end,
-        degradation,
-        settings,
-        {name: refused_methods(trials) for name, trials in own.items()},
+    found = Evaluation(
+        takes, tuple(trials), tuple(failed), lacking, runs, scores, drawn, front_end, None, settings,
+        {one.name: refused_methods(some) for one, some in own.items()},
         {
             name: equal_detection(run.trials, run.decisions, drawn[name])
             for name, run in runs.items()
             if not run.protocol.by_junction
         },
-        staged,
-    )
+    )  # fmt: skip
+    # Broken videos may leave a sweep fewer recordings than it needs: no reason to lose all other figures.
+    if settings.degradation is not None:
+        with _noted(lacking, "degradation sweep"):
+            found = replace(
+                found, degradation=_degradation(left, hearing, engine, track, settings.degradation)
+            )
+    if settings.stage_streams:
+        with _noted(lacking, "staged streams"):
+            found = replace(found, staged=_staged(found, left, hearing, engine, track))
+    return found
+
+
+def _scored(run: ProtocolRun, track: Progress) -> dict[str, Score]:
+    every = track(run.decisions.items(), "scoring", len(run.decisions))
+    return {method: Score.of(run.trials, passes) for method, passes in every}
 
 
 @contextmanager
@@ -190,7 +184,7 @@ def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSe
 
 
 def _degradation(
-    takes: TakeList, hearing: Hearing, engine: Engine, track: Track, settings: DegradationSettings
+    takes: TakeList, hearing: Hearing, engine: Engine, track: Progress, settings: DegradationSettings
 ) -> DegradationStudy:
     """Run the sweep; the recordings are worked on as all others are, and what was seen is kept."""
     model, filmed = read_model(settings.model), [take for take in takes.static if take.filmed]
@@ -228,17 +222,18 @@ class _StagedStream:
 
 
 def _staged(
-    takes: TakeList, trials: Sequence[Trial], hearing: Hearing, engine: Engine, track: Track, seed: int
+    found: Evaluation, takes: TakeList, hearing: Hearing, engine: Engine, track: Progress
 ) -> StreamSweep:
     """Stage every state of camera and roof on the hazard-free streams."""
-    names = {str(trial.hops.about["stream"]) for trial in trials if "stream" in trial.hops.about}
+    names = {str(t.hops.about["stream"]) for t in found.trials if "stream" in t.hops.about}
     streams = [take for take in takes.static if take.name in names]
     if not streams:
         raise InvalidArgumentError("needs a stream of two minutes or more without hazards, found none")
+    seed = found.settings.seeds[0]
     work = engine.over(_StagedStream(hearing, seed), streams, attrgetter("name"))
-    found = []
+    done = []
     for one in track(work, "staging camera and rain on streams", len(streams)):
         if isinstance(one, Failed):
             raise InvalidArgumentError(f"{one.name}: {one.problem}")
-        found.append(one)
-    return stream_sweep(found, seed)
+        done.append(one)
+    return stream_sweep(done, seed)

@@ -96,8 +96,8 @@ class Table:
     Leads
     method        lead (s)
     ours    1.70 [1.30, 2.10]
-    >>> plain(table.records())
-    [{'method': 'ours', 'lead (s)': [1.7, 1.3, 2.1]}]
+    >>> plain(table)["rows"]
+    [['ours', [1.7, 1.3, 2.1]]]
     """
 
     name: str
@@ -111,10 +111,6 @@ class Table:
         texts = [list(self.columns), *([cell_text(cell) for cell in row] for row in self.rows)]
         widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
         return [self.title, *(_aligned(row, widths) for row in texts)]
-
-    def records(self) -> list[dict[str, Cell]]:
-        """Return the rows by column, for JSON through `plain`."""
-        return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
 
     def csv(self) -> str:
         """Return the numbers to the last digit."""
