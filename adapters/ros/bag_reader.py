@@ -116,7 +116,7 @@ def refused_as_bag(path: Path) -> Iterator[None]:
     # that was spoiled asks for more memory than there is.
     except Exception as error:
         said = str(error) or type(error).__name__
-        if "rofile" in said:  # An MCAP file of another program, such as `run --mcap`
+        if "rofile" in said:  # An MCAP file of another program, such as `run --export mcap=FILE`
             said += "; `worldstate log replay` reads files of snapshots"
         raise InputFileError(path, f"expected a bag of ROS 2 that can be read ({said:.200})") from error
 

@@ -54,13 +54,11 @@ FIRST_OPTIONS = (
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     inputs.add_sound_options(parser)
-    inputs.add_array_options(parser)
-    sensors.add_car_option(parser)
+    sensors.add_sensor_options(parser)
     inputs.add_search_options(parser)
     listening.add_listen_options(parser)
     listening.add_memory_options(parser, "0")
     _add_recording_options(parser)
-    sensors.add_camera_options(parser)
     sensors.add_detector_option(parser, default=None)
     _add_output_options(parser)
     exports.add_export_options(parser)

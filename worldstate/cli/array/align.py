@@ -13,9 +13,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import add_array_options, add_search_options, search_of
+from worldstate.cli.common.inputs import add_search_options, search_of
 from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.sensors import add_camera_options, add_car_option, given_sensors
+from worldstate.cli.common.sensors import add_sensor_options, given_sensors
 
 if TYPE_CHECKING:
     from worldstate.adapters.source import Source
@@ -31,10 +31,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     inputs = "data sets, recording folders, or a sound file with --detections"
     add("input", type=Path, nargs="+", metavar="RECORDING", help=inputs)
-    add_array_options(parser)
-    add_car_option(parser)
+    add_sensor_options(parser)
     add_search_options(parser)
-    add_camera_options(parser)
     add("--out", type=Path, metavar="FILE", help="the file of --car, with both added, beside it")
 
 

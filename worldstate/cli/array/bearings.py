@@ -32,10 +32,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.audio.open_sound import open_sound, path_of
     from worldstate.adapters.files.atomic import write_text
     from worldstate.cli.common.progress import sound_bar
-    from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.bearing_track import (
         bearings_csv,
         track_bearings,
@@ -43,20 +41,16 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     )
 
     check_outputs(arguments, "out", figures=("figure",))
-    sound, array = inputs.sound_and_array(arguments)
-    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
-        settings = inputs.search_of(arguments).front_end(array, audio.sample_rate_hz)
-        front_end = FrontEnd(array, audio.sample_rate_hz, settings)
-        with sound_bar(audio) as bar:
-            track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
+    with inputs.opened_front_end(arguments) as (audio, front_end), sound_bar(audio) as bar:
+        track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
         silent = list(audio.silent_channels)
     write_text(arguments.out, bearings_csv(track))
     if arguments.figure is not None:
-        write_bearings_figure(track, arguments.figure, path_of(sound).name)
+        write_bearings_figure(track, arguments.figure, audio.path.name)
     summary = {
         "out": str(arguments.out),
-        "array": inputs.stance(array),
-        "band_hz": list(settings.srp_band_hz),
+        "array": inputs.stance(front_end.array),
+        "band_hz": list(front_end.settings.srp_band_hz),
         "hops": len(track),
         "silent_channels": silent,
     }

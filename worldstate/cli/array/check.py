@@ -42,18 +42,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from dataclasses import replace
 
-    from worldstate.adapters.audio.open_sound import open_sound
     from worldstate.frontend.health.sample_clock import rate_from_duration
-    from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.channel_report import write_array_figure
 
     from .check_report import as_json, as_text
 
     check_outputs(arguments, figures=("figure",))
-    sound, array = inputs.sound_and_array(arguments)
-    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
-        settings = inputs.search_of(arguments).front_end(array, audio.sample_rate_hz)
-        health = examine(audio, FrontEnd(array, audio.sample_rate_hz, settings))
+    with inputs.opened_front_end(arguments) as (audio, front_end):
+        array, health = front_end.array, examine(audio, front_end)
         if arguments.duration is not None:
             rate = rate_from_duration(
                 audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)

@@ -1,6 +1,8 @@
 """What a command listens to, and by which microphones: INPUT, --array, where a bearing is looked for."""
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -8,9 +10,11 @@ from .command import add_choice
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import Encoding, SoundInput
+    from worldstate.adapters.audio.sound_file import Audio
     from worldstate.adapters.ros.bag_input import BagTopics
     from worldstate.adapters.source import ListenSettings
     from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.frontend.stream import FrontEnd
 
 SOUND_HELP = """\
 INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
@@ -129,7 +133,7 @@ def search_of(arguments: argparse.Namespace) -> "ListenSettings":
     )
 
 
-def sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, MicrophoneArray]":
+def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, MicrophoneArray]":
     """Return what INPUT and --array name, or the array that belongs to the sound."""
     from worldstate.adapters.audio.open_sound import path_of
     from worldstate.adapters.datasets.array_choice import choose_array
@@ -145,6 +149,18 @@ def sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, Microph
     if isinstance(sound, Path) and sound.is_dir():
         sound = Recording.open(sound).audio_path
     return sound, array
+
+
+@contextmanager
+def opened_front_end(arguments: argparse.Namespace) -> "Iterator[tuple[Audio, FrontEnd]]":
+    """Open what INPUT and --array name, and the front-end that hears it."""
+    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.frontend.stream import FrontEnd
+
+    sound, array = _sound_and_array(arguments)
+    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
+        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        yield audio, FrontEnd(array, audio.sample_rate_hz, settings)
 
 
 def stance(array: "MicrophoneArray") -> str:

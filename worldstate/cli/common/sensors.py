@@ -6,7 +6,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .inputs import given_array
+from .inputs import add_array_options, given_array
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
@@ -42,20 +42,22 @@ images "image_rate_hz" (10); of its boxes "classes" (["car", "motorcycle"]), "mi
 MOVING = "motion", "knn"
 
 
-def add_car_option(parser: argparse.ArgumentParser) -> None:
-    """Declare --car."""
-    parser.description = f"{parser.description}\n\n{CAR_HELP}"
-    add = parser.add_argument_group("vehicle").add_argument
-    add("--car", type=Path, metavar="FILE", help="array, cameras and what they reported, odometry, model")
-
-
-def add_camera_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --detections, --camera and --miss-rates."""
+def add_sensor_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --array, --car and the camera of a recording."""
+    add_array_options(parser)
+    add_car_option(parser)
     parser.description = f"{parser.description}\n\n{DETECTIONS_HELP}"
     group = parser.add_argument_group("camera")
     told = "what its detector reported; NAME=PATH of a camera of --car, repeated: all these are asked"
     group.add_argument("--detections", type=Path, action="append", default=[], metavar="PATH", help=told)
     add_lens_options(parser, group)
+
+
+def add_car_option(parser: argparse.ArgumentParser) -> None:
+    """Declare --car."""
+    parser.description = f"{parser.description}\n\n{CAR_HELP}"
+    add = parser.add_argument_group("vehicle").add_argument
+    add("--car", type=Path, metavar="FILE", help="array, cameras and what they reported, odometry, model")
 
 
 def add_lens_options(parser: argparse.ArgumentParser, group: "argparse._ArgumentGroup") -> None:

@@ -73,14 +73,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _sound(arguments: argparse.Namespace) -> "SoundPower":
-    from worldstate.adapters.audio.open_sound import open_sound
     from worldstate.cli.common.progress import progress_bar
-    from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.viewing.state_figure import sound_power
 
-    sound, array = inputs.sound_and_array(arguments)
-    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
-        settings = inputs.search_of(arguments).front_end(array, audio.sample_rate_hz)
-        front_end = FrontEnd(array, audio.sample_rate_hz, settings)
-        with progress_bar("listening", audio.duration_s) as bar:
-            return sound_power(audio, front_end, on_second=bar.advance)
+    with (
+        inputs.opened_front_end(arguments) as (audio, front_end),
+        progress_bar("listening", audio.duration_s) as bar,
+    ):
+        return sound_power(audio, front_end, on_second=bar.advance)

@@ -13,10 +13,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import add_array_options, add_sound_options, sound_of
+from worldstate.cli.common.inputs import add_sound_options, sound_of
 from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import progress_bar
-from worldstate.cli.common.sensors import add_camera_options, add_car_option, camera_source
+from worldstate.cli.common.sensors import add_sensor_options, camera_source
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,9 +35,7 @@ examples:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_sound_options(parser)
-    add_array_options(parser)
-    add_car_option(parser)
-    add_camera_options(parser)
+    add_sensor_options(parser)
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, required=True, metavar="JSON", help="trajectories and T0, OpenLABEL")
     add("--windows", type=Path, metavar="CSV", help="labelled seconds for `model fit --labels`")

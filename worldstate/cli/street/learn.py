@@ -17,10 +17,9 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import add_array_options
 from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import track
-from worldstate.cli.common.sensors import add_camera_options, add_car_option, camera_source
+from worldstate.cli.common.sensors import add_sensor_options, camera_source
 
 if TYPE_CHECKING:
     from worldstate.operations.labelling.street_passes import WatchedRecording
@@ -38,9 +37,7 @@ STAGES = (1, 3, 10)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_array_options(parser)
-    add_car_option(parser)
-    add_camera_options(parser)
+    add_sensor_options(parser)
     add = parser.add_argument
     add("input", type=Path, nargs="+", metavar="INPUT", help="recordings of one place, in order")
     add("--known", type=Path, metavar="JSON", help="a street that was learned before")
