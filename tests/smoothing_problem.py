@@ -8,7 +8,14 @@ import numpy as np
 from worldstate.belief.kinematics import motion
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.measurement import Approach, Bearing
-from worldstate.smoothing import FixedLagSmoother, Range, SmoothingSettings
+from worldstate.smoothing import (
+    AngularHeight,
+    FixedLagSmoother,
+    PastEdge,
+    Range,
+    ReflectedBearing,
+    SmoothingSettings,
+)
 
 HOP_S, HOP_NS, HOPS, HIDDEN_HOPS = 0.1, 100_000_000, 60, 35
 PSD = 1.0  # Of the vehicles' acceleration, m^2/s^3
@@ -77,3 +84,46 @@ def hidden_errors_m(seed: int) -> tuple[float, float]:
         math.sqrt(((found - true) ** 2).sum(axis=1).mean())
         for found in (np.stack([z.real, z.imag], axis=1), smoothed)
     )
+
+
+PASS_HOPS, ENTITIES, WALLS = 160, 3, ("opposite", "west", "back", "east")
+
+
+def slots_of_a_street(hops: int, rng: np.random.Generator) -> int:
+    """Return the factor slots after a stream of three entities, with two corners and four walls."""
+    smoother = FixedLagSmoother()
+    smoother.add_corner("left", 1, (5.0, 3.0), (1.0, 0.5))
+    smoother.add_corner("right", -1, (5.0, -3.0), (1.0, 0.5))
+    for number, name in enumerate(WALLS):
+        smoother.add_wall(name, number * math.pi / 2.0, 8.0, (0.05, 0.5))
+    for hop in range(hops):
+        seen = {}
+        for number in range(ENTITIES):
+            # Each comes again when it has passed, under another name: 16 s, 24 m to 40 m away at first.
+            after, passes = (hop + 53 * number) % PASS_HOPS, (hop + 53 * number) // PASS_HOPS
+            seen[f"{number}-{passes}"] = crossing(after, number, rng)
+        smoother.update(hop * HOP_NS, seen)
+    return smoother.n_factor_slots
+
+
+def crossing(hop: int, number: int, rng: np.random.Generator) -> list:
+    """Return what one entity is measured by at a hop of its pass."""
+    side = 1 if number % 2 == 0 else -1
+    x, y, speed = 8.0 + number, side * (24.0 - 0.3 * hop), 3.0
+    azimuth, r = math.atan2(y, x), math.hypot(x, y)
+    inverse_tta = side * y * speed / r**2
+    heard = [
+        Bearing(azimuth + rng.normal(0.0, 0.07), 0.07),
+        Approach(inverse_tta + rng.normal(0.0, 0.25), 0.25),
+    ]
+    hidden = side * y / x > 0.6
+    corner = "left" if side > 0 else "right"
+    if hop % 10 == 0:
+        image = math.atan2(y, 16.0 - x)
+        heard.append(ReflectedBearing("opposite", image + rng.normal(0.0, 0.1), 0.1))
+    if abs(side * y / x - 0.6) < 0.2:
+        heard.append(PastEdge(corner, seen=not hidden))
+    if not hidden:
+        heard[0] = Bearing(azimuth + rng.normal(0.0, 0.01), 0.01)
+        heard.append(AngularHeight(1.5 / r * math.exp(rng.normal(0.0, 0.03)), 0.03))
+    return heard

@@ -4,7 +4,15 @@ import math
 
 import numpy as np
 import pytest
-from smoothing_problem import HOP_NS, PRIOR, heard_then_seen, hidden_errors_m
+from smoothing_problem import (
+    HOP_NS,
+    HOP_S,
+    PRIOR,
+    crossing,
+    heard_then_seen,
+    hidden_errors_m,
+    slots_of_a_street,
+)
 
 from worldstate.belief.kinematics.cartesian import CartesianBelief
 from worldstate.ground.errors import InvalidArgumentError
@@ -109,11 +117,8 @@ def test_an_entity_that_is_silent_beyond_the_lag_begins_anew():
 
 
 def test_entities_with_heights_come_and_go():
-    from worldstate_lab.cli.bench.smoothing import smoothing_times
-
     # At the 581st step a height that had outlived its states was refused by gtsam.
-    spent, _ = smoothing_times(620, np.random.default_rng(0))
-    assert len(spent) == 620
+    assert slots_of_a_street(620, np.random.default_rng(0)) > 0
 
 
 def test_an_outlier_among_bearings_costs_little():
@@ -224,9 +229,6 @@ def test_what_cannot_be_is_refused():
 
 
 def test_what_marginalised_entities_left_may_be_summed_at_any_time(monkeypatch):
-    from worldstate_lab.cli.bench.smoothing import HOP_NS as BENCH_HOP_NS
-    from worldstate_lab.cli.bench.smoothing import observed
-
     def landmarks(every: int) -> list[np.ndarray]:
         monkeypatch.setattr(graph, "_SUMMED_EVERY", every)
         smoother, rng = FixedLagSmoother(), np.random.default_rng(3)
@@ -234,8 +236,8 @@ def test_what_marginalised_entities_left_may_be_summed_at_any_time(monkeypatch):
         smoother.add_corner("right", -1, (5.0, -3.0), (1.0, 0.5))
         smoother.add_wall("opposite", 0.0, 8.0, (0.05, 0.5))
         for hop in range(700):
-            seen = {f"{k}-{(hop + 53 * k) // 160}": observed((hop + 53 * k) % 160, k, rng) for k in (0, 1)}
-            smoother.update(hop * BENCH_HOP_NS, seen)
+            seen = {f"{k}-{(hop + 53 * k) // 160}": crossing((hop + 53 * k) % 160, k, rng) for k in (0, 1)}
+            smoother.update(hop * HOP_NS, seen)
         found = [part for name in ("left", "right", "opposite") for part in smoother.landmark(name)]
         return [*found, np.array([smoother.n_factor_slots])]
 
@@ -249,11 +251,9 @@ def test_what_marginalised_entities_left_may_be_summed_at_any_time(monkeypatch):
 def test_an_hour_leaves_memory_and_graph_as_they_were():
     import tracemalloc
 
-    from worldstate_lab.cli.bench.smoothing import HOP_S, smoothing_times
-
     def grown(hours: float) -> tuple[int, int, int]:
         tracemalloc.start()
-        _, slots = smoothing_times(round(3600.0 * hours / HOP_S), np.random.default_rng(0))
+        slots = slots_of_a_street(round(3600.0 * hours / HOP_S), np.random.default_rng(0))
         return *tracemalloc.get_traced_memory(), slots
 
     _, peak_early, slots_early = grown(0.02)

@@ -1,49 +1,71 @@
-"""What is computed for every hop, part by part, with a clock between: front-end, evidence, and their peers.
+"""What a hop costs, stage by stage, in the real front-end and evidence, and what peers cost beside it.
 
-The window model is the one that ships. Trees and guard are made up, of the sizes that `worldstate model make`
-trains: what they cost does not depend on what they have learned. `published_chain` restates the chain of the
-published acoustic baseline in its amortised form: scipy's STFT of the whole file, channel by channel, its
-cost shared among the hops; then for every hop two segments of half a second through pyroomacoustics' SRP,
-thirty azimuths, 50-1500 Hz. `published_chain_per_call` is the same where the sound comes as a stream, so that
-every hop transforms its own second.
+Every stage is timed where it is called: its function is replaced by one with a clock around it, so that no
+chain is repeated here. The window model is the one that ships. Trees and guard are made up, of the sizes that
+`worldstate model make` trains: what they cost does not depend on what they have learned. `published_chain`
+restates the chain of the published acoustic baseline in its amortised form: scipy's STFT of the whole file,
+channel by channel, its cost shared among the hops; then for every hop two segments of half a second through
+pyroomacoustics' SRP, thirty azimuths, 50-1500 Hz. `published_chain_per_call` is the same where the sound
+comes as a stream, so that every hop transforms its own second.
 """
 
 import time
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial, wraps
 from importlib.util import find_spec
-from typing import Any, cast
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.abduction.sequence.sequence_inputs import INPUTS
 from worldstate.abduction.sequence.sequence_model import GROUPS, BoostedTrees, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard
-from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
+from worldstate.adapters import acoustic
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.acoustic_sequence import read_hop
 from worldstate.adapters.files.model_file import read_model
-from worldstate.frontend.approach.looming import looming
-from worldstate.frontend.approach.tone import ENGINE_BAND_HZ, ToneStage
-from worldstate.frontend.array.microphone_array import ChannelMask, roof_array_56
-from worldstate.frontend.array.steering import Steering, cross_spectra
-from worldstate.frontend.direction.bearing import find_peaks
-from worldstate.frontend.direction.feature import feature_steering, pair_sum_of, segment_feature
+from worldstate.frontend import hop_spectra, stream
+from worldstate.frontend.approach.tone import ToneStage
+from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.direction.music import MusicStage
-from worldstate.frontend.direction.srp import normalised, steered_power
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.levels import LevelMeter
-from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import MEASURES
-from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, power, whiten
+from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 
 Milliseconds = list[float]
+Stages = Mapping[str, tuple[tuple[Any, str], ...]]
+
+RATE_HZ, NFFT = 47_998, 512
+GOAL: Stages = {
+    "stft": ((StreamingStft, "push"),),
+    "phat": ((hop_spectra, "power"), (hop_spectra, "whiten")),
+    "srp181": ((hop_spectra, "steered_power"), (FrontEnd, "_srp")),
+    "feature": ((hop_spectra, "cross_spectra"), (hop_spectra, "pair_sum_of"), (FrontEnd, "_feature")),
+}
+"""Stages of the first goal, by the functions that do their work."""
+FRONT_END: Stages = {
+    **GOAL,
+    "peaks": ((stream, "highest_peaks"),),
+    "bands": ((LevelMeter, "push"),),
+    "looming": ((FrontEnd, "_looming"),),
+    "tone": ((ToneStage, "push"), (ToneStage, "read")),
+    "music": ((MusicStage, "push"), (MusicStage, "read")),
+    "channel_watching": ((ChannelMonitor, "push"),),
+}
+EVIDENCE: Stages = {
+    "window_evidence": ((SiteSignature, "evidence"),),
+    "domain_guard": ((DomainGuard, "judge"),),
+    "sequence_reader": ((acoustic, "read_hop"),),
+}
+"""Parts of `evidence`, which also asks no camera and weighs the bearing."""
 
 
 def elapsed_ms(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
@@ -59,110 +81,49 @@ def elapsed_ms(call: Callable[[], object], clock: Callable[[], float] = time.per
     return 1e3 * (clock() - start)
 
 
-RATE_HZ, NFFT = 47_998, 512
-SRP_BINS, FEATURE_BINS = range(3, 19), range(1, 16)
-AZIMUTHS_RAD = np.radians(np.arange(-90.0, 91.0))
-GOAL = ("stft", "phat", "srp181_new_frames", "srp181_running_second", "feature")
-"""Stages of the first goal, in milliseconds."""
-MORE = ("peaks", "bands", "looming", "tone", "music", "channel_watching")
-"""Stages that `everything` adds to them."""
-
-
-def srp_beams() -> Steering:
-    """Beams of the search grid, 300-1800 Hz.
+def stage_times(stages: Stages, calls: Sequence[Callable[[], object]]) -> dict[str, Milliseconds]:
+    """Return the milliseconds that every stage takes within each call.
 
     Examples
     --------
-    >>> srp_beams().n_directions
-    181
+    >>> len(stage_times({"power": ((np, "square"),)}, [lambda: np.square(2.0)] * 3)["power"])
+    3
     """
-    return Steering.towards(roof_array_56(), bin_frequencies_hz(SRP_BINS, RATE_HZ, NFFT), AZIMUTHS_RAD)
-
-
-def stage_times(hops: list[Float32Array]) -> dict[str, Milliseconds]:
-    """Time every stage on every hop, in turn, as the stream does them.
-
-    Shapes: hops (n, 56).
-    """
-    stages = _Stages()
-    times: dict[str, Milliseconds] = {name: [] for name in (*GOAL, *MORE, "goal")}
-    for samples in hops:
-        for name, stage in stages.of(samples):
-            times[name].append(elapsed_ms(stage))
-        times["goal"].append(sum(times[name][-1] for name in GOAL))
+    spent = dict.fromkeys(stages, 0.0)
+    times: dict[str, Milliseconds] = {name: [] for name in stages}
+    with _clocks(stages, spent):
+        for call in calls:
+            spent.update(dict.fromkeys(stages, 0.0))
+            call()
+            for name, ms in spent.items():
+                times[name].append(ms)
     return times
 
 
-class _Stages:
-    """The state of every stage, and what one hands to the next."""
-
-    def __init__(self) -> None:
-        array, everyone = roof_array_56(), ChannelMask.all_of(56)
-        self._mask = everyone
-        self._stft = StreamingStft(56, NFFT, range(1, 19))
-        self._beams, self._feature_beams = srp_beams(), feature_steering(array, FEATURE_BINS, RATE_HZ)
-        self._meter = LevelMeter(56, RATE_HZ, FrontEndSettings())
-        self._tone = ToneStage(array, RATE_HZ, ENGINE_BAND_HZ)
-        self._music = MusicStage([self._beams], AZIMUTHS_RAD, 1, 56, window_hops=10)
-        self._monitor = ChannelMonitor(array, bin_frequencies_hz(FEATURE_BINS, RATE_HZ, NFFT), RATE_HZ)
-        self._powers: list[NDArray[Any]] = []
-        self._pairs: list[NDArray[Any]] = []
-        self._energies: list[NDArray[Any]] = []
-
-    def of(self, samples: Float32Array) -> list[tuple[str, Callable[[], object]]]:
-        """Return the stages of one hop, to be called in this order."""
-        return [
-            ("stft", partial(self._transform, samples)),
-            ("phat", self._whiten),
-            ("srp181_new_frames", self._steer),
-            ("srp181_running_second", self._sum),
-            ("feature", self._feature),
-            ("peaks", lambda: find_peaks(self._srp, AZIMUTHS_RAD)),
-            ("bands", lambda: self._meter.push(samples)),
-            ("looming", self._loom),
-            ("tone", partial(self._fit_tone, samples)),
-            ("music", self._score),
-            ("channel_watching", partial(self._watch, samples)),
-        ]
-
-    def _transform(self, samples: Float32Array) -> None:
-        self._spectra = self._stft.push(samples)
-
-    def _whiten(self) -> None:
-        self._power = power(self._spectra)
-        self._whitened = whiten(self._spectra, self._power)
-
-    def _steer(self) -> None:
-        self._powers = [*self._powers[-9:], steered_power(self._whitened[:, 2:18], self._beams)]
-
-    def _sum(self) -> None:
-        self._srp = normalised(np.sum(self._powers, axis=0), 187, len(SRP_BINS), 56)
-
-    def _feature(self) -> None:
-        self._matrices = cross_spectra(self._whitened[:, 0:15].transpose(1, 0, 2))
-        self._pairs = [*self._pairs[-9:], pair_sum_of(self._matrices, self._feature_beams)]
-        halves = self._pairs[:5], self._pairs[-5:]
-        np.concatenate([segment_feature(half, 94, len(FEATURE_BINS), 56) for half in halves])
-
-    def _loom(self) -> None:
-        self._energies = [*self._energies[-9:], self._power[:, 2:18].sum(axis=1, dtype=np.float64)]
-        means = np.array([energies.mean() for energies in self._energies])
-        if len(means) == 10:
-            looming(np.arange(-0.95, 0.0, 0.1), np.log(means), floor_std=0.08)
-
-    def _fit_tone(self, samples: Float32Array) -> None:
-        self._tone.push(samples, self._mask)
-        self._tone.read()
-
-    def _score(self) -> None:
-        self._music.push(self._spectra[:, 2:18])
-        self._music.read(self._mask)
-
-    def _watch(self, samples: Float32Array) -> None:
-        self._monitor.push(samples, self._energies[-1], self._power, self._matrices)
+@contextmanager
+def _clocks(stages: Stages, spent: dict[str, float]) -> Iterator[None]:
+    """Let every stage add its milliseconds to `spent`."""
+    with ExitStack() as patches:
+        for name, functions in stages.items():
+            for owner, function in functions:
+                clocked = _clocked(getattr(owner, function), name, spent)
+                patches.enter_context(patch.object(owner, function, clocked))
+        yield
 
 
-NFFT, REPEATS = 512, 9
+def _clocked(stage: Callable[..., Any], name: str, spent: dict[str, float]) -> Callable[..., Any]:
+    @wraps(stage)
+    def call(*arguments: Any, **options: Any) -> Any:
+        start = time.perf_counter()
+        try:
+            return stage(*arguments, **options)
+        finally:
+            spent[name] += 1e3 * (time.perf_counter() - start)
+
+    return call
+
+
+REPEATS = 9
 SRP_BAND_HZ, FEATURE_BAND_HZ = [300.0, 1800.0], [50.0, 1500.0]
 
 
@@ -218,15 +179,13 @@ def _published_chain(
     return file_ms, [elapsed_ms(one_hop) for _ in range(REPEATS)], second_ms
 
 
-PARTS = ("window_evidence", "domain_guard", "sequence_reader")
-"""Parts of `evidence`, which also asks no camera and weighs the bearing."""
 ROUNDS, LEAVES = 60, 8  # A round is a tree for each group
 _FOREIGN, _SIGNALS, _CENTRES = 8, 4, 5
 _ROWS, _WINDOWS = 150, 40  # Few: the peers' cost does not depend on them either
 
 
 def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:
-    """Time every part of the evidence on every frame, and two peers, keys beginning with ``peer_``."""
+    """Time the evidence and its parts on every frame, and two peers, keys beginning with ``peer_``."""
     # A limit holds for libraries that are loaded. On a busy machine two threads wait for one another at every
     # one of 900 small trees, for minutes.
     import sklearn.ensemble  # noqa: F401
@@ -234,36 +193,28 @@ def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:
     with threadpool_limits(1):
         rng = np.random.default_rng(1)
         trees, rows = _peer_trees(rng), rng.normal(size=(REPEATS, 2, len(INPUTS)))
-        times = _own_times(frames, _sequence(rng), _guard(rng), rng.normal(size=len(MEASURES)))
+        whole, interpret = [elapsed_ms(one) for one in _interpreted(frames, rng)], _interpreted(frames, rng)
+        times = stage_times(EVIDENCE, interpret) | {"evidence": whole}
+        # Before, trees are not asked.
+        times = {name: spent[LEAST_HOPS:] for name, spent in times.items()}
         classify, window = _peer_classifier(rng).decision_function, frames[-1].feature[None]
         times["peer_scikit_learn_trees"] = [elapsed_ms(partial(trees.predict_proba, two)) for two in rows]
         times["peer_scikit_learn_classifier"] = [elapsed_ms(partial(classify, window)) for _ in rows]
     return times
 
 
-def _own_times(
-    frames: Sequence[AcousticFrame], sequence: SequenceModel, guard: DomainGuard, measures: FloatArray
-) -> dict[str, Milliseconds]:
-    windows = _windows()
-    adapter = _adapter(windows, guard, sequence)
-    signature, reader = SiteSignature(windows), SequenceReader(sequence)
-    times: dict[str, Milliseconds] = {}
-    for frame in frames:
-        heard = signature.evidence(frame.feature)
-        calls: dict[str, Callable[[], object]] = {
-            "window_evidence": partial(signature.evidence, frame.feature),
-            "domain_guard": partial(guard.judge, measures),
-            "sequence_reader": partial(read_hop, reader, heard, frame),
-            "evidence": partial(adapter.interpret, frame),
-        }
-        for name, call in calls.items():
-            times.setdefault(name, []).append(elapsed_ms(call))
-    # Before, trees are not asked.
-    return {name: spent[LEAST_HOPS:] for name, spent in times.items()}
+def _interpreted(frames: Sequence[AcousticFrame], rng: np.random.Generator) -> list[Callable[[], object]]:
+    interpret = made_up_adapter(rng).interpret
+    return [partial(interpret, frame) for frame in frames]
 
 
-def _windows() -> EnsembleModel:
-    return cast(EnsembleModel, read_model().signature)
+def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
+    """Return an adapter with the window model that ships, and trees and a guard of no meaning."""
+    signature = SiteSignature(read_model().signature)  # type: ignore[arg-type]
+    reader = SequenceReader(_sequence(rng))
+    return AcousticAdapter(
+        roof_array_56(), RATE_HZ, signature, guard=_guard(rng), sequence=reader, uncalibrated=True
+    )
 
 
 def _sequence(rng: np.random.Generator) -> SequenceModel:
@@ -281,11 +232,6 @@ def _sequence(rng: np.random.Generator) -> SequenceModel:
     classes = np.arange(trees) % len(GROUPS)
     grown = BoostedTrees(split, threshold, yes, no, value, classes, np.zeros(len(GROUPS)))
     return SequenceModel(grown, np.full(len(GROUPS), 1.0 / len(GROUPS)))
-
-
-def _adapter(windows: EnsembleModel, guard: DomainGuard, sequence: SequenceModel) -> AcousticAdapter:
-    array, signature, reader = roof_array_56(), SiteSignature(windows), SequenceReader(sequence)
-    return AcousticAdapter(array, RATE_HZ, signature, guard=guard, sequence=reader, uncalibrated=True)
 
 
 def _peer_trees(rng: np.random.Generator) -> Any:

@@ -35,7 +35,6 @@ BENCHES = {
     "bench import": f"{BENCH}.imports",
     "bench label-training": f"{BENCH}.label_training",
     "bench labels": f"{BENCH}.labels",
-    "bench smoothing": f"{BENCH}.smoothing",
     "bench street": f"{BENCH}.street",
 }
 DESCRIPTION = "The evaluation of the paper, and studies of our own."

@@ -1,6 +1,7 @@
 """A program of commands: it finds the one that is called, imports its module alone, and runs it."""
 
 import argparse
+import ast
 import os
 import signal
 import sys
@@ -10,6 +11,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 from worldstate.ground.errors import InvalidArgumentError, WorldstateError
@@ -67,7 +70,7 @@ class Program:
         lines = [f"{group}: {self.groups[group]}"] if group else ["commands:"]
         for name in self.members(group):
             words = f"{group} {name}".strip()
-            summary, _ = _documentation(import_module(self.commands[words]))
+            summary, _ = _documentation(_docstring(self.commands[words]))
             lines += textwrap.wrap(f"  {words:<16} {summary}", _WIDTH, subsequent_indent=" " * 19)
         return "\n".join(lines)
 
@@ -76,7 +79,7 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of one command, with --json."""
 
     def __init__(self, program: str, module: ModuleType) -> None:
-        _, description = _documentation(module)
+        _, description = _documentation(module.__doc__ or "")
         super().__init__(
             program,
             description=description,
@@ -117,9 +120,17 @@ class _HelpAll(argparse.Action):
         parser.exit()
 
 
-def _documentation(module: ModuleType) -> tuple[str, str]:
+def _docstring(module: str) -> str:
+    """Return the documentation of a module that is not imported: a study takes more than a second."""
+    found = find_spec(module)
+    if found is None or found.origin is None:
+        return ""
+    return ast.get_docstring(ast.parse(Path(found.origin).read_text(encoding="utf-8"))) or ""
+
+
+def _documentation(docstring: str) -> tuple[str, str]:
     """Return the summary and the description of a command."""
-    head, _, description = (module.__doc__ or "").partition("\n\n")
+    head, _, description = docstring.partition("\n\n")
     return head.partition("`: ")[2].removesuffix("."), description.strip()
 
 
