@@ -12,10 +12,8 @@ from .bounds.cramer_rao import bearing_crb_rad2 as bearing_crb_rad2
 from .bounds.cramer_rao import delay_crb_s2 as delay_crb_s2
 from .bounds.cramer_rao import radial_speed_crb_m2_s2 as radial_speed_crb_m2_s2
 from .bounds.cramer_rao import tone_crb_hz2 as tone_crb_hz2
-from .direction.bearing import GatingCurve as GatingCurve
 from .direction.bearing import Peak as Peak
 from .direction.bearing import find_peaks as find_peaks
-from .direction.bearing import gating_curve as gating_curve
 from .direction.feature import published_feature as published_feature
 from .direction.gcc import PairDelays as PairDelays
 from .direction.gcc import gcc_delays as gcc_delays

@@ -10,14 +10,15 @@ from worldstate_lab.cli.ablations import (
     AblationSwitches,
     ablation_table,
     evaluate_ablation,
+    presence_statistic,
 )
 
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import abduce
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT
-from worldstate.operations.recordings.stream_statistic import presence_statistic
+from worldstate.operations.recordings.hop_table import ABSENT, PRESENT
+from worldstate.operations.recordings.stream_statistic import StatisticSwitches
 
 PRIOR = (0.25, 0.25, 0.25, 0.25)
 BETA = {0.0: 0.05, 0.5: 0.5, 1.0: 0.97}
@@ -65,7 +66,8 @@ def test_presence_is_that_of_the_posterior():
         row = stream.log_likelihoods[i]
         answer = (Present if stream.answer[i] == PRESENT else Absent)(0.05, 0.01)
         whole = abduce(np.log(PRIOR), SignatureEvidence(("l", "r"), tuple(row[:2]), row[2], row[3]), answer)
-        assert presence_statistic(stream, PRIOR)[i] == pytest.approx(whole.hidden_total + whole.visible)
+        presence = presence_statistic(stream, PRIOR, StatisticSwitches())[i]
+        assert presence == pytest.approx(whole.hidden_total + whole.visible)
 
 
 def test_the_table_switches_one_thing_at_a_time():

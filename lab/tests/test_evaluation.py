@@ -17,6 +17,7 @@ from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STA
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
+from worldstate_lab.metrics.bearing_gating import bearing_curve
 from worldstate_lab.streets.simulated_windows import simulated_window_pair
 from worldstate_lab.trials.classification import (
     Classifiers,
@@ -38,9 +39,7 @@ from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import load_model, read_model, save_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
-from worldstate.operations.recordings.bearing_gating import bearing_curve
-from worldstate.operations.recordings.hop_stream import ABSENT
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import ABSENT, HopTable
 
 HOPS = 91
 T0_S, PASS_S = 7.0, 8.0

@@ -21,8 +21,7 @@ from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, Recording
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.approach_table import poisson_interval
-from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, UNQUERIED
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import ABSENT, PRESENT, UNQUERIED, HopTable
 
 PRIOR = (0.25,) * 4
 HOPS, T0_S = 60, 4.0

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.recordings.hop_stream import load_streams
-from worldstate.operations.recordings.hop_table import HopTable, save_tables
+from worldstate.operations.recordings.hop_table import HopTable, load_streams, save_tables
 
 MIB = 1 << 20
 MOST_KIB = 1_000_000_000 // 1024

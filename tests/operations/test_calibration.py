@@ -18,7 +18,7 @@ from worldstate.abduction.cueing.calibration_error import (
 )
 from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt, fit_sigmoid
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.roc import auroc, auroc_by_group
+from worldstate.operations.metrics.roc import auroc
 
 samples = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=2, max_size=80).filter(
     lambda sample: len({label for _, label in sample}) == 2
@@ -115,8 +115,3 @@ def test_auroc_agrees_with_scikit_learn(sample):
         assert auroc(scores, labels) is None
     else:
         assert auroc(scores, labels) == pytest.approx(roc_auc_score(labels, scores), abs=1e-12)
-
-
-def test_groups_without_both_labels_are_left_out():
-    areas = auroc_by_group([0.1, 0.9, 0.5], [False, True, True], ["a", "a", "b"])
-    assert areas == {"a": 1.0}

@@ -26,8 +26,7 @@ from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Measurement, Sighting
 from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
 from worldstate.operations.metrics.approach_table import ApproachTable
-from worldstate.operations.recordings.hop_stream import hop_stream, load_streams
-from worldstate.operations.recordings.hop_table import save_tables
+from worldstate.operations.recordings.hop_table import hop_stream, load_streams, save_tables
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 
 PRIOR = (0.3, 0.3, 0.2, 0.2)

@@ -13,9 +13,6 @@ that of detections with stamps, too).
 the corner that hides the arm (x ahead, y left of the ego) and the lane behind it, metres, or "open": true of
 an arm that hides nothing; optional "speed_mps" and "corner_std_m" of an arm, "rates", "priors",
 "ego_speed_mps", "site", "view_half_angle_deg". With --odometry corners move as the ego does.
-
---gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
-coverage, where only prominent peaks are kept.
 """
 
 import argparse
@@ -79,13 +76,12 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     add("--figure", type=Path, metavar="PNG", help="draw the timeline")
-    add("--gating", type=Path, metavar="PNG", help="bearing error against the share kept by prominence")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     files = exports.exported_files(arguments)
-    check_outputs(arguments, "out", "save_state", figures=("figure", "gating"), exported=files)
+    check_outputs(arguments, "out", "save_state", figures=("figure",), exported=files)
     given = sensors.given_sensors(arguments)
     check_call(given, arguments.input if inputs.bag_of(arguments) is None else [])
     return _heard(arguments, given)
@@ -95,7 +91,6 @@ def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> Comman
     """Listen to the recording; return what was found."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
-    from worldstate.operations.recordings.bearing_gating import bearing_figures, write_gating_figure
     from worldstate.operations.recordings.timeline import write_timeline
 
     source = _source(arguments, given)
@@ -116,9 +111,6 @@ def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> Comman
         "array": inputs.stance(source.array),
         "detections": sensors.box_counts(source, as_json=arguments.json),
     }
-    if arguments.gating is not None:
-        write_gating_figure(report.bearings, arguments.gating, title=str(source.audio_path))
-        summary |= bearing_figures(report.bearings)
     return CommandResult(summary)
 
 

@@ -24,7 +24,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
-from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
 from worldstate.simulation.stream.settings import StreamSettings
 

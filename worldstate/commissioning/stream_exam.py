@@ -38,7 +38,7 @@ from worldstate.operations.metrics.approach_table import (
     visible_errors,
 )
 from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HOP_S
 
 from .heard_stream import HeardStream
 from .sequence_training import QUIET_KINDS, ROW_S, StreamTruth

@@ -35,7 +35,7 @@ from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import (
     StatisticSwitches,
-    presence_statistic,
+    log_joint,
     stream_statistic,
 )
 from worldstate_lab.metrics.intervals import deal_folds
@@ -309,3 +309,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         )
     report = {"recordings": len(streams), "alpha": arguments.alpha, "rows": rows}
     return CommandResult(report, table={}, lines=lines)
+
+
+def presence_statistic(
+    stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches
+) -> FloatArray:
+    """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,)."""
+    joint = log_joint(stream, reference_prior, switches)
+    something = np.logaddexp.reduce(joint[:, :-1], axis=1)
+    return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))

@@ -53,10 +53,11 @@ from worldstate.cli.model.fit import add_table_options, read_beside
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate, worst_rate
+from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
+from worldstate_lab.metrics.by_group import auroc_by_group, macro, rate, worst_rate
 from worldstate_lab.metrics.intervals import DRAWS, middle, paired_gains, recording_draws
 
 # The floor belongs to the risks: another seed in every run would only add noise to it.

@@ -17,8 +17,7 @@ from worldstate.operations.metrics.approach_table import (
     poisson_interval,
     rising_edges,
 )
-from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HOP_S, UNQUERIED, HopTable
 from worldstate.operations.recordings.stream_statistic import stream_statistic
 from worldstate_lab.metrics.intervals import deal_folds, middle
 

@@ -31,8 +31,7 @@ from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.detectors.miss_rate_measurement import MIN_OVERLAP
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rising_edges
-from worldstate.operations.recordings.hop_stream import HOP_S, hop_stream
-from worldstate.operations.recordings.hop_table import HopTable, joined
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream, joined
 from worldstate_lab.metrics.intervals import DRAWS, middle, poisson_upper
 
 from .awareness import Estimate

@@ -7,8 +7,8 @@ import numpy as np
 
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.recordings.bearing_gating import bearing_figures
 from worldstate.operations.recordings.hop_table import HopTable, joined
+from worldstate_lab.metrics.bearing_gating import gated_median_deg
 from worldstate_lab.metrics.intervals import middle, stratified_draws
 from worldstate_lab.trials.trial import Trial
 
@@ -69,16 +69,12 @@ def front_end_study(trials: Sequence[Trial], rng: np.random.Generator, draws: in
 def _figures(trials: Sequence[Trial], rows: IndexArray) -> dict[str, float]:
     approaches = [trials[i].hops for i in rows.tolist() if not trials[i].hazard_free]
     calm = [trials[i].hops for i in rows.tolist() if trials[i].hazard_free]
-    gated = (
-        bearing_figures(joined([_checked(hops) for hops in approaches]))["bearing_gated_deg"]
-        if approaches
-        else None
-    )
+    checked = [_checked(hops) for hops in approaches]
     seen = _pooled(approaches, lambda hops: hops.prominence[np.isfinite(hops.reference_rad)])
     return {
         "bearing_srp_deg": _median_deg(approaches, "srp_rad"),
         "bearing_music_deg": _median_deg(approaches, "music_rad"),
-        "bearing_gated_deg": np.nan if gated is None else gated,
+        "bearing_gated_deg": gated_median_deg(joined(checked)) if checked else np.nan,
         "prominence_in_view": _median(seen),
         "prominence_in_silence": _median(_pooled(calm, lambda hops: hops.prominence)),
         "doppler_usable": float(sum(hops.about["doppler"] == "" for hops in approaches)),

@@ -9,7 +9,7 @@ from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.sequence.sequence_model import held
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
-from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate_lab.methods.acoustic_rules import SUSTAIN_CHOICES
 from worldstate_lab.metrics.intervals import draw_weights, middle, ratio
 from worldstate_lab.trials.trial import Decisions, Trial

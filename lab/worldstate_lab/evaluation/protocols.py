@@ -8,7 +8,7 @@ import numpy as np
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, caution
-from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate_lab.metrics.intervals import deal_folds
 from worldstate_lab.trials.classification import Classifiers, TrainedOn, junction_of
 from worldstate_lab.trials.takes import Take

@@ -16,8 +16,7 @@ from worldstate.operations.metrics.approach_table import (
     rising_edges,
     visible_errors,
 )
-from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
 from worldstate_lab.trials.trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
 

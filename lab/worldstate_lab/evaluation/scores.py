@@ -11,11 +11,11 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval
 from worldstate.operations.metrics.roc import rank_wins
-from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
-from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate.operations.recordings.hop_table import HopTable, joined
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
 from worldstate_lab.evaluation import reduction
 from worldstate_lab.evaluation.figures import FIGURES
+from worldstate_lab.metrics.bearing_gating import PUBLISHED_COVERAGE
+from worldstate_lab.metrics.by_group import worst_group
 from worldstate_lab.metrics.intervals import (
     draw_weights,
     highest_share,
@@ -25,7 +25,6 @@ from worldstate_lab.metrics.intervals import (
     random_detection,
     ratio,
     weighted_median,
-    worst_group,
 )
 from worldstate_lab.trials.trial import Decisions, Trial
 

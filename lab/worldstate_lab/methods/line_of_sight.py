@@ -11,8 +11,7 @@ import numpy as np
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
-from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.trials.trial import TRACK_COLUMNS, Decide, Decisions, Trial
 
 from .oc_sort import OcSort, TrackedBox

@@ -12,7 +12,6 @@ Exact intervals of counts and shares are in `worldstate.operations.metrics.appro
 """
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -83,22 +82,6 @@ def paired_gains(ours: Mapping[str, FloatArray], other: Mapping[str, FloatArray]
     """
     # Both methods stumble over the same hard recordings: paired, those cancel.
     return {figure: middle(values - other[figure]) for figure, values in ours.items()}
-
-
-def worst_group(values: Mapping[str, float], worse: Literal["low", "high"]) -> tuple[str, float]:
-    """Return name and figure of the worst group, the first of equals; ("", NaN) where none has a figure.
-
-    Examples
-    --------
-    >>> worst_group({"SA1": 0.9, "SB1": 0.6, "SC1": float("nan")}, worse="low")
-    ('SB1', 0.6)
-    """
-    # NaN compares as neither less nor greater, so that min and max would depend on the order.
-    known = {name: value for name, value in values.items() if not np.isnan(value)}
-    if not known:
-        return "", float("nan")
-    name = (min if worse == "low" else max)(known, key=known.__getitem__)
-    return name, known[name]
 
 
 def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = DRAWS) -> list[IndexArray]:

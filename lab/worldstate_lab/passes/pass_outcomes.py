@@ -24,7 +24,7 @@ from worldstate.operations.metrics.approach_table import (
     mean_of,
     shortly_before,
 )
-from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.state import Entity
 
 from .followed_stream import PassedStream

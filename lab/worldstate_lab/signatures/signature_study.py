@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
-from worldstate.operations.metrics.roc import auroc, auroc_by_group
+from worldstate.operations.metrics.roc import auroc
+from worldstate_lab.metrics.by_group import auroc_by_group
 from worldstate_lab.metrics.intervals import DRAWS, FOLDS, Interval, middle, stratified_draws
 
 from .clip_signatures import ClipSignatures, signature_edges_hz

@@ -11,8 +11,7 @@ from worldstate.adapters.datasets.array_choice import named_array
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
-from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.trials.pass_cache import origin_of
 
 from .engine import Failed

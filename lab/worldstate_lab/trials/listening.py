@@ -33,8 +33,7 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
-from worldstate.operations.recordings.hop_stream import HOP_S, hop_stream
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream
 from worldstate.operations.recordings.stream_statistic import stream_statistic
 from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.state import RiskCue, WorldState

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # A signature is a line of a model file; no model that `save_model` writes has a longer one.
 _LONGEST_LINE = 1 << 20
-_EXTRAS = {"figure": "matplotlib", "gating": "matplotlib", "camera_device": "cv2"}
+_EXTRAS = {"figure": "matplotlib", "camera_device": "cv2"}
 
 
 def check_call(given: "GivenSensors", sound: list[Path]) -> None:

@@ -12,8 +12,7 @@ from worldstate.adapters.source_files import open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.serialisation import encode
-from worldstate.operations.recordings.hop_stream import hop_stream, load_streams
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HopTable, hop_stream, load_streams
 
 
 def find_inputs(path: Path) -> list[Path]:

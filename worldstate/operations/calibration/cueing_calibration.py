@@ -22,8 +22,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, caution, poisson_interval
-from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate.operations.training.window_calibration import MISS_RATES
 

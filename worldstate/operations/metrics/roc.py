@@ -1,13 +1,12 @@
-"""Areas under the ROC curve and rates at a threshold."""
+"""Areas under the ROC curve, ties included."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import AnyArray, BoolArray, FloatArray
+from worldstate.ground.typing import FloatArray
 
 
 def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
@@ -43,57 +42,6 @@ def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
     if not n_positive or not n_negative:
         return None
     return float(rank_wins([values[labels]], [values[~labels]])[0, 0]) / (n_positive * n_negative)
-
-
-def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:
-    """Return the area of each group that has both labels, in the order of their names.
-
-    Shapes: scores, positive (n,), groups (n,).
-    """
-    values, labels, names = np.asarray(scores), np.asarray(positive), np.asarray(groups)
-    areas = {str(name): auroc(values[names == name], labels[names == name]) for name in np.unique(names)}
-    return {name: area for name, area in areas.items() if area is not None}
-
-
-def macro(by_group: Mapping[str, float]) -> float:
-    """Return the mean over groups.
-
-    Examples
-    --------
-    >>> macro({"SA1": 1.0, "SB1": 0.5})
-    0.75
-    """
-    if not by_group:
-        raise InvalidArgumentError("groups: expected at least one with hazard and hazard-free windows")
-    return float(np.mean(list(by_group.values())))
-
-
-def rate(decisions: BoolArray, among: BoolArray) -> float | None:
-    """Return the share of decisions among the chosen rows, None where there are none.
-
-    Examples
-    --------
-    >>> rate(np.array([True, False, True]), np.array([True, True, False]))
-    0.5
-    """
-    return float(decisions[among].mean()) if among.any() else None
-
-
-def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> float:
-    r"""Return the share of hazard-free windows that are in alarm at the junction where it is largest.
-
-    .. math:: \max_s \frac{\sum_i a_i f_i [s_i = s]}{\sum_i f_i [s_i = s]}
-
-    Shapes: alarms, hazard_free, sites (n,).
-
-    Examples
-    --------
-    >>> free = np.ones(4, dtype=bool)
-    >>> worst_rate(np.array([True, False, False, False]), free, np.array([0, 0, 1, 1]))
-    0.5
-    """
-    rates = [rate(alarms, hazard_free & (sites == site)) for site in np.unique(sites[hazard_free])]
-    return max(one for one in rates if one is not None)
 
 
 def rank_wins(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) -> FloatArray:

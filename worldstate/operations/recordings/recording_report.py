@@ -14,7 +14,6 @@ from worldstate.adapters.source import Source
 from worldstate.adapters.state_log import states_writer
 from worldstate.ground.values import seconds
 
-from .bearing_gating import check_bearings
 from .channel_report import HealthLog, RecordingHealth
 from .hop_table import HopTable
 from .timeline import Timeline
@@ -25,7 +24,7 @@ from .warning import WarningMeter, WarningSummary
 LIKELY = 0.5
 SIDES = ("left", "right")
 # The sides' columns: whether an advisory of that side is on.
-_COLUMNS = ("time_s", "statistic", "risk", *SIDES, "srp", "bearing_age_s", "bearing_rad", "prominence")
+_COLUMNS = ("time_s", "statistic", "risk", *SIDES, "srp")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +45,6 @@ class RecordingReport:
         Seconds of audio per second of wall time, the whole chain.
     health : RecordingHealth
         What was wrong with the microphones.
-    bearings : HopTable
-        Bearings and their prominence, beside the moving boxes of the camera: see `check_bearings`.
     end : Checkpoint or None
         Belief and site after the last hop, to go on from; None where there was none.
 
@@ -73,7 +70,6 @@ class RecordingReport:
     peak_risk: float
     realtime_factor: float
     health: RecordingHealth
-    bearings: HopTable
     end: Checkpoint | None = None
 
     def to_dict(self) -> dict[str, object]:
@@ -106,7 +102,7 @@ def run_recording(
     Returns
     -------
     RecordingReport
-        Warnings, timeline, health and bearings.
+        Warnings, timeline and health.
 
     Raises
     ------
@@ -147,7 +143,6 @@ def run_recording(
         peak_risk=float(hops.risk.max(initial=0.0)),
         realtime_factor=(float(hops.time_s.max(initial=start_s)) - start_s) / elapsed_s,
         health=log.health.summary(),
-        bearings=check_bearings(hops, log.moving_rad),
         end=end,
     )
 
@@ -169,9 +164,8 @@ class _HopLog:
         self.health.add(frame)
         statistic = max((cue.statistic for cue in state.cues), default=0.0)
         raised = [cue.direction for cue in state.cues if cue.advisory]
-        bearing = frame.bearing_age_s, frame.bearing_rad, frame.prominence
         sides = [side in raised for side in SIDES]
-        self.rows.append((now_s, statistic, state.risk, *sides, frame.srp.astype(np.float32), *bearing))
+        self.rows.append((now_s, statistic, state.risk, *sides, frame.srp.astype(np.float32)))
         self.azimuths_rad = frame.azimuths_rad
         for entity in state.entities:
             if entity.moving and entity.existence_probability >= LIKELY:

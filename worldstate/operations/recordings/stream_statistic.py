@@ -8,8 +8,7 @@ import numpy as np
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import FloatArray
 
-from .hop_stream import ABSENT, PRESENT
-from .hop_table import HopTable
+from .hop_table import ABSENT, PRESENT, HopTable
 
 # An approach score beyond this many standard deviations says no more than one at it.
 LARGEST_SCORE = 3.0
@@ -48,22 +47,12 @@ def stream_statistic(
     Shapes: reference_prior (K + 2,).
     """
     chosen = switches or StatisticSwitches()
-    joint = _log_joint(stream, reference_prior, chosen)
+    joint = log_joint(stream, reference_prior, chosen)
     hidden = np.logaddexp.reduce(joint[:, :-2], axis=1)
     log_odds = hidden - np.logaddexp(joint[:, -2], joint[:, -1])
     if chosen.approach_weight:
         log_odds += chosen.approach_weight * approach_score(stream)
     return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
-
-
-def presence_statistic(
-    stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
-) -> FloatArray:
-    """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,)."""
-    # Parameters and errors are those of `stream_statistic`; the approach term has no part in it.
-    joint = _log_joint(stream, reference_prior, switches or StatisticSwitches())
-    something = np.logaddexp.reduce(joint[:, :-1], axis=1)
-    return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))
 
 
 def approach_score(stream: HopTable) -> FloatArray:
@@ -72,7 +61,7 @@ def approach_score(stream: HopTable) -> FloatArray:
     return np.where(usable, np.clip(stream.approach, -LARGEST_SCORE, LARGEST_SCORE), 0.0)
 
 
-def _log_joint(stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches) -> FloatArray:
+def log_joint(stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches) -> FloatArray:
     """Log of prior, signature and answer, up to a constant of each hop, shape (n, K + 2)."""
     prior = finite_array("reference_prior", reference_prior, (stream.log_likelihoods.shape[1],))
     joint = np.log(prior) + stream.log_likelihoods

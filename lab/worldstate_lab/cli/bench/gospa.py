@@ -27,7 +27,7 @@ from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S
-from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.state import WorldState
 from worldstate_lab.methods.oc_sort import OcSort
 from worldstate_lab.metrics.track_measures import gospa_bearing

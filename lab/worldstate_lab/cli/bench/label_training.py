@@ -25,10 +25,11 @@ from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.labelling.box_tracks import box_tracks
 from worldstate.operations.labelling.label_files import window_rows
 from worldstate.operations.labelling.pass_labels import PassLabel, label_passes
-from worldstate.operations.metrics.roc import auroc, auroc_by_group
+from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate.smoothing.observations import FirstSight
 from worldstate_lab.features.methods import method_of
+from worldstate_lab.metrics.by_group import auroc_by_group
 from worldstate_lab.metrics.intervals import middle, recording_draws
 from worldstate_lab.paper.identifiability import reach_on_table
 from worldstate_lab.passes.followed_stream import EVERYBODY

@@ -30,8 +30,7 @@ from worldstate.ground.values import wrap_angle
 from worldstate.operations.labelling.box_tracks import box_tracks
 from worldstate.operations.labelling.street_passes import seen_edge, streets_after
 from worldstate.operations.metrics.approach_table import rising_edges
-from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate.simulation.scene.settings import rate_for
 from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.writing import draw_stream

@@ -8,13 +8,13 @@ import numpy as np
 
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.operations.arrays.array_bounds import array_bounds
-from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import FIGURES, PAPER_VALUES, PaperValue, paper_value
 from worldstate_lab.evaluation.front_end_study import FrontEndStudy
 from worldstate_lab.evaluation.protocols import RETRAINED, STATIC
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.line_of_sight import seen_early_s
+from worldstate_lab.metrics.bearing_gating import PUBLISHED_COVERAGE
 from worldstate_lab.metrics.intervals import middle, ratio
 from worldstate_lab.report.table import Cell, Table, Value
 

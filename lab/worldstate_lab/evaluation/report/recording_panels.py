@@ -8,9 +8,9 @@ import numpy as np
 from worldstate.ground.typing import FloatArray, IntArray
 from worldstate.ground.values import NotUsable
 from worldstate.operations.figure_style import BLUE, RED
-from worldstate.operations.recordings.bearing_gating import bearing_curve, draw_gating
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.intervals import worst_group
+from worldstate_lab.metrics.bearing_gating import bearing_curve, draw_gating
+from worldstate_lab.metrics.by_group import worst_group
 from worldstate_lab.report.table import Figure, Value
 
 from .panels import COLOURS, GREY, MARKS, legend_below
