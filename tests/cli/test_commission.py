@@ -33,8 +33,8 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert set(told["mounting"]) == {"as mounted", "2 deg of yaw", "5 mm of position"}
     assert told["mounting"]["as mounted"]["detected"] == told["detected"]
     follow = ["streams", *map(str, (tmp_path / "model.streams").glob("*-200*.npz"))]
-    assert study([*follow, "--model", str(out), "--report", str(tmp_path / "passes.json")]) == 0
-    passes = json.loads((tmp_path / "passes.json").read_text())["junctions"]
+    assert study([*follow, "--model", str(out), "--json"]) == 0
+    passes = json.loads(capsys.readouterr().out)["junctions"]
     assert passes["all"]["approaches"] >= 1 and 0.0 < passes["all"]["hazard_free_hours"] < 0.1
     heard = {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()}
     before = out.read_bytes()

@@ -39,6 +39,7 @@ from worldstate.operations.recordings.stream_statistic import (
     stream_statistic,
 )
 from worldstate_lab.metrics.intervals import deal_folds
+from worldstate_lab.report.table import figure_lines
 
 LOOMING_WEIGHTS = (0.0, 0.1, 0.2, 0.4, 0.8)
 
@@ -301,14 +302,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     table = ablation_table(streams, policy.reference_prior, arguments.seed, switches)
     rows = {name: asdict(row) for name, row in table.items()}
-    lines = [f"{'':24}" + "".join(f"{name:>16}" for name in rows)]
-    for figure in rows["full"]:
-        values = [row[figure] for row in rows.values()]
-        lines.append(
-            f"{figure:24}" + "".join(f"{'-' if v is None else format(v, '.3g'):>16}" for v in values)
-        )
     report = {"recordings": len(streams), "alpha": arguments.alpha, "rows": rows}
-    return CommandResult(report, table={}, lines=lines)
+    return CommandResult(report, table={}, lines=figure_lines(rows))
 
 
 def presence_statistic(

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.cli.common.output import CommandResult, check_outputs, write_report
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import characters
 from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams
@@ -119,7 +119,7 @@ def _examined(near: RoadUserRows, said: FloatArray, weights: FloatArray, shares:
 
 EXAMPLE = """\
 examples:
-  worldstate-lab kinds --junctions 16 --passes 2 --jobs 2 --report road_users.json"""
+  worldstate-lab kinds --junctions 16 --passes 2 --jobs 2"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -131,12 +131,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="that were listened to")
     add("--seed", type=int, default=0, help="of vehicles and drives (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--report", type=Path, metavar="JSON", help="write what was found")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    check_outputs(arguments, "report")
     in_range("--passes", arguments.passes, 1, 100)
     plan = learned_streams(CommissionSettings(junctions=arguments.junctions))
     sites = list(dict.fromkeys(one.site.name for one in plan))
@@ -151,8 +149,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     streams = [HeardStream.load(path) for path in arguments.streams]
     found = stream_exam(rows, streams) if streams else road_user_exam(rows)
     report = {name: np.asarray(one).tolist() for name, one in asdict(found).items()}
-    if arguments.report is not None:
-        write_report(arguments.report, report)
     summary = {name: round(getattr(found, name), 3) for name in ("log_loss", "prior_log_loss", "worst_site")}
     named = zip(found.classes, found.shares, found.hops, found.recall, found.recall_of_equals, strict=True)
     lines = ["", f"{'class':12}{'share':>7}{'hops':>7}{'recall':>8}{'of equals':>11}  mean probabilities"]

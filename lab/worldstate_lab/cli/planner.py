@@ -15,7 +15,7 @@ import numpy as np
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.parallel import in_processes
-from worldstate.cli.common.output import CommandResult, check_outputs, write_report
+from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
 from worldstate_lab.planner.encounters import FROM_STANDING, BelievedStream, EgoVehicle, believed_stream
@@ -29,6 +29,7 @@ from worldstate_lab.planner.planner_exam import (
     safe_threshold,
     write_planner_figure,
 )
+from worldstate_lab.report.table import figure_lines
 
 EXAMPLE = """\
 examples:
@@ -54,18 +55,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--cache", type=Path, metavar="DIR", help="keep what the filter said of each stream here")
     add("--seed", type=int, default=0, help="of the replays (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--report", type=Path, metavar="JSON", help="write the figures")
     add("--figure", type=Path, metavar="PNG", help="draw a corner, a way through one, and all thresholds")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    check_outputs(arguments, "report", figures=("figure",))
+    check_outputs(arguments, figures=("figure",))
     count = int(in_range("--count", arguments.count, 10, 100_000))
-    ego, rng = (
-        FROM_STANDING if arguments.from_standing else EgoVehicle(),
-        np.random.default_rng(arguments.seed),
-    )
+    ego = FROM_STANDING if arguments.from_standing else EgoVehicle()
+    rng = np.random.default_rng(arguments.seed)
     others = _believed(arguments, arguments.set_on or [])
     chance = for_loud = arguments.threshold
     if others:
@@ -79,14 +77,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if arguments.figure is not None:
         write_planner_figure(corners, planners, list(curve.values()), figures, ego, arguments.figure)
     report = {"threshold": chance, "threshold_loud": for_loud, "planners": figures, "thresholds": curve}
-    if arguments.report is not None:
-        write_report(arguments.report, report)
-    lines = [
-        f"thresholds {chance:g}, {for_loud:g} (loud)",
-        f"{'':24}" + "".join(f"{name:>22}" for name in figures),
-    ]
-    for name in figures["phantom"]:
-        lines.append(f"{name:24}" + "".join(f"{one[name]:>22.4g}" for one in figures.values()))
+    lines = [f"thresholds {chance:g}, {for_loud:g} (loud)", *figure_lines(figures, ".4g")]
     return CommandResult(report, table={}, lines=lines)
 
 

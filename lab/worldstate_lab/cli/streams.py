@@ -14,15 +14,16 @@ from pathlib import Path
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.parallel import in_processes
-from worldstate.cli.common.output import CommandResult, check_outputs, write_report
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import pass_figures
+from worldstate_lab.report.table import figure_lines
 
 EXAMPLE = """\
 examples:
   worldstate-lab streams streams/*-2001-*.npz --model my_model.json
-  worldstate-lab streams streams/SA1-*.npz --model my_model.json --camera none --report figures.json"""
+  worldstate-lab streams streams/SA1-*.npz --model my_model.json --camera none --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -38,12 +39,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--seed", type=int, default=0, help="of the camera's misses (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--report", type=Path, metavar="JSON", help="write the figures")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    check_outputs(arguments, "report")
     model = read_model(arguments.model)
     given = {"camera": arguments.camera, "seed": arguments.seed, "learns": arguments.sides}
     follow = partial(passed_stream, model=model, **given)
@@ -55,15 +54,4 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     figures = {site: pass_figures(streams[site]) for site in sorted(streams)}
     figures["all"] = pass_figures([one for every in streams.values() for one in every])
     report = {**given, "junctions": figures}
-    if arguments.report is not None:
-        write_report(arguments.report, report)
-    lines = [f"{'':24}" + "".join(f"{site:>9}" for site in figures)]
-    for name in figures["all"]:
-        lines.append(f"{name:24}" + "".join(f"{_shown(one[name]):>9}" for one in figures.values()))
-    return CommandResult(report, table={}, lines=lines)
-
-
-def _shown(value: float | int | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:d}" if isinstance(value, int) else f"{value:.3f}"
+    return CommandResult(report, table={}, lines=figure_lines(figures, ".3f"))

@@ -153,6 +153,28 @@ def csv_text(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
     return buffer.getvalue()
 
 
+def figure_lines(columns: Mapping[str, Mapping[str, float | None]], form: str = ".3g") -> list[str]:
+    """Return figures for a terminal, each in a row; whole numbers in full, a dash for what is not known.
+
+    Examples
+    --------
+    >>> for line in figure_lines({"ours": {"n": 12, "lead_s": 1.7}, "theirs": {"n": 12, "lead_s": None}}):
+    ...     print(line.replace(MISSING, "-"))
+    figure  ours  theirs
+    n         12      12
+    lead_s   1.7       -
+    """
+    rows = [
+        (name, *(_figure_text(one[name], form) for one in columns.values()))
+        for name in next(iter(columns.values()))
+    ]
+    return Table("figures", "", ("figure", *columns), rows).lines()[1:]
+
+
+def _figure_text(value: float | None, form: str) -> str:
+    return MISSING if value is None else format(value, "d" if isinstance(value, int) else form)
+
+
 def plain(value: Any) -> Any:
     """Return findings as JSON-able values: dataclasses, tuples and arrays in any depth, null for NaN.
 

@@ -1,7 +1,7 @@
 """Signature separability and its limits: section IX of the paper on whatever corpora are given."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -219,9 +219,13 @@ def _rows(
     on_row: Callable[[], None] = lambda: None,
 ) -> tuple[list[SignatureRow], list[SignatureRow]]:
     """Return the rows of how well is told apart, and those of the Fisher profile."""
-    corpora, rows = _Corpora(tables, rng), []
+    rows, scored = [], dict[tuple[str, ...], _Scored | None]()
     for question in QUESTIONS:
-        rows.append(corpora.row(question))
+        # Vehicles and quiet road users of a corpus are scored by one and the same model.
+        key = question.by, question.train, question.test, question.microphone
+        if key not in scored:
+            scored[key] = _scored(question, tables, rng)
+        rows.append(_row(question, tables, scored[key], rng))
         on_row()
     studio = _studio(tables.get(IDMT))
     return rows, [row for by in BYS for row in _range_rows(studio, by, rng)]
@@ -266,56 +270,48 @@ class _Scored:
     score: FloatArray
     split: str
 
-    def of(self, kind: str) -> ClipScores:
-        """Return the scores of one kind, or of all motor vehicles, and of the background."""
-        positive = self.table.motor if kind == VEHICLE else self.table.kinds == kind
-        return scores_of(self.table, self.score, positive)
+
+def _row(
+    question: _Question,
+    tables: Mapping[Corpus, ClipSignatures],
+    scored: _Scored | None,
+    rng: np.random.Generator,
+) -> SignatureRow:
+    """Answer a question; without a value where a corpus is missing or too small."""
+    names = list(dict.fromkeys((question.train, question.test)))
+    missing = [name for name in names if name not in tables]
+    known = [name if missing else tables[name].name for name in names]
+    row = SignatureRow(question.name, " -> ".join(known), question.figure, None, paper=question.paper)
+    if missing:
+        return replace(row, note=NOWHERE if question.kind == ELECTRIC else command(*names))
+    if scored is None:
+        return replace(row, note=TOO_FEW)
+    table, measure = scored.table, FIGURES[row.figure]
+    positive = table.motor if question.kind == VEHICLE else table.kinds == question.kind
+    scores = scores_of(table, scored.score, positive)
+    value = measure(scores)
+    if np.isnan(value):
+        return replace(row, note=f"no clip of {question.kind}")
+    low, high = interval(measure, scores, rng)
+    worst = scores.worst_site if measure is area else None
+    note = scored.split + (f"; worst site {worst[0]} {worst[1]:.3f}" if worst else "")
+    return replace(row, value=value, low=low, high=high, n_clips=len(scores.score), note=note)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Corpora:
-    """What was given, and scores that several rows share."""
-
-    tables: Mapping[Corpus, ClipSignatures]
-    rng: np.random.Generator
-    scored: dict[tuple[str, ...], _Scored | None] = field(default_factory=dict)
-
-    def row(self, question: _Question) -> SignatureRow:
-        """Answer a question; without a value where a corpus is missing or too small."""
-        names = list(dict.fromkeys((question.train, question.test)))
-        missing = [name for name in names if name not in self.tables]
-        known = [name if missing else self.tables[name].name for name in names]
-        row = SignatureRow(question.name, " -> ".join(known), question.figure, None, paper=question.paper)
-        if missing:
-            return replace(row, note=NOWHERE if question.kind == ELECTRIC else command(*names))
-        scored = self._scores(question)
-        if scored is None:
-            return replace(row, note=TOO_FEW)
-        measure, scores = FIGURES[row.figure], scored.of(question.kind)
-        value = measure(scores)
-        if np.isnan(value):
-            return replace(row, note=f"no clip of {question.kind}")
-        low, high = interval(measure, scores, self.rng)
-        worst = scores.worst_site if measure is area else None
-        note = scored.split + (f"; worst site {worst[0]} {worst[1]:.3f}" if worst else "")
-        return replace(row, value=value, low=low, high=high, n_clips=len(scores.score), note=note)
-
-    def _scores(self, question: _Question) -> _Scored | None:
-        key = question.by, question.train, question.test, question.microphone
-        if key not in self.scored:
-            # Vehicles and quiet road users of a corpus are scored by one and the same model.
-            self.scored[key] = self._new_scores(question)
-        return self.scored[key]
-
-    def _new_scores(self, question: _Question) -> _Scored | None:
-        train, test = self.tables[question.train], self.tables[question.test]
-        if question.microphone:
-            train = train.select(train.microphones == question.microphone)
-        if not enough(train):
-            return None
-        if question.microphone:
-            return _Scored(*held_out(train, question.by, self.rng))
-        return _Scored(test, transferred(train, test, question.by), f"learned on all of {train.name}")
+def _scored(
+    question: _Question, tables: Mapping[Corpus, ClipSignatures], rng: np.random.Generator
+) -> _Scored | None:
+    """Return the scores of a question's clips, None where a corpus is missing or too small."""
+    train, test = tables.get(question.train), tables.get(question.test)
+    if train is None or test is None:
+        return None
+    if question.microphone:
+        train = train.select(train.microphones == question.microphone)
+    if not enough(train):
+        return None
+    if question.microphone:
+        return _Scored(*held_out(train, question.by, rng))
+    return _Scored(test, transferred(train, test, question.by), f"learned on all of {train.name}")
 
 
 def _range_rows(table: ClipSignatures | None, by: By, rng: np.random.Generator) -> list[SignatureRow]:

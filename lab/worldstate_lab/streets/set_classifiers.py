@@ -37,8 +37,8 @@ from .window_measures import (
 )
 
 
-def two_sample_areas(one: FeatureTable, other: FeatureTable, rng: np.random.Generator) -> dict[str, float]:
-    """Return the areas of a boosted classifier on descriptors and log features, for all and by class."""
+def two_sample_area(one: FeatureTable, other: FeatureTable, rng: np.random.Generator) -> float:
+    """Return the area of a boosted classifier on descriptors and log features that tells two sets apart."""
     # By recording: the hidden and the front window of one vehicle are alike.
     folds = [folds_by_recording(table, rng) for table in (one, other)]
     inputs = np.concatenate([_inputs(table.features) for table in (one, other)])
@@ -52,12 +52,7 @@ def two_sample_areas(one: FeatureTable, other: FeatureTable, rng: np.random.Gene
             # streets were measured with these.
             model = HistGradientBoostingClassifier(max_iter=100, random_state=seed)
             score[test] = model.fit(inputs[~test], origin[~test]).predict_proba(inputs[test])[:, 1]
-    found = {"all": auroc(score, origin) or 0.5}
-    for name in CLASS_GROUPS:
-        chosen = np.concatenate([of_class(table, name) for table in (one, other)])
-        area = auroc(score[chosen], origin[chosen])
-        found |= {} if area is None else {name: area}
-    return found
+    return auroc(score, origin) or 0.5
 
 
 def _inputs(features: FloatArray) -> FloatArray:
@@ -133,17 +128,13 @@ def area_of(score: FloatArray, table: FeatureTable, rows: IndexArray | None = No
 FAR_AZIMUTHS_DEG = AZIMUTHS_DEG[len(AZIMUTHS_DEG) // 2 :]
 
 
-def side_accuracy(
-    train: FeatureTable, test: FeatureTable, *, without_site_mean: bool = False
-) -> dict[str, float]:
+def side_accuracy(train: FeatureTable, test: FeatureTable) -> dict[str, float]:
     """Return how often left is told from right at each junction of `test`, trained on other junctions.
 
     A linear support vector machine on standardised log features and their mirror images. A junction of
     `test` that `train` knows by name is left out of the training.
     """
     levels = [np.log(table.features) for table in (train, test)]
-    if without_site_mean:
-        levels = [one - _site_means(one, table) for one, table in zip(levels, (train, test), strict=True)]
     found = {}
     for site in np.unique(test.environments[test.hazards]):
         # Real on real has to leave the junction out; the others do, so that all learn from as many.
@@ -154,12 +145,6 @@ def side_accuracy(
             told = _told_right(levels[0][learned], right, levels[1][asked])
             found[str(site)] = float((told == (test.labels[asked] == "right")).mean())
     return found
-
-
-def _site_means(levels: FloatArray, table: FeatureTable) -> FloatArray:
-    """Return the mean log feature of each window's junction, shape (n, 60)."""
-    names, which = np.unique(table.environments, return_inverse=True)
-    return np.array([levels[which == i].mean(axis=0) for i in range(len(names))])[which]
 
 
 def _told_right(levels: FloatArray, right: BoolArray, asked: FloatArray) -> FloatArray:
@@ -198,7 +183,7 @@ def odd_profiles(table: FeatureTable) -> dict[str, FloatArray]:
 def position_figures(
     real: FeatureTable, right: FeatureTable, permuted: FeatureTable, rng: np.random.Generator
 ) -> dict[FigureKey, float]:
-    """Return the areas of hidden above empty windows with right and permuted positions, and their difference.
+    """Return what permuted positions take from the area of hidden above empty windows.
 
     By the published classifier trained on the real windows, by the same trained on the right ones of other
     recordings, and by the model that ships.
@@ -209,12 +194,11 @@ def position_figures(
         "published, of simulated": _out_of_fold(right, permuted, rng),
         "shipped model": hazard_statistic(explain(read_model().signature, both), miss_rate=0.0),
     }
-    found: dict[FigureKey, float] = {}
-    for name, score in scores.items():
-        here, there = (area_of(one, right) for one in np.split(score, 2))
-        named = {"right": here, "permuted": there, "loss by permuted": here - there}
-        found |= {(f"{how} positions: {name}", "hidden, none"): area for how, area in named.items()}
-    return found
+    halves = {name: np.split(score, 2) for name, score in scores.items()}
+    return {
+        (f"loss by permuted positions: {name}", "hidden, none"): area_of(here, right) - area_of(there, right)
+        for name, (here, there) in halves.items()
+    }
 
 
 def _out_of_fold(right: FeatureTable, permuted: FeatureTable, rng: np.random.Generator) -> FloatArray:
