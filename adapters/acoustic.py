@@ -44,10 +44,8 @@ from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import OutOfDomainError
+from worldstate.ground import NotUsable, OutOfDomainError, in_range, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement.measurement import (
     Approach,
     Bearing,

@@ -25,9 +25,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import NotUsable
+from worldstate.ground import InvalidArgumentError, NotUsable, in_range
 from worldstate.measurement.measurement import CoEvidenceChannel
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context

@@ -22,9 +22,7 @@ from worldstate.adapters.files.odometry_file import EngineSpeed, OdometryLog, re
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.values import nanoseconds
+from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
 from worldstate.state import Context
 
 from .acoustic_sequence import sequence_of

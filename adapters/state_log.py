@@ -10,9 +10,8 @@ from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.adapters.ros.bag_reader import is_bag
 from worldstate.adapters.ros.state_bag import bag_snapshot_lines
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.serialisation import MOST_CHARACTERS, decode_json
-from worldstate.ground.values import nanoseconds, seconds
 from worldstate.state import WorldState
 
 # A hop: the last decision of a recording ends up to so long before it does.

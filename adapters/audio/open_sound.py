@@ -9,8 +9,7 @@ from typing import BinaryIO, Literal, TypeAlias
 
 import numpy as np
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array
 
 from .sound_file import Audio, AudioSource, check_finite, constant_channels, open_audio

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import convolve, gaussian_filter, sobel
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
 
 from .degradation import LEVELS, degrade, level_of

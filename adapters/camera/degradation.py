@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, ImageArray
 
 from .video import opencv

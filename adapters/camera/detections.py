@@ -10,11 +10,9 @@ from typing import Annotated, Protocol
 import numpy as np
 
 from worldstate.adapters.files.text_file import read_json, read_text, refused_as_file
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
 from worldstate.ground.serialisation import Check, Count, Probability, decode
 from worldstate.ground.typing import FloatArray, ImageArray, IntArray
-from worldstate.ground.values import nanoseconds
 
 MAX_BYTES = 64 << 20
 MAX_FRAMES = 100_000

@@ -13,8 +13,7 @@ from scipy.special import betaincinv
 from worldstate.abduction.absence import MissRateTable, isotonic_grid
 from worldstate.adapters.files.atomic import write_text
 from worldstate.adapters.files.text_file import read_record
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.serialisation import ADDED, Layout, encode
 from worldstate.ground.typing import FloatArray
 

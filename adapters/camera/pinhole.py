@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.adapters.files.text_file import read_record, refused_as_file
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, finite_array, in_range, wrap_angle
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
 
 

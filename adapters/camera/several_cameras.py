@@ -6,8 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import NotUsable, wrap_angle
+from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 from worldstate.measurement.sector import Sector
 

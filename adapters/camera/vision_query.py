@@ -8,9 +8,7 @@ import numpy as np
 
 from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError
-from worldstate.ground.values import NotUsable, nanoseconds, seconds
+from worldstate.ground import InputFileError, NotUsable, in_range, nanoseconds, seconds
 from worldstate.measurement.measurement import Bearing, Look, Side, Sighting
 from worldstate.measurement.sector import WHOLE_SIDES, Sector
 

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.files.atomic import atomic_path
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import decode, decode_json
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
 
 from .log_message import IMAGE_TOPIC, SCENE_TOPIC, SNAPSHOT_TOPIC, SRP_TOPIC, LogMessage, LogSink
 from .scene_messages import CompressedImage, Rgba, SceneItem, SceneUpdate, Xyz

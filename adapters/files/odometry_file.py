@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds
 from worldstate.ground.serialisation import ADDED
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import nanoseconds
 from worldstate.measurement.odometry import EgoPose, Odometry
 
 from .text_file import number, read_rows, refused_as_file

@@ -8,8 +8,7 @@ from typing import Generic, Self, TypeVar
 
 from worldstate.adapters.camera.detections import DetectionFrame, frame_of
 from worldstate.adapters.files.odometry_file import OdometryRecord
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import decode, decode_json
 from worldstate.measurement.odometry import Odometry
 

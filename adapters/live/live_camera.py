@@ -16,9 +16,8 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.video import opencv
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.source import Source
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
 from worldstate.ground.typing import ImageArray
-from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing, Look, Side, Sighting
 
 from .bounded_channel import BoundedChannel

@@ -12,9 +12,8 @@ import soundfile
 
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.files.atomic import atomic_path
-from worldstate.ground.errors import InputFileError
+from worldstate.ground import InputFileError, nanoseconds
 from worldstate.ground.typing import Float32Array
-from worldstate.ground.values import nanoseconds
 
 from .bounded_channel import BoundedChannel
 

@@ -20,9 +20,8 @@ from worldstate.adapters.camera.detections import (
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, seconds
 from worldstate.ground.typing import Float32Array
-from worldstate.ground.values import seconds
 from worldstate.measurement.odometry import Odometry
 
 from .bag_reader import BagReader, open_bag

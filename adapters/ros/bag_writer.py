@@ -14,8 +14,7 @@ from worldstate.adapters.files.atomic import atomic_path, check_target
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.files.text_file import read_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import InputFileError
-from worldstate.ground.values import nanoseconds
+from worldstate.ground import InputFileError, nanoseconds
 from worldstate.measurement.odometry import Odometry
 
 from .message_types import ARRAY, AUDIO, DETECTIONS, ODOMETRY, header, message, typestore

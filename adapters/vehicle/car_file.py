@@ -13,8 +13,7 @@ from worldstate.adapters.files.array_file import checked_array, read_array
 from worldstate.adapters.files.atomic import write_text
 from worldstate.adapters.files.text_file import read_json, read_record, refused_as_file
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.serialisation import ADDED, decode
 
 from .mounting import Mounting

@@ -19,9 +19,8 @@ from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.adapters.source import Source
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, wrap_angle
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import wrap_angle
 from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
 from worldstate.operations.recordings.bearing_track import track_bearings
 from worldstate.operations.recordings.hop_table import HopTable

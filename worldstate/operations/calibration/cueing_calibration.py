@@ -18,8 +18,7 @@ from worldstate.abduction.cueing.thresholds import (
     neyman_pearson_threshold,
     recordings_needed,
 )
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, caution, poisson_interval
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable

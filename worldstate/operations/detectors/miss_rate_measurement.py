@@ -14,8 +14,7 @@ from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, Video
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.measurement.sector import Sector
 from worldstate.operations.figure_style import figure_file, legend_beside

@@ -17,9 +17,8 @@ from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listen import measure_steps
 from worldstate.adapters.source import Source
 from worldstate.adapters.source_files import open_source
-from worldstate.ground.errors import OutOfDomainError
+from worldstate.ground import NotUsable, OutOfDomainError, seconds
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable, seconds
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_looks, with_pass
 
 from .box_tracks import BoxTrack, box_tracks

@@ -10,10 +10,9 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.adapters.files.npz_file import load_npz, save_npz
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, seconds
 from worldstate.ground.checks import check_shape, finite_array
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray
-from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.metrics.approach_table import SLACK_S
 

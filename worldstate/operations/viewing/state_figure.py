@@ -13,9 +13,8 @@ from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.errors import InputFileError
+from worldstate.ground import InputFileError, seconds
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
 from worldstate.operations.figure_style import (
     BLUE,
     GREEN,
