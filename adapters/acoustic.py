@@ -35,7 +35,7 @@ from worldstate.abduction.signature.domain_guard import (
     neutral,
 )
 from worldstate.abduction.signature.model_domain import ModelDomain
-from worldstate.adapters.camera.several_cameras import SeveralCameras
+from worldstate.adapters.camera.vision_query import SeveralCameras
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability

@@ -1,12 +1,23 @@
-"""Entities at places: as measured, or in the crossing lane where only their azimuth is known."""
+"""Entities at places as other stacks have them: Autoware's `PredictedObjects` and ASAM OSI `SensorData`.
+
+A place is as measured, or in the crossing lane where only the azimuth is known.
+"""
 
 import math
-from collections.abc import Iterator
+import struct
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import seconds
 from worldstate.state import Entity, WorldState
 
 # Real vehicles of OVAD pass some 9 m ahead of the ego; another junction has another distance.
@@ -84,3 +95,168 @@ def _assumed(entity: Entity, crossing_m: float, pace_hz: float, confidence: floa
     else:
         velocity = (entity.azimuth_rate_rad_s or 0.0) * turned
     return LaneObject(entity, position, velocity, covariance, False, confidence)
+
+
+# Of autoware_perception_msgs/ObjectClassification; a tram is none of them.
+LABELS = {"unknown": 0, "car": 1, "van": 1, "truck": 2, "bus": 3, "motorcycle": 5, "bicycle": 6, "person": 7}
+# Length, width and height of a usual one, metres.
+SIZES_M = {
+    2: (8.0, 2.5, 3.2),
+    3: (12.0, 2.5, 3.2),
+    5: (2.2, 0.8, 1.4),
+    6: (1.8, 0.6, 1.6),
+    7: (0.5, 0.5, 1.8),
+}
+CAR_M = (4.5, 1.8, 1.5)
+# Of what the message asks for and nobody measured: "unknown" as Autoware's trackers state it.
+_UNKNOWN_VARIANCE = 1e4
+
+
+def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[str, Any]:
+    """Return the message; hidden entities stand in the occluded lane, see `lane_objects`.
+
+    Examples
+    --------
+    >>> autoware_objects(WorldState(1_500_000_000, 0))
+    {'header': {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'base_link'}, 'objects': []}
+    """
+    sec, nanosec = divmod(state.stamp_ns, 1_000_000_000)
+    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": state.frame_id}
+    return {"header": header, "objects": [_object(one) for one in lane_objects(state, crossing_m)]}
+
+
+def likeliest_label(one: LaneObject) -> int:
+    """Return Autoware's number of the likeliest known class, 0 where none is known."""
+    known = [said for said in one.entity.classification if LABELS.get(said.label, 0)]
+    return LABELS[max(known, key=lambda said: said.probability).label] if known else 0
+
+
+def _object(one: LaneObject) -> dict[str, Any]:
+    speed = float(np.hypot(*one.velocity_mps))
+    pose = {"pose": _pose(one.position_m, one.yaw_rad), "covariance": _covariance(one.covariance)}
+    twist = {"linear": _xyz(speed, 0.0), "angular": _xyz(0.0, 0.0)}  # in the axes of the object
+    still = {"linear": _xyz(0.0, 0.0), "angular": _xyz(0.0, 0.0)}
+    unknown = _covariance(np.diag([_UNKNOWN_VARIANCE] * 2))
+    path = {
+        "path": [_pose(point, one.yaw_rad) for point in one.path_m()],
+        "time_step": {"sec": int(PATH_STEP_S), "nanosec": int(PATH_STEP_S % 1.0 * 1e9)},
+        "confidence": one.confidence,
+    }
+    length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
+    return {
+        "object_id": {"uuid": list(uuid.UUID(one.entity.id).bytes)},
+        "existence_probability": one.entity.existence_probability,
+        "classification": [
+            {"label": LABELS.get(said.label, 0), "probability": said.probability}
+            for said in one.entity.classification
+        ],
+        "kinematics": {
+            "initial_pose_with_covariance": pose,
+            "initial_twist_with_covariance": {"twist": twist, "covariance": unknown},
+            "initial_acceleration_with_covariance": {"accel": still, "covariance": unknown},
+            "predicted_paths": [path],
+        },
+        "shape": {
+            "type": 0,  # a bounding box
+            "footprint": {"points": []},
+            "dimensions": {"x": length, "y": width, "z": height},
+        },
+    }
+
+
+def _pose(position_m: FloatArray, yaw_rad: float) -> dict[str, Any]:
+    half = 0.5 * yaw_rad
+    turned = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
+    return {"position": _xyz(*position_m.tolist()), "orientation": turned}
+
+
+def _xyz(x: float, y: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": 0.0}
+
+
+def _covariance(of_xy: FloatArray) -> list[float]:
+    """Return the 6 x 6 of x, y, z and three angles, row by row; what is not known has a large variance."""
+    whole = _UNKNOWN_VARIANCE * np.eye(6)
+    whole[:2, :2] = of_xy
+    return [float(value) for value in whole.ravel()]
+
+
+# Of osi3.MovingObject.VehicleClassification, by Autoware's numbers; a person has another type.
+_VEHICLES = {1: "TYPE_CAR", 2: "TYPE_HEAVY_TRUCK", 3: "TYPE_BUS", 5: "TYPE_MOTORBIKE", 6: "TYPE_BICYCLE"}
+_PERSON = 7
+
+
+def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
+    """Return the snapshot as an `osi3` message: hidden entities are predicted, others measured.
+
+    Examples
+    --------
+    >>> osi_sensor_data(WorldState(1_500_000_000, 7)).moving_object_header.cycle_counter
+    7
+    """
+    described, data = optional("osi3.osi_version_pb2"), optional("osi3.osi_sensordata_pb2").SensorData()
+    version = described.DESCRIPTOR.GetOptions().Extensions[described.current_interface_version]
+    data.version.CopyFrom(version)
+    for stamp in (data.timestamp, data.last_measurement_time, data.moving_object_header.measurement_time):
+        stamp.seconds, stamp.nanos = divmod(state.stamp_ns, 1_000_000_000)
+    data.sensor_id.value = 1
+    # The axes of the state are those of the vehicle: a virtual sensor at their origin.
+    data.mounting_position.position.x = data.mounting_position.position.y = 0.0
+    header = data.moving_object_header
+    header.cycle_counter = state.seq
+    impaired = any(sensor.condition != "working" for sensor in state.sensors)
+    header.data_qualifier = (
+        header.DATA_QUALIFIER_AVAILABLE_REDUCED if impaired else header.DATA_QUALIFIER_AVAILABLE
+    )
+    for one in lane_objects(state, crossing_m):
+        _fill(data.moving_object.add(), one)
+    return data
+
+
+@contextmanager
+def osi_trace(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
+    """Lend a function that writes states to a single-channel trace: length, little endian, and message."""
+    check_extra("osi3")
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+
+        def write(state: WorldState) -> None:
+            message = osi_sensor_data(state, crossing_m).SerializeToString()
+            file.write(struct.pack("<I", len(message)) + message)
+
+        yield write
+
+
+def _fill(moving: Any, one: LaneObject) -> None:
+    entity = one.entity
+    header = moving.header
+    # OSI counts in 64 bits, of which the highest marks a value that is not set.
+    header.tracking_id.value = uuid.UUID(entity.id).int & (1 << 63) - 1
+    header.existence_probability = entity.existence_probability
+    header.age = seconds(entity.updated_ns - entity.created_ns)
+    predicted = entity.status == "hidden" or not one.measured
+    header.measurement_state = (
+        header.MEASUREMENT_STATE_PREDICTED if predicted else header.MEASUREMENT_STATE_MEASURED
+    )
+    base, spread = moving.base, one.covariance.diagonal() ** 0.5
+    base.position.x, base.position.y = one.position_m.tolist()
+    base.velocity.x, base.velocity.y = one.velocity_mps.tolist()
+    base.position.z = base.velocity.z = 0.0  # A vector has three values, or is not set
+    base.orientation.yaw = one.yaw_rad
+    moving.base_rmse.position.x, moving.base_rmse.position.y = spread.tolist()
+    size = base.dimension
+    size.length, size.width, size.height = SIZES_M.get(likeliest_label(one), CAR_M)
+    moving.movement_state = moving.MOVEMENT_STATE_MOVING
+    kinds = optional("osi3.osi_object_pb2").MovingObject
+    for said in entity.classification:
+        number, candidate = LABELS.get(said.label, 0), moving.candidate.add()
+        candidate.probability = said.probability
+        candidate.type = (
+            kinds.TYPE_PEDESTRIAN
+            if number == _PERSON
+            else kinds.TYPE_VEHICLE
+            if number
+            else kinds.TYPE_UNKNOWN
+        )
+        if number in _VEHICLES:
+            name = _VEHICLES[number]
+            candidate.vehicle_classification.type = getattr(kinds.VehicleClassification, name)

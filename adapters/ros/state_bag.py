@@ -5,8 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from worldstate.adapters.export.autoware import autoware_objects
-from worldstate.adapters.export.lane_objects import CROSSING_M
+from worldstate.adapters.export.lane_objects import CROSSING_M, autoware_objects
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.export.scene_messages import SceneItem
 from worldstate.ground.serialisation import encode

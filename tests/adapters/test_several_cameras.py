@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from worldstate import Bearing, NotUsable, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.several_cameras import SeveralCameras
-from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
 
 NOW, COARSE = 1_000_000_000, NotUsable("coarse")
 EMPTY = DetectionFrame(np.empty((0, 4)), np.empty(0), ())

@@ -161,7 +161,7 @@ def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> 
 
 def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
     from worldstate.adapters.audio.open_sound import open_sound
-    from worldstate.adapters.live.playback import Playback
+    from worldstate.adapters.live.microphones import Playback
 
     audio = open_sound(recorded.sound, recorded.array.n_microphones, strict=False)
     return Playback(audio, arguments.speed, arguments.duration)

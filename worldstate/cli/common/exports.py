@@ -128,7 +128,7 @@ def _websocket(port: str, *, paced: bool) -> "Iterator[LogSink]":
 
 def _stack(name: str, target: str, crossing_m: float) -> "Stack":
     if name == "osi":
-        from worldstate.adapters.export.osi import osi_trace
+        from worldstate.adapters.export.lane_objects import osi_trace
 
         return osi_trace(Path(target), crossing_m)
     if name == "autoware":
@@ -149,7 +149,7 @@ def _stack(name: str, target: str, crossing_m: float) -> "Stack":
 
 @contextmanager
 def _autoware_lines(path: Path, crossing_m: float) -> "Iterator[Callable[[WorldState], object]]":
-    from worldstate.adapters.export.autoware import autoware_objects
+    from worldstate.adapters.export.lane_objects import autoware_objects
     from worldstate.adapters.state_log import states_writer
 
     with states_writer(path) as write:

@@ -7,8 +7,7 @@ from pathlib import Path
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, read_any_detections
 from worldstate.adapters.camera.miss_rates import load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.several_cameras import SeveralCameras
-from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
 from worldstate.adapters.source import Source
 from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
 from worldstate.ground.errors import InvalidArgumentError
