@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
-from worldstate_lab.cli.place import followed_places
-from worldstate_lab.places.junctions import WALLS, place_models, simulated_pass
+from worldstate_lab.cli.place import WALLS, followed_places, place_models, simulated_pass
 from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter, PlaceMeasurements
 from worldstate_lab.places.spectrum_model import SpectrumModel, StreetWalls, sound_paths
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worldstate_lab.cli.main import main
+from worldstate_lab.cli.main import keep_results, main, read_results
 from worldstate_lab.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
 from worldstate_lab.degradation.beta_curves import Band, BetaCurves
 from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, Condition
@@ -33,7 +33,6 @@ from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.line_of_sight import VisionOnly
 from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.report.pages import Document, Section, html_page, markdown_page, write_document
-from worldstate_lab.report.results import keep_results, read_results
 from worldstate_lab.report.table import Figure, Table, Value
 from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 from worldstate_lab.trials.takes import Take, TakeList

@@ -34,8 +34,6 @@ ARRIVALS_HZ, DEPARTURES_HZ = 0.1, 0.01
 # An axle is heard, and the middle of the vehicle is meant: half a wheelbase of 2.7 m, and some.
 EXTENT_STD_M = 1.0
 STATED_STD_M = 5.0
-# In limits of sight: at twice that, a vehicle at 4 m/s comes into view within a second or two.
-NEAR = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +46,14 @@ class PlaceEstimate:
         Of the place along the street, left positive.
     interval_m : (float, float)
         From the 5 % to the 95 % quantile.
-    left_probability, near_probability, hidden_probability : float
-        That it is left of the ego's axis; that it is in view or about to be; that a corner hides it.
+    left_probability : float
+        That it is left of the ego's axis.
     existence_probability : float
         That there is a vehicle.
 
     Examples
     --------
-    >>> PlaceEstimate(7.2, 1.4, (5.0, 9.5), 1.0, 0.9, 0.98, 0.99).stated
+    >>> PlaceEstimate(7.2, 1.4, (5.0, 9.5), 1.0, 0.99).stated
     True
     """
 
@@ -63,13 +61,11 @@ class PlaceEstimate:
     std_m: float
     interval_m: tuple[float, float]
     left_probability: float
-    near_probability: float
-    hidden_probability: float
     existence_probability: float
 
     @property
     def stated(self) -> bool:
-        """Whether a place can be stated; otherwise only the side, and whether the vehicle is near."""
+        """Whether a place can be stated; otherwise only the side."""
         return self.std_m < STATED_STD_M
 
 
@@ -151,7 +147,7 @@ class PlaceFilter:
 
     def estimate(self, belief: PlaceBelief) -> PlaceEstimate:
         """Return what can be said of the middle of the vehicle."""
-        along, (right, left) = self.model.along_m, self.model.walls.sight_m
+        along = self.model.along_m
         heard = belief.of_places
         shares = np.convolve(heard, _extent(), mode="same")
         shares = shares / shares.sum()
@@ -159,11 +155,8 @@ class PlaceFilter:
         std = float(np.sqrt(shares @ (along - mean) ** 2))
         ends = np.interp((0.05, 0.95), shares.cumsum(), along + 0.5 * STEP_M).tolist()
         on_left = float(heard[along > 0.0].sum() + 0.5 * heard[along == 0.0].sum())
-        near = float(heard[(along > NEAR * right) & (along < NEAR * left)].sum())
-        hidden = float(heard[(along < right) | (along > left)].sum())
         exists = 1.0 - min(float(np.exp(belief.log_empty)), 1.0)
-        on_left, near, hidden = (min(chance, 1.0) for chance in (on_left, near, hidden))
-        return PlaceEstimate(mean, std, (ends[0], ends[1]), on_left, near, hidden, exists)
+        return PlaceEstimate(mean, std, (ends[0], ends[1]), min(on_left, 1.0), exists)
 
 
 @lru_cache(maxsize=4)
