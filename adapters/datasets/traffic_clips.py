@@ -1,10 +1,14 @@
-"""Two-second clips of roadside traffic corpora: where each lies and what is known of it."""
+"""Two-second clips of roadside traffic, of IDMT-Traffic and of MELAUDIS: where each lies, and its labels."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.files.text_file import read_text
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array
 
@@ -44,14 +48,171 @@ def read_clip(clip: TrafficClip) -> tuple[Float32Array, float]:
         return source.span(start, min(round(CLIP_S * rate), source.frames - start)), float(rate)
 
 
-def refuse_missing(root: Path, corpus: str, missing: Sequence[str]) -> None:
+def _refuse_missing(root: Path, corpus: str, missing: Sequence[str]) -> None:
     """Refuse a folder that lacks something, with a list of it; none missing is fine."""
     if missing:
         more = f" and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
         raise InputFileError(root, f"expected {corpus}; missing: {', '.join(missing[:_NAMED])}{more}")
 
 
-def check_number(root: Path, clips: Sequence[object]) -> None:
+def _check_number(root: Path, clips: Sequence[object]) -> None:
     """Refuse more clips than any of these corpora has."""
     if len(clips) > MAX_CLIPS:
         raise InputFileError(root, f"expected at most {MAX_CLIPS} clips, got {len(clips)}")
+
+
+ALL_NAME = "idmt_traffic_all.txt"
+SPLIT_NAMES = {"train": "eusipco_2021_train.txt", "test": "eusipco_2021_test.txt"}
+VEHICLES = {"B": "bus", "C": "car", "M": "motorcycle", "T": "truck"}
+MICROPHONES = {"SE": "studio", "ME": "mems"}
+_MAX_BYTES = 16 << 20
+_IDMT_NAME = re.compile(
+    r"(?P<stamp>\d{4}(?:-\d{2}){4})_(?P<site>[\w.-]+?)_(?P<limit>\d+|unknown)Kmh_(?P<middle>\d+)"
+    r"(?:_[MA]_[DW]_(?P<vehicle>[BCMT])[LR])?_(?P<microphone>SE|ME)_CH\d+(?P<background>-BG)?",
+    re.ASCII,
+)
+
+
+def idmt_traffic(root: str | Path) -> list[TrafficClip]:
+    """List the clips of the data set; refuse a folder that lacks a list or any of the sound that it names.
+
+    IDMT-Traffic: passing vehicles at four roads, recorded with studio and with MEMS microphones.
+
+    J. Abesser et al., "IDMT-Traffic: An open benchmark dataset for acoustic traffic monitoring research",
+    EUSIPCO 2021; doi:10.5281/zenodo.7551553. The layout is that of its readme and of its import script,
+    ``annotation/import_idmt_traffic_dataset.py``::
+
+        <root>/annotation/idmt_traffic_all.txt      one file name a line, 17,506 of them
+        <root>/annotation/eusipco_2021_train.txt    the official split
+        <root>/annotation/eusipco_2021_test.txt
+        <root>/audio/<name>.wav                     2 s, two channels, 48 kHz
+
+    A name holds date and time, location, speed limit, middle of the clip in samples of its recording, time of
+    day (M, A), road (D dry, W wet), vehicle (B bus, C car, M motorcycle, T truck) with the side that it comes
+    from (L, R), microphone (SE sE8 studio, ME ICS-43434 MEMS) and channel pair::
+
+        2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_1272258_M_D_CR_ME_CH12.wav
+        2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_10077440_SE_CH34-BG.wav       without a vehicle
+    """
+    folder = Path(root)
+    lists = (ALL_NAME, *SPLIT_NAMES.values())
+    missing = [f"annotation/{name}" for name in lists if not (folder / "annotation" / name).is_file()]
+    _refuse_missing(folder, "IDMT-Traffic (audio/*.wav and annotation/*.txt)", missing)
+    names = _names(folder / "annotation" / ALL_NAME)
+    _check_number(folder, names)
+    # One look into the folder: 17,506 questions to a network disk take minutes.
+    there = {path.name for path in (folder / "audio").glob("*.wav")}
+    missing = [f"audio/{name}" for name in names if name not in there]
+    _refuse_missing(folder, f"the {len(names)} clips of annotation/{ALL_NAME}", missing)
+    splits = {
+        name: part for part, file in SPLIT_NAMES.items() for name in _names(folder / "annotation" / file)
+    }
+    return [
+        TrafficClip(folder / "audio" / name, _idmt_labels(folder, name, splits.get(name, "")))
+        for name in names
+    ]
+
+
+def _names(path: Path) -> list[str]:
+    """Return the file names of a list; its lines may lack the suffix."""
+    lines = read_text(path, "a list of file names", _MAX_BYTES).splitlines()
+    names = [line.strip().removesuffix(".wav") + ".wav" for line in lines if line.strip()]
+    if not names:
+        raise InputFileError(path, "expected one file name a line, the list is empty")
+    return names
+
+
+def _idmt_labels(folder: Path, name: str, split: str) -> ClipLabels:
+    found = _IDMT_NAME.fullmatch(name.removesuffix(".wav"))
+    # A clip is either of a vehicle or of the background; a name that says both or neither is no label.
+    if found is None or (found["vehicle"] is None) == (found["background"] is None):
+        problem = f"expected a name such as ..._30Kmh_1272258_M_D_CR_ME_CH12.wav, got {name[:100]!r}"
+        raise InputFileError(folder / "annotation" / ALL_NAME, problem)
+    kind = BACKGROUND if found["vehicle"] is None else VEHICLES[found["vehicle"]]
+    # Both microphones heard the same passage: they share a recording, so that no fold parts them.
+    recording = f"{found['stamp']}_{found['site']}_{found['limit']}"
+    return ClipLabels(kind, MICROPHONES[found["microphone"]], recording, found["site"], split)
+
+
+VEHICLES_NAME, BACKGROUND_NAME = "MELAUDIS_Vehicles", "MELAUDIS_BG"
+KINDS = {"Car": "car", "Truck": "truck", "Bus": "bus", "MC": "motorcycle", "Tram": "tram", "Bic": "bicycle"}
+# Neighbouring clips of a long recording say the same; so many of them, evenly apart, tell its spread.
+CLIPS_A_FILE = 20
+# Minutes of 60 to 62 occur: the time is not read as one.
+_WHERE = r"(?P<date>\d{4}-\d{2}-\d{2})_\d+-\d+-[\d.]+-(?P<place>[A-Za-z]+)(?P<spot>\d*[A-Za-z]?)"
+_MELAUDIS_NAME = re.compile(
+    _WHERE + r"_(?P<state>[A-Z]+)_(?P<what>NoV|\dV-\w+?)(?:_\w+)?_(?:mono|stereo)",
+    re.ASCII,
+)
+# A stray file does no harm; many are a release with other names, of which a part would be used unsaid.
+_MOST_UNREAD = 0.01
+_BEGINNING = re.compile(_WHERE + r"(?![A-Za-z\d])", re.ASCII)
+
+
+def melaudis(root: str | Path) -> list[TrafficClip]:
+    """List the clips of one vehicle in free flow and those of the background; refuse a partial folder.
+
+    MELAUDIS: vehicles in the streets of Melbourne, recorded with phones on the pavement.
+
+    H. Parineh, M. Sarvi, S. A. Bagloee, "MELAUDIS: A large-scale benchmark acoustic dataset for intelligent
+    transportation systems research", Scientific Data 12, 362, 2025; doi:10.6084/m9.figshare.27115870, two
+    archives that unpack to::
+
+        <root>/MELAUDIS_Vehicles/**/<name>.wav    two seconds around a passage, 13,668 of them
+        <root>/MELAUDIS_BG/**/<name>.wav          without a vehicle
+
+    The data descriptor ("Data Features") says what the name of a vehicle clip holds: date, time and place,
+    state of the traffic (FF free flow, TJN and TJF jams), number and kind of vehicles, lanes, direction, and
+    mono or stereo, which tells the two models of phone apart::
+
+        2024-02-09_13-0-1.8-Fitzroy1_FF_1V-Car_2Lanes_LR_stereo.wav
+
+    Only free flow with one vehicle is used (1V-Car, -Truck, -Bus, -MC, -Tram, -Bic), and NoV as background.
+    How the files of MELAUDIS_BG are named is not documented: any WAV there is background, cut into clips
+    where it is longer, of the day and place with which its name begins, else a recording of its own.
+    """
+    folder = Path(root)
+    found = {name: sorted((folder / name).rglob("*.wav")) for name in (VEHICLES_NAME, BACKGROUND_NAME)}
+    missing = [f"{name}/**/*.wav" for name, files in found.items() if not files]
+    _refuse_missing(folder, "MELAUDIS (both archives unpacked side by side)", missing)
+    _check_number(folder, found[VEHICLES_NAME] + found[BACKGROUND_NAME])
+    vehicles = [(path, _MELAUDIS_NAME.fullmatch(path.stem)) for path in found[VEHICLES_NAME]]
+    unread = [path.name for path, name in vehicles if name is None]
+    if len(unread) > _MOST_UNREAD * len(vehicles):
+        example = "2024-02-09_13-0-1.8-Fitzroy1_FF_1V-Car_2Lanes_LR_stereo.wav"
+        got = f"{len(unread)} of {len(vehicles)} others, the first {unread[0][:100]!r}"
+        raise InputFileError(folder / VEHICLES_NAME, f"expected names such as {example}, got {got}")
+    clips = [clip for path, name in vehicles if name is not None for clip in _vehicle_clips(path, name)]
+    return clips + [clip for path in found[BACKGROUND_NAME] for clip in _background_clips(folder, path)]
+
+
+def _vehicle_clips(path: Path, found: re.Match[str]) -> list[TrafficClip]:
+    """Return the clip of a file; none where it holds a jam or several vehicles."""
+    single = KINDS.get(found["what"].removeprefix("1V-"))
+    kind = BACKGROUND if found["what"] == "NoV" else single
+    if kind is None or found["state"] != "FF":
+        return []
+    return [TrafficClip(path, _melaudis_labels(kind, found))]
+
+
+def _melaudis_labels(kind: str, found: re.Match[str]) -> ClipLabels:
+    # Start and end of the original recordings are not published. A day at a spot is the least that shares
+    # its background, so what is learned on one clip of it is not tested on the next.
+    return ClipLabels(kind, "phone", f"{found['date']}_{found['place']}{found['spot']}", found["place"])
+
+
+def _background_clips(root: Path, path: Path) -> list[TrafficClip]:
+    try:
+        with open_audio(path, strict=False) as source:
+            last_s = max(source.duration_s - CLIP_S, 0.0)
+    except InputFileError:
+        return [TrafficClip(path, _background(root, path))]  # which is reported when it is read
+    starts = np.linspace(0.0, last_s, min(int(last_s // CLIP_S) + 1, CLIPS_A_FILE))
+    return [TrafficClip(path, _background(root, path), start_s) for start_s in starts.tolist()]
+
+
+def _background(root: Path, path: Path) -> ClipLabels:
+    found = _BEGINNING.match(path.stem)
+    if found is not None:
+        return _melaudis_labels(BACKGROUND, found)
+    return ClipLabels(BACKGROUND, "phone", path.relative_to(root).with_suffix("").as_posix(), "")

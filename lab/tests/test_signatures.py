@@ -27,8 +27,7 @@ from worldstate_lab.signatures.simulated_corpora import (
 )
 from worldstate_lab.trials.pass_cache import PassCache
 
-from worldstate.adapters.datasets.melaudis import KINDS
-from worldstate.adapters.datasets.traffic_clips import BACKGROUND, ClipLabels
+from worldstate.adapters.datasets.traffic_clips import BACKGROUND, KINDS, ClipLabels
 
 RECORDINGS = {TOWN_ROAD: 4, CITY_STREET: 2}
 

@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.datasets.idmt_traffic import VEHICLES, idmt_traffic
-from worldstate.adapters.datasets.melaudis import CLIPS_A_FILE, KINDS, melaudis
-from worldstate.adapters.datasets.traffic_clips import BACKGROUND, CLIP_S, read_clip
+from worldstate.adapters.datasets.traffic_clips import (
+    BACKGROUND,
+    CLIP_S,
+    CLIPS_A_FILE,
+    KINDS,
+    VEHICLES,
+    idmt_traffic,
+    melaudis,
+    read_clip,
+)
 from worldstate.ground.errors import InputFileError
 
 CAR = "2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_1272258_M_D_CR"

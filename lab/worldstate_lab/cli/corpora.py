@@ -24,9 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.datasets.idmt_traffic import idmt_traffic
-from worldstate.adapters.datasets.melaudis import melaudis
-from worldstate.adapters.datasets.traffic_clips import TrafficClip
+from worldstate.adapters.datasets.traffic_clips import TrafficClip, idmt_traffic, melaudis
 from worldstate.adapters.files.atomic import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
