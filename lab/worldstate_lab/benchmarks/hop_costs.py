@@ -128,7 +128,7 @@ SRP_BAND_HZ, FEATURE_BAND_HZ = [300.0, 1800.0], [50.0, 1500.0]
 
 
 def peer_times(
-    sound: Float32Array, frames: Complex64Array, sample_rate_hz: int, azimuths_rad: FloatArray
+    sound: Float32Array, frames: Complex64Array, azimuths_rad: FloatArray
 ) -> dict[str, Milliseconds]:
     """Return milliseconds per hop of each peer, keys beginning with ``peer_``; empty where none is installed.
 
@@ -142,12 +142,12 @@ def peer_times(
     spectra = np.ascontiguousarray(frames.transpose(2, 1, 0))
 
     def on_a_tenth(method: Any) -> Milliseconds:
-        peer = method(positions, sample_rate_hz, NFFT, azimuth=azimuths_rad)
+        peer = method(positions, RATE_HZ, NFFT, azimuth=azimuths_rad)
         locate = partial(peer.locate_sources, spectra, freq_range=SRP_BAND_HZ)
         return [elapsed_ms(locate) for _ in range(REPEATS)]
 
-    file_ms, halves_ms, second_ms = _published_chain(sound, sample_rate_hz, pyroomacoustics.doa.SRP)
-    shared_ms = 0.1 * file_ms * sample_rate_hz / len(sound)
+    file_ms, halves_ms, second_ms = _published_chain(sound, pyroomacoustics.doa.SRP)
+    shared_ms = 0.1 * file_ms * RATE_HZ / len(sound)
     return {
         "peer_pyroomacoustics_srp": on_a_tenth(pyroomacoustics.doa.SRP),
         "peer_pyroomacoustics_music": on_a_tenth(pyroomacoustics.doa.MUSIC),
@@ -156,20 +156,18 @@ def peer_times(
     }
 
 
-def _published_chain(
-    sound: Float32Array, sample_rate_hz: int, method: Any
-) -> tuple[float, Milliseconds, float]:
+def _published_chain(sound: Float32Array, method: Any) -> tuple[float, Milliseconds, float]:
     """Return the STFT of the file, SRP of two half seconds several times, and the STFT of one second."""
     from scipy.signal import stft
 
     def transform(part: Float32Array) -> list[Any]:
-        return [stft(channel, sample_rate_hz, nperseg=NFFT)[2] for channel in part.T]
+        return [stft(channel, RATE_HZ, nperseg=NFFT)[2] for channel in part.T]
 
     file_ms = elapsed_ms(lambda: transform(sound))
-    second_ms = elapsed_ms(lambda: transform(sound[:sample_rate_hz]))
-    second = np.stack(transform(sound[:sample_rate_hz]))
+    second_ms = elapsed_ms(lambda: transform(sound[:RATE_HZ]))
+    second = np.stack(transform(sound[:RATE_HZ]))
     azimuths = np.radians(np.linspace(-90.0, 90.0, 30))
-    peer = method(roof_array_56().positions_m.T, sample_rate_hz, NFFT, azimuth=azimuths)
+    peer = method(roof_array_56().positions_m.T, RATE_HZ, NFFT, azimuth=azimuths)
     half = second.shape[2] // 2
 
     def one_hop() -> None:

@@ -33,7 +33,6 @@ from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import BLUE, RED, figure_file
-from worldstate.simulation.scene.presets import DEFAULT_PRESET, preset
 from worldstate_lab.streets.realism import Realism, measure_realism, realism_lines
 from worldstate_lab.streets.set_classifiers import FAR_AZIMUTHS_DEG
 from worldstate_lab.streets.simulated_windows import simulated_window_pair
@@ -139,7 +138,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("features", type=Path, metavar="FEATURES.csv", help="real windows")
     add_choice(parser, "--group", "windows of a standing or a moving ego", "static", "dynamic")
     add("--sites", nargs="+", metavar="SITE", help="only these junctions (default: all of the table)")
-    add("--preset", metavar="NAME", help="levels of the simulation (default: the newest)")
     add("--simulated", type=Path, nargs="+", metavar="CSV", help="simulated windows, instead of simulating")
     add("--permuted", type=Path, nargs="+", metavar="CSV", help="the same windows, positions permuted")
     add("--measures-only", action="store_true", help="no classifier: what streets are tuned on (a second)")
@@ -195,12 +193,11 @@ def _simulated(arguments: argparse.Namespace, real: FeatureTable) -> dict[str, P
         }
     # A moving ego's junctions come as they are in the table; a site that it lacks has nothing to be held to.
     sites = sorted(set(real.environments.tolist()))
-    levels = preset(arguments.preset or DEFAULT_PRESET)
     found: dict[str, Pair] = {}
     with progress_bar("simulating windows", 4 * WINDOWS * len(sites) * len(SEEDS)) as bar:
         for seed in SEEDS:
             pair = simulated_window_pair(
-                WINDOWS, seed, sites=sites, jobs=arguments.jobs, levels=levels, progress=bar.advance
+                WINDOWS, seed, sites=sites, jobs=arguments.jobs, progress=bar.advance
             )
             found[f"seed {seed}"] = pair
             if arguments.out is not None:

@@ -93,7 +93,7 @@ def second_half_area(table: FeatureTable) -> float | None:
 
 
 def _spreads(features: FloatArray) -> dict[str, float]:
-    named = {f"median of {name}": np.median(values) for name, values in describe_windows(features).items()}
+    named: dict[str, float] = {}
     for name, values in spread_values(features).items():
         said = name if name.endswith("deg") else f"log {name}"
         low, high = np.percentile(values, (25.0, 75.0))
@@ -131,13 +131,11 @@ def between_share(values: FloatArray, sites: TextArray) -> float:
 
 
 def _hidden_peaks(hidden: FeatureTable) -> dict[str, float]:
-    """Return how many peaks stand wide, and how many on the vehicle's own side."""
+    """Return how many peaks stand wide."""
     spectrum = hidden.features.reshape(len(hidden), SEGMENTS, -1).mean(axis=1)
-    azimuth = AZIMUTHS_DEG[spectrum.argmax(axis=1)]
-    aside = np.abs(azimuth)
+    aside = np.abs(AZIMUTHS_DEG[spectrum.argmax(axis=1)])
     return {
         "share of peaks at 40 to 65 deg": float(((aside >= WIDE_DEG[0]) & (aside <= WIDE_DEG[1])).mean()),
-        "share of peaks on the own side": float(((azimuth > 0.0) == (hidden.labels == "right")).mean()),
     }
 
 

@@ -129,7 +129,7 @@ def _one_round(street: Float32Array, noise: Float32Array) -> Mapping[str, Millis
     ours |= {name: [elapsed_ms(hop) for hop in calls] for name, calls in whole.items()}
     ours = {name: times[WARM_UP_HOPS:] for name, times in ours.items()}
     ours |= _on_a_tenth(spectra) | evidence_times(heard)
-    return ours | peer_times(street, spectra, RATE_HZ, AZIMUTHS_RAD)
+    return ours | peer_times(street, spectra, AZIMUTHS_RAD)
 
 
 def _hops(sound: Float32Array) -> list[Float32Array]:
