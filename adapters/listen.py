@@ -41,6 +41,7 @@ class Step:
     --------
     >>> import numpy as np
     >>> import soundfile
+    >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
     >>> with TemporaryDirectory() as folder:
@@ -90,6 +91,7 @@ def listen(path: SoundInput | str | Sequence[str], **parts: Unpack[SourceParts])
 
     >>> import numpy as np
     >>> import soundfile
+    >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
     >>> with TemporaryDirectory() as folder:
@@ -124,6 +126,7 @@ def listen_steps(source: Source) -> Iterator[Step]:
     --------
     >>> import numpy as np
     >>> import soundfile
+    >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
     >>> with TemporaryDirectory() as folder:
@@ -186,6 +189,7 @@ def measure_steps(
     --------
     >>> import numpy as np
     >>> import soundfile
+    >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
     >>> with TemporaryDirectory() as folder:
