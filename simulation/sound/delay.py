@@ -23,7 +23,7 @@ ROWS_AT_ONCE = 128
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class SampledSignal:
     """An oversampled emitted signal and when it begins."""
 
     values: Float32Array  # shape (n,): float32
@@ -41,7 +41,7 @@ def emission_times(
     return np.interp(receive_s, emit_s + travel_m / speed_mps, emit_s, left=np.nan, right=np.nan)
 
 
-def add_delayed(out: Float32Array, table: Table, emit_s: FloatArray, gain: FloatArray) -> None:
+def add_delayed(out: Float32Array, table: SampledSignal, emit_s: FloatArray, gain: FloatArray) -> None:
     """Add a delayed signal to `out`, block by block between knots.
 
     Shapes: out (K * N,), emit_s (K + 1,), gain (K + 1,).
@@ -82,7 +82,7 @@ def _one_and_ramp(samples: int) -> Float32Array:
 
 
 def _add_between_knots(
-    rows: Float32Array, table: Table, base: IndexArray, places: _Lines, gains: _Lines
+    rows: Float32Array, table: SampledSignal, base: IndexArray, places: _Lines, gains: _Lines
 ) -> None:
     """Interpolate the table; a few intervals at a time, so that everything stays in the cache."""
     shape = min(ROWS_AT_ONCE, len(rows)), rows.shape[1]
@@ -178,7 +178,7 @@ class Emission:
         """Emission times of the knots, shape (K + 1,)."""
         return self.start_s + np.arange(len(self.bands) + 1) * KNOT_SAMPLES / self.sample_rate_hz
 
-    def table(self, gain: FloatArray) -> tuple[Table, slice] | None:
+    def table(self, gain: FloatArray) -> tuple[SampledSignal, slice] | None:
         """Add up the bands, weighted by gains (K + 1, 8) at the knots, over the span where any is not 0."""
         loud = np.flatnonzero(gain.max(axis=1) > 0.0)
         if not len(loud):
@@ -189,7 +189,7 @@ class Emission:
         both = np.matmul(np.stack([ends[:-1], np.diff(ends, axis=0)], axis=1), self.bands[first : last - 1])
         ramp = np.arange(both.shape[2], dtype=np.float32) / np.float32(both.shape[2])
         values = (both[:, 0] + ramp * both[:, 1]).ravel()
-        return Table(values, self.knots_s[first], self.sample_rate_hz * OVERSAMPLING), span
+        return SampledSignal(values, self.knots_s[first], self.sample_rate_hz * OVERSAMPLING), span
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, resample_whole, smooth_step
 from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, EgoMotion
 
-from .delay import KNOT_SAMPLES, PHASES, Phases, Table, add_delayed, emission_times
+from .delay import KNOT_SAMPLES, PHASES, Phases, SampledSignal, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 
 NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
@@ -93,7 +93,7 @@ def distance_m(place_m: FloatArray, x_m: FloatArray, offset_m: FloatArray) -> Fl
 
 
 def add_along(
-    out: Float32Array, table: Table, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
+    out: Float32Array, table: SampledSignal, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
 ) -> None:
     """Add what was emitted at the knots `emit_s` and has gone `travel_m`, weaker the longer the way."""
     emit = emission_times(receive_s, emit_s, travel_m, SPEED_OF_SOUND_MPS)
@@ -103,7 +103,7 @@ def add_along(
 
 def add_to_all(
     out: Float32Array,
-    table: Table,
+    table: SampledSignal,
     emit_s: FloatArray,
     travel_m: Callable[[FloatArray], FloatArray],
     receiver: Receiver,

@@ -14,7 +14,7 @@ from worldstate.simulation.sound.delay import (
     OVERSAMPLING,
     Emission,
     MovingSource,
-    Table,
+    SampledSignal,
     add_delayed,
     emission_times,
 )
@@ -76,7 +76,9 @@ def test_fractional_delay_error_is_below_minus_50_db(frequency):
     blocks = 40
     time = np.arange(-2048, blocks * KNOT_SAMPLES + 2048) / FS
     table_time = np.arange(len(time) * OVERSAMPLING) / (FS * OVERSAMPLING) + time[0]
-    table = Table(np.sin(2 * np.pi * frequency * table_time).astype(np.float32), time[0], FS * OVERSAMPLING)
+    table = SampledSignal(
+        np.sin(2 * np.pi * frequency * table_time).astype(np.float32), time[0], FS * OVERSAMPLING
+    )
     out = np.zeros(blocks * KNOT_SAMPLES, np.float32)
     delay = 0.0123456789
     knots = np.arange(blocks + 1) * KNOT_SAMPLES / FS
