@@ -57,13 +57,16 @@ def modules_of_the_product() -> str:
     )
 
 
-@pytest.mark.parametrize("package", ["gtsam", "networkx", "numpy", "scipy", "sklearn", "soundfile"])
+@pytest.mark.parametrize(
+    "package", ["filterpy", "gtsam", "networkx", "numpy", "scipy", "sklearn", "soundfile"]
+)
 def test_what_the_project_is_built_on_is_imported_by_the_product(package):
     said = rf"(^\s*(import|from) {package}\b|optional\(\"{package}\b)"
     assert re.search(said, modules_of_the_product(), flags=re.MULTILINE)
 
 
 OPTIONAL = {
+    "sklearn": ("worldstate.operations.train_model(None, None, dataset='', group='static')", "train"),
     "matplotlib": ("worldstate.operations.write_timeline(None, pathlib.Path('a.png'))", "plot"),
     "networkx": ("worldstate.WorldState(0, 0).graph()", "graph"),
 }
