@@ -38,9 +38,6 @@ BENCHES = {
     "bench ego-noise": f"{BENCH}.ego_noise",
     "bench gospa": f"{BENCH}.gospa",
     "bench import": f"{BENCH}.imports",
-    "bench label-training": f"{BENCH}.label_training",
-    "bench labels": f"{BENCH}.labels",
-    "bench street": f"{BENCH}.street",
 }
 DESCRIPTION = "The evaluation of the paper, and studies of our own."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"

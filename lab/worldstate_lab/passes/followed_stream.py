@@ -1,7 +1,7 @@
 """Streams that the whole world-state follows: what is measured of them, and what the filter believed."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +11,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
-from worldstate.abduction.sequence.street_sides import StreetListener, arrival_pattern, somebody_comes
+from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import asked_again
@@ -19,7 +19,6 @@ from worldstate.adapters.acoustic_sequence import learn_passes, street_listener
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
-from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
@@ -28,7 +27,6 @@ from worldstate.core.filter import WorldFilter
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, CoEvidenceChannel, Measurement
-from worldstate.operations.labelling.street_passes import HeardStreet, WatchedRecording, watched_recording
 from worldstate.state import Entity, WorldState
 from worldstate.state.context import Context
 
@@ -171,16 +169,3 @@ def stream_measurements(
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
     evidence = stream_evidence(windows, heard)
     return heard, measurements(heard, windows, sequence, evidence, vision, street)
-
-
-def watched_stream(path: Path, seed: int, model: Model) -> WatchedRecording:
-    """Return the passes of a stream before a camera and what was heard; `seed` draws the camera's misses."""
-    heard, camera = HeardStream.load(path), PinholeCamera()
-    detections = stream_detections(heard, np.random.default_rng(seed), camera)
-    seen = watched_recording(detections, camera, EVERYBODY, float(heard.hops.time_s[-1]))
-    if model.domain is None:
-        return seen
-    windows, sequence = parts_of(model)
-    groups = sequence.posterior(stream_evidence(windows, heard)).groups
-    patterns, heard_by = arrival_pattern(heard.hops.feature), heard_with(model.domain)
-    return replace(seen, heard=HeardStreet(heard.hops.time_s, patterns, somebody_comes(groups), heard_by))

@@ -75,7 +75,7 @@ def _vehicle(heard: HeardStream, entry_s: float) -> int:
     return int(heard.vehicles.vehicle[np.nanargmin(np.abs(heard.vehicles.entry_s - entry_s))])
 
 
-def true_azimuth(heard: HeardStream, vehicle: int, time_s: float) -> float | None:
+def _true_azimuth(heard: HeardStream, vehicle: int, time_s: float) -> float | None:
     """Return the azimuth of a vehicle, None where it is not there."""
     rows = heard.rows
     at = np.flatnonzero((rows.vehicle == vehicle) & (np.abs(rows.time_s - time_s) < 0.5 * HOP_S + SLACK_S))
@@ -83,7 +83,7 @@ def true_azimuth(heard: HeardStream, vehicle: int, time_s: float) -> float | Non
 
 
 def _seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
-    azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
+    azimuth = _true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
     if azimuth is None:
         return None
     near = [
@@ -148,7 +148,7 @@ def _hops_beside(
             since_s = stream.followed.time_s - one.entries_s[0]
             within = () if one.quiet else np.flatnonzero((since_s >= first_s) & (since_s < end_s)).tolist()
             for hop in within:
-                azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
+                azimuth = _true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
                 if azimuth is not None:
                     yield stream, one, hop, azimuth
 

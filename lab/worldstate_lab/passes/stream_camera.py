@@ -17,12 +17,9 @@ FRAME_S = 0.1
 _STILL_M = 1e-3  # Of a tenth of a second: slower ones keep their heading
 
 
-def stream_detections(
-    heard: HeardStream, rng: np.random.Generator, camera: PinholeCamera | None = None
-) -> DetectionLog:
+def stream_detections(heard: HeardStream, rng: np.random.Generator) -> DetectionLog:
     """Return the boxes of everybody in view, missed as often as the paper's detector misses them."""
-    camera = camera or PinholeCamera()
-    site = junction_named(heard.site)
+    camera, site = PinholeCamera(), junction_named(heard.site)
     frames: dict[int, list[tuple[FloatArray, float, str]]] = {}
     kinds = dict(zip(heard.vehicles.vehicle.tolist(), heard.vehicles.kind.tolist(), strict=True))
     for number, name in kinds.items():
