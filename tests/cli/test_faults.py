@@ -95,7 +95,6 @@ def files(tmp_path, monkeypatch) -> Path:
         ("model features set --labels t.csv --out t.csv", "t.csv"),
         ("model detector v.mp4 --out v.mp4", "v.mp4"),
         ("model detector v.mp4 --out b.json --figure b.bmp", "b.bmp"),
-        ("array bounds --out a.wav", "a.wav"),
         ("demo --out a.wav/demo", "a.wav"),
         ("sim make --out a.wav", "a.wav"),
     ],
@@ -258,9 +257,13 @@ def test_a_full_disk_leaves_no_recording(tmp_path):
 
 
 def test_a_full_disk_leaves_no_figure(tmp_path):
-    done = on_small_disk(["array", "bounds", "--out", str(tmp_path), "--trials", "2", "--snr-db", "0"])
+    soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0.0, 0.05, (48_000, 4)), 48_000)
+    write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)]))
+    before = tree(tmp_path)
+    sound, figure = str(tmp_path / "a.wav"), str(tmp_path / "mics.png")
+    done = on_small_disk(["array", "check", sound, "--array", str(tmp_path / "mics.xml"), "--figure", figure])
     assert "File too large" in one_line(done)
-    assert list(tmp_path.iterdir()) == []
+    assert tree(tmp_path) == before
 
 
 def test_a_full_standard_output_is_one_line():

@@ -1,4 +1,10 @@
-"""Bounds: the paper's numbers, a numerical Fisher matrix for any array, efficiency of a beamformer peak."""
+"""Bounds: the paper's numbers, a numerical Fisher matrix for any array, efficiency of a beamformer peak.
+
+The tone and the delay are held against their bounds in tests/frontend/approach/test_tone.py and
+tests/frontend/direction/test_gcc.py.
+"""
+
+import json
 
 import numpy as np
 import pytest
@@ -7,7 +13,10 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.bounds.cramer_rao import (
     bearing_crb_rad2,
     bearing_information,
@@ -17,6 +26,9 @@ from worldstate.frontend.bounds.cramer_rao import (
     radial_speed_crb_m2_s2,
     tone_crb_hz2,
 )
+from worldstate.frontend.direction.bearing import find_peaks
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError
 
 SOUND_M_S = 343.0
@@ -133,6 +145,42 @@ def test_beamformer_peak_meets_the_bearing_bound(azimuth_deg, snr):
     assert 10 * np.log10(1 - 3 * np.sqrt(2 / trials)) < ratio_db < 1.5
 
 
+def bearing_trial(array, azimuth_deg, snr_db, trials):
+    """Return mean squared error of SRP-PHAT on the front-end's grid of one degree, and the bound."""
+    rng, snapshots, snr = np.random.default_rng(trials), 20, 10 ** (snr_db / 10)
+    grid, middle = np.radians(np.arange(-90.0, 91.0)), np.radians(azimuth_deg)
+    steering = Steering.towards(array, [1000.0], grid)
+    errors = []
+    with one_blas_thread():
+        for _ in range(trials):
+            # Over one step of the grid, so that its interpolation is tried where it is worst, too.
+            truth = middle + np.radians(rng.uniform(-0.5, 0.5))
+            wave = np.exp(2j * np.pi * rng.uniform(size=(snapshots, 1, 1)))
+            noise = rng.normal(size=(2, snapshots, 1, array.n_microphones)) / np.sqrt(2 * snr)
+            heard = wave * array.steering(1000.0, truth)[:, :, 0] + noise[0] + 1j * noise[1]
+            spectrum = srp_phat(heard.astype(np.complex64), steering)
+            errors.append(find_peaks(spectrum, grid, max_peaks=1)[0].azimuth_rad - truth)
+    bound = bearing_crb_rad2(array.positions_m, middle, 1000.0, snr, snapshots)
+    return np.mean(np.square(errors)), bound
+
+
+@pytest.mark.parametrize(
+    ("every", "azimuth_deg", "snr_db"),
+    [(1, 0.0, 15.0), (1, 0.0, 25.0), (4, 0.0, 15.0), (4, 0.0, 25.0), (1, 45.0, 15.0), (1, 80.0, 15.0)],
+)
+def test_srp_phat_meets_the_bearing_bound(every, azimuth_deg, snr_db):
+    """Within 1.5 dB of the bound, also toward endfire, and never below it beyond three standard errors."""
+    array = MicrophoneArray(roof_array_56().positions_m[::every])
+    found, bound = bearing_trial(array, azimuth_deg, snr_db, trials=300)
+    assert 10 * np.log10(1 - 3 * np.sqrt(2 / 300)) < 10 * np.log10(found / bound) < 1.5
+
+
+def test_below_the_threshold_another_lobe_wins():
+    array = MicrophoneArray(roof_array_56().positions_m[::4])
+    found, bound = bearing_trial(array, 0.0, -15.0, trials=60)
+    assert 10 * np.log10(found / bound) > 10.0
+
+
 def test_delay_bound_equals_adaptive_quadrature():
     def coherence(f):
         return 0.8 * np.exp(-(((f - 700.0) / 400.0) ** 2))
@@ -171,3 +219,29 @@ def test_tone_bound_equals_a_numerical_fisher_matrix():
 def test_bad_input_is_refused(call):
     with pytest.raises(InvalidArgumentError):
         call()
+
+
+def test_the_command_knows_the_papers_numbers(capsys):
+    assert main(["array", "bounds", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["horizontal_moment_m2"] == pytest.approx(3.03, abs=0.005)
+    assert found["sigma_deg"]["0"] == pytest.approx(1.80, abs=0.01)
+    assert found["sigma_deg"]["60"] == pytest.approx(2 * found["sigma_deg"]["0"])
+    assert found["alias_hz"] == pytest.approx(1.9e3, rel=0.03)
+    assert main(["array", "bounds", "--snr-db", "0"]) == 0
+    assert "S_xx               3.03 m^2" in capsys.readouterr().out
+
+
+def test_an_array_that_faces_left_has_no_bearing_ahead(tmp_path, capsys):
+    turned = MicrophoneArray(roof_array_56().positions_m[::3][:, [1, 0, 2]])
+    write_array_xml(tmp_path / "mics.xml", turned)
+    assert main(["array", "bounds", "--json", "--array", str(tmp_path / "mics.xml")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["broadside_deg"] == pytest.approx(90.0)
+    assert found["sigma_deg"]["0"] is None
+
+
+def test_an_upright_line_has_no_bearing(tmp_path, capsys):
+    write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0, 0], [0, 0, 0.1]]))
+    assert main(["array", "bounds", "--array", str(tmp_path / "mics.xml")]) == 2
+    assert "horizontal extent" in capsys.readouterr().err

@@ -1,7 +1,5 @@
 from .arrays.array_bounds import ArrayBounds as ArrayBounds
 from .arrays.array_bounds import array_bounds as array_bounds
-from .arrays.efficiency import Efficiency as Efficiency
-from .arrays.efficiency import measure_over_snr as measure_over_snr
 from .calibration.cueing_calibration import CueingCalibration as CueingCalibration
 from .calibration.cueing_calibration import CueingSettings as CueingSettings
 from .calibration.cueing_calibration import calibrate_cueing as calibrate_cueing
