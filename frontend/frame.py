@@ -6,7 +6,6 @@ from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.geometry import Ambiguity
 from worldstate.frontend.direction.bearing import Peak
-from worldstate.frontend.direction.music import MusicReading
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.ground import FloatArray, NotUsable
 
@@ -51,8 +50,6 @@ class AcousticFrame:
         Directions that the array cannot distinguish: see `MicrophoneArray.ambiguity`.
     mirror_bearing_rad : float or NotUsable
         Azimuth with the same delays as the bearing (front-back ambiguity), radians.
-    music : MusicReading or NotUsable
-        MUSIC on the decision window; not usable when it is off.
     band_log_energy : ndarray of float64, shape (16,)
         Natural logarithm of the mean square of the last hop per band.
     looming : Looming or NotUsable
@@ -95,7 +92,6 @@ class AcousticFrame:
     peaks: tuple[Peak, ...]
     ambiguity: Ambiguity
     mirror_bearing_rad: float | NotUsable
-    music: MusicReading | NotUsable
     band_log_energy: FloatArray
     looming: Looming | NotUsable
     feature: FloatArray

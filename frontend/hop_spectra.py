@@ -9,7 +9,6 @@ import numpy as np
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.direction.feature import feature_steering, pair_sum, pair_sum_of
-from worldstate.frontend.direction.music import MusicStage
 from worldstate.frontend.direction.srp import steered_power
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, spanned
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
@@ -117,7 +116,6 @@ class HopSpectra:
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft, self._order = nfft, settings.feature_order
         self._n_frames = 0
-        self.music = self._music(array.n_microphones, settings)
         self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not monitored")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
@@ -133,8 +131,6 @@ class HopSpectra:
         if self.monitor is not None:
             health = self.monitor.push(samples, energies, powers, matrices)
         prewhitened = self._whitened(spectra, health.mask)
-        if self.music is not None:
-            self._push_music(self.music, spectra, powers, prewhitened)
         health.mask.silence(whitened)
         srp, pairs = self._sums(prewhitened, whitened, matrices, health.mask)
         centre = self._centre(len(spectra))
@@ -155,16 +151,6 @@ class HopSpectra:
             mask.silence(whitened)
         return prewhitened
 
-    def _push_music(
-        self, music: MusicStage, spectra: Complex64Array, powers: Float32Array, prewhitened: list[Steered]
-    ) -> None:
-        """Give MUSIC the raw spectra, or the prewhitened ones at the level of the raw ones."""
-        if not prewhitened or prewhitened[0][1] is self.beams[0]:
-            music.push(spectra[:, self._srp])
-        else:
-            level = np.sqrt(powers[:, self._srp].mean(axis=2, keepdims=True))
-            music.push(prewhitened[0][0] * level, [beams for _, beams in prewhitened[: len(self.beams)]])
-
     def _sums(
         self,
         prewhitened: list[Steered],
@@ -183,12 +169,6 @@ class HopSpectra:
         if self.ego_noise is not None:
             power = self.ego_noise.levelled(power, len(whitened))
         return power, pairs * mask.pair_scale
-
-    def _music(self, n_microphones: int, settings: FrontEndSettings) -> MusicStage | None:
-        if not settings.music_sources:
-            return None
-        azimuths, sources = settings.azimuths_rad(), settings.music_sources
-        return MusicStage(self.beams, azimuths, sources, n_microphones, settings.window_hops)
 
     def _monitor(
         self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings

@@ -50,8 +50,6 @@ class FrontEndSettings:
         Step of that grid, degrees; it must divide the span.
     max_peaks : int
         Largest number of peaks listed.
-    music_sources : int
-        Number of sources assumed by MUSIC, below the number of microphones; 0 switches MUSIC off.
     tone_band_hz : (float, float), optional
         Band in which an engine line is searched, Hz, for example (20, 400); None switches it off.
     tone_hops : int
@@ -96,7 +94,6 @@ class FrontEndSettings:
     elevation_span_deg: tuple[float, float] = (-12.0, 0.0)
     elevation_step_deg: float = 12.0
     max_peaks: int = 4
-    music_sources: int = 0
     tone_band_hz: Band | None = None
     tone_hops: int = 10
     srp_band_hz: Band = BAND_HZ
@@ -120,7 +117,6 @@ class FrontEndSettings:
         in_range("bearing_std_rad", self.bearing_std_rad, 0.0, np.pi, open_low=True)
         in_range("speed_of_sound_m_s", self.speed_of_sound_m_s, 100.0, 10_000.0)
         in_range("max_peaks", self.max_peaks, 1, 1000)
-        in_range("music_sources", self.music_sources, 0, 1000)
         in_range("tone_hops", self.tone_hops, 1, 1000)
         self._check_grid()
         for name in ("srp_band_hz", "feature_band_hz", "looming_band_hz", "level_band_hz", "tone_band_hz"):

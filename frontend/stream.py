@@ -32,7 +32,6 @@ __all__ = ["AcousticFrame", "FrontEnd"]
 
 # Far above full scale of any converter; the power of an STFT frame still fits single precision.
 _LOUDEST = 1e15
-_MUSIC_IS_OFF = NotUsable("MUSIC is off: see FrontEndSettings.music_sources")
 
 
 def _full_scale(dtype: np.dtype[Any]) -> np.float32:
@@ -253,7 +252,7 @@ class FrontEnd:
             return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
-        settings, health, music = self.settings, self._hops[-1].health, self._spectra.music
+        settings, health = self.settings, self._hops[-1].health
         recent, window = self._srp(settings.bearing_hops), self._srp(settings.window_hops)
         spectrum, floor = recent.max(axis=0), self._least_prominence
         peaks = highest_peaks(spectrum, self._azimuths, settings.max_peaks)
@@ -273,7 +272,6 @@ class FrontEnd:
             peaks=peaks,
             ambiguity=self._ambiguity,
             mirror_bearing_rad=mirror_azimuth_rad(self._mirror, bearing.azimuth_rad),
-            music=_MUSIC_IS_OFF if music is None else music.read(health.mask),
             band_log_energy=levels,
             looming=self._looming(hop.end),
             feature=self._feature(),

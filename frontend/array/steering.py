@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray, IndexArray
+from worldstate.ground.typing import Complex64Array, Complex128Array, FloatArray, IndexArray
 
 from .geometry import SPEED_OF_SOUND_M_S
 from .microphone_array import MicrophoneArray
@@ -26,7 +26,7 @@ class Steering:
     Examples
     --------
     >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5, 1.0])
-    >>> steering.n_directions, steering.basis is None
+    >>> steering.weights.shape[2], steering.basis is None
     (3, True)
     """
 
@@ -61,11 +61,6 @@ class Steering:
         frequencies = np.asarray(frequencies_hz, np.float64)
         values = (one.tobytes() for one in (array.centred_m, frequencies, azimuths, elevations))
         return _beams(*values, speed_of_sound_m_s)
-
-    @property
-    def n_directions(self) -> int:
-        """Number of directions."""
-        return int(self.weights.shape[2])
 
     def covariance(self, spectra: Complex64Array) -> Complex64Array:
         r"""Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
@@ -103,18 +98,6 @@ class Steering:
         inner = (rows if self.basis is None else rows @ self.basis) @ beams.weights
         power = np.square(inner.real).sum(axis=1, dtype=np.float64) + np.square(inner.imag).sum(axis=1)
         return np.asarray(power if self.nodes is None else power @ self.nodes.spread)
-
-    def squared_lengths(self, keep: BoolArray) -> FloatArray:
-        r"""Return the squared length of steering vectors over the microphones kept, (bins, directions).
-
-        .. math:: \|a_k(\theta)\|^2 = \sum_{m \in kept} |a_{k,m}(\theta)|^2
-        """
-        if self.basis is None:
-            kept = self.weights[:, keep]
-            return np.asarray(np.square(kept.real).sum(axis=1) + np.square(kept.imag).sum(axis=1), np.float64)
-        kept = self.basis[:, keep]
-        inner = (kept.conj().transpose(0, 2, 1) @ kept) @ self.weights
-        return np.asarray((self.conjugate * inner).real.sum(axis=1), np.float64)
 
 
 # Every stream of an array needs the same two sets of beams, and they are nine tenths of the 50 ms that a

@@ -75,8 +75,8 @@ def feature_steering(
 
     Examples
     --------
-    >>> feature_steering(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), range(1, 16), 47_998).n_directions
-    30
+    >>> feature_steering(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), range(1, 16), 47_998).weights.shape
+    (15, 2, 30)
     """
     frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)
     return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD, speed_of_sound_m_s=speed_of_sound_m_s)

@@ -1,14 +1,11 @@
-"""What a front-end does where it is asked: elevations, several peaks, MUSIC; the twin of a bearing."""
+"""What a front-end does where it is asked: elevations, several peaks; the twin of a bearing."""
 
 import numpy as np
 import pytest
 
 from worldstate.frontend.array.geometry import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.direction.music import MusicReading, covariance, covariance_subspace, music_spectrum
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
@@ -64,45 +61,9 @@ def test_several_sources_are_several_peaks() -> None:
     assert few.peaks == frame.peaks[:2]
 
 
-def test_music_is_that_of_the_whole_window() -> None:
-    chosen = FrontEndSettings(music_sources=2)
-    sound = waves(ARRAY, [(-40.0, 0.0), (25.0, 0.0)], seconds=2.4)
-    frames = FrontEnd(ARRAY, RATE, chosen).process(sound)
-    bins = band_bins(chosen.srp_band_hz, RATE, chosen.nfft)
-    spectra = StreamingStft(19, chosen.nfft, bins).push(sound)
-    ends = chosen.nfft + chosen.nfft // 2 * np.arange(len(spectra))
-    steering = ARRAY.steering(bin_frequencies_hz(bins, RATE, chosen.nfft), frames[0].azimuths_rad)
-    for frame in frames[:: len(frames) // 3]:
-        within = (ends > frame.sample_index - RATE) & (ends <= frame.sample_index)
-        subspace = covariance_subspace(covariance(spectra[within]), 2)
-        assert isinstance(frame.music, MusicReading)
-        expected = music_spectrum(subspace, steering, normalised=True)
-        assert np.corrcoef(frame.music.spectrum, expected)[0, 1] > 0.9999
-        assert np.degrees(frame.music.azimuth_rad) == pytest.approx(
-            min((-40.0, 25.0), key=lambda a: abs(a - np.degrees(frame.music.azimuth_rad))), abs=1.0
-        )
-
-
-def test_music_hears_a_quiet_source_after_a_loud_one_has_gone() -> None:
-    loud, quiet = waves(ARRAY, [(-40.0, 0.0)], 1.5), 1e-5 * waves(ARRAY, [(25.0, 0.0)], 2.0)
-    frames = FrontEnd(ARRAY, RATE, FrontEndSettings(music_sources=1)).process(
-        np.concatenate([1e3 * loud, quiet])
-    )
-    assert isinstance(frames[-1].music, MusicReading)
-    assert np.degrees(frames[-1].music.azimuth_rad) == pytest.approx(25.0, abs=1.0)
-
-
-def test_music_is_off_by_default_and_says_so() -> None:
-    sound = waves(ARRAY, [(10.0, 0.0)])
-    assert isinstance(FrontEnd(ARRAY, RATE).process(sound)[-1].music, NotUsable)
-    quiet = FrontEnd(ARRAY, RATE, FrontEndSettings(music_sources=1)).process(np.zeros_like(sound))[-1]
-    assert isinstance(quiet.music, NotUsable)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"music_sources": 19}, "music_sources"),
         ({"elevation_span_deg": (10.0, 5.0)}, "elevation_span_deg"),
         ({"elevation_span_deg": (0.0, 7.0)}, "elevation_step_deg"),
         ({"max_peaks": 0}, "max_peaks"),
@@ -151,47 +112,3 @@ def test_the_frame_tells_the_twin_and_the_grid_shows_it() -> None:
     assert solid.ambiguity == "none"
     assert isinstance(solid.mirror_bearing_rad, NotUsable)
     assert np.degrees(solid.bearing_rad) == pytest.approx(30.0, abs=1.0)
-
-
-EGO = FrontEndSettings(music_sources=1, ego_noise=EgoNoiseSettings(guard_hops=0, only_below_horizon=False))
-
-
-def test_prewhitened_music_hears_past_the_own_noise() -> None:
-    """Own noise from below, learned while alone, no longer owns the MUSIC peak when a weaker source joins."""
-    own, source = waves(ARRAY, [(-40.0, -50.0)], 6.0, 1), waves(ARRAY, [(25.0, 0.0)], 2.0, 2)
-    sound = 2.0 * own
-    sound[-len(source) :] += source
-    learning, plain = FrontEnd(ARRAY, RATE, EGO), FrontEnd(ARRAY, RATE, FrontEndSettings(music_sources=1))
-    learning.learn_ego_noise(1.0)
-    learning.process(sound[: -len(source)])
-    learning.learn_ego_noise(0.0)
-    heard = learning.process(sound[-len(source) :])[-1].music
-    deaf = plain.process(sound)[-1].music
-    assert isinstance(heard, MusicReading)
-    assert isinstance(deaf, MusicReading)
-    assert abs(np.degrees(deaf.azimuth_rad) - 25.0) > 10.0
-    assert np.degrees(heard.azimuth_rad) == pytest.approx(25.0, abs=1.0)
-
-
-def test_music_is_what_it_was_until_ego_noise_is_learned() -> None:
-    sound = waves(ARRAY, [(25.0, 0.0)])
-    shut = FrontEnd(ARRAY, RATE, EGO).process(sound)
-    plain = FrontEnd(ARRAY, RATE, FrontEndSettings(music_sources=1)).process(sound)
-    for ours, theirs in zip(shut, plain, strict=True):
-        assert isinstance(ours.music, MusicReading)
-        assert isinstance(theirs.music, MusicReading)
-        np.testing.assert_array_equal(ours.music.spectrum, theirs.music.spectrum)
-
-
-@pytest.mark.parametrize("dead", [(), (3, 7, 11)])
-def test_prewhitened_music_does_no_harm_in_white_noise(dead: tuple[int, ...]) -> None:
-    noise = np.random.default_rng(3).standard_normal((4 * RATE, 19)).astype(np.float32)
-    sound = np.concatenate([noise, waves(ARRAY, [(25.0, 0.0)])])
-    sound[:, list(dead)] = 0.0
-    front_end = FrontEnd(ARRAY, RATE, EGO)
-    front_end.learn_ego_noise(1.0)
-    front_end.process(sound[: len(noise)])
-    front_end.learn_ego_noise(0.0)
-    frame = front_end.process(sound[len(noise) :])[-1]
-    assert isinstance(frame.music, MusicReading)
-    assert np.degrees(frame.music.azimuth_rad) == pytest.approx(25.0, abs=1.0)

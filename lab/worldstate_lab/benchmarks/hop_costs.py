@@ -31,7 +31,6 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.frontend import hop_spectra, stream
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import roof_array_56
-from worldstate.frontend.direction.music import MusicStage
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.levels import LevelMeter
@@ -57,7 +56,6 @@ FRONT_END: Stages = {
     "bands": ((LevelMeter, "push"),),
     "looming": ((FrontEnd, "_looming"),),
     "tone": ((ToneStage, "push"), (ToneStage, "read")),
-    "music": ((MusicStage, "push"), (MusicStage, "read")),
     "channel_watching": ((ChannelMonitor, "push"),),
 }
 EVIDENCE: Stages = {

@@ -2,7 +2,7 @@
 
 56 channels, 47,998 Hz, nfft 512, half overlap, BLAS pinned to one thread. Milliseconds are the median over
 rounds of the median (and 99th percentile) over hops. The sound is a broadband source and an engine line in
-noise as loud as the source; noise alone, the worst case for MUSIC, is a row of its own.
+noise as loud as the source.
 """
 
 import argparse
@@ -46,11 +46,11 @@ SECONDS = 6
 SRP_BINS, AZIMUTHS_RAD = range(3, 19), np.radians(np.arange(-90.0, 91.0))
 # Running seconds are full after ten hops, and caches warm.
 WARM_UP_HOPS = 11
-EVERYTHING = FrontEndSettings(music_sources=1, tone_band_hz=ENGINE_BAND_HZ, character=True)
+EVERYTHING = FrontEndSettings(tone_band_hz=ENGINE_BAND_HZ, character=True)
 SETTINGS = {
     "stages": "56 channels, 47,998 Hz, Hann 512, hop 256, 18 or 19 new frames a hop; STFT bins 1-18; SRP "
-    "bins 3-18, 181 azimuths; feature bins 1-15, 30 azimuths x 2 halves; MUSIC bins 3-18, 1 source, running "
-    "second; tone 20-400 Hz, 1 s at 1231 Hz, every hop",
+    "bins 3-18, 181 azimuths; feature bins 1-15, 30 azimuths x 2 halves; "
+    "tone 20-400 Hz, 1 s at 1231 Hz, every hop",
     "published_chain": "per hop: scipy.signal.stft of the file, channel by channel, its cost shared among "
     "the hops; pyroomacoustics SRP, 30 azimuths, 50-1500 Hz (bins 1-15), on each half of one second; against "
     "stft + phat + feature",
@@ -75,13 +75,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Measure the front-end and the peers that are installed, in turn, `--rounds` times."""
     rounds = int(in_range("rounds", arguments.rounds, 1, 1000))
     rng = np.random.default_rng(0)
-    noise = rng.standard_normal((SECONDS * RATE_HZ, 56), dtype=np.float32)
-    street = noise + np.tile(_source(rng), (SECONDS // 2, 1))
+    street = rng.standard_normal((SECONDS * RATE_HZ, 56), dtype=np.float32)
+    street += np.tile(_source(rng), (SECONDS // 2, 1))
     runs: list[Mapping[str, Milliseconds]] = []
     with threadpool_limits(1), progress_bar("timing", rounds, quiet=arguments.json) as bar:
         kernels = tuple(_kernel(info) for info in threadpool_info())
         for _ in range(rounds):
-            runs.append(_one_round(street, noise))
+            runs.append(_one_round(street))
             bar.advance()
     report = _report(runs, kernels)
     return CommandResult(report, table={}, lines=report_lines(report))
@@ -117,15 +117,14 @@ def _kernel(info: Mapping[str, Any]) -> str:
     return " ".join(str(info.get(key) or "-") for key in ("internal_api", "version", "architecture"))
 
 
-def _one_round(street: Float32Array, noise: Float32Array) -> Mapping[str, Milliseconds]:
+def _one_round(street: Float32Array) -> Mapping[str, Milliseconds]:
     hops = _hops(street)
     spectra = StreamingStft(56, NFFT, range(NFFT // 2 + 1)).push(street[:5000])[:19]
     plain, _ = processed(hops, FrontEndSettings())
     everything, heard = processed(hops, EVERYTHING)
-    in_noise, _ = processed(_hops(noise), EVERYTHING)
     ours = stage_times(FRONT_END, processed(hops, EVERYTHING)[0])
     ours["goal"] = [sum(parts) for parts in zip(*(ours[name] for name in GOAL), strict=True)]
-    whole = {"front_end": plain, "everything": everything, "everything_in_noise_alone": in_noise}
+    whole = {"front_end": plain, "everything": everything}
     ours |= {name: [elapsed_ms(hop) for hop in calls] for name, calls in whole.items()}
     ours = {name: times[WARM_UP_HOPS:] for name, times in ours.items()}
     ours |= _on_a_tenth(spectra) | evidence_times(heard)
