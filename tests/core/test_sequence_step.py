@@ -66,7 +66,7 @@ def looks(rng: np.random.Generator, hops: int) -> list[CoEvidence]:
 def test_without_anything_else_it_believes_what_the_sequence_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     said = drawn(rng, 12)
-    hop = np.cumsum(rng.integers(1, 30, 12))
+    hop = np.cumsum(rng.integers(1, 21, 12))  # A longer pause waits for a second one
     worlds = run(WorldFilter(), [heard(at, one) for at, one in zip(hop, said, strict=True)])
     for world, one in zip(worlds, said, strict=True):
         np.testing.assert_allclose(belief(world), one.groups, rtol=1e-6, atol=1e-9)

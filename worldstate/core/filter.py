@@ -197,7 +197,7 @@ class WorldFilter:
         """
         # Before anything is computed: a measurement that is refused leaves the filter as it was.
         measurement = _checked(measurement, self.context)
-        lag = self._lag.add(measurement, self._step)
+        lag = self._lag.add(measurement, self.stamp_ns, self._step)
         if lag is None:
             return self._begun_anew(measurement)
         world = replace(self, memory=lag.latest, lag=lag)
@@ -256,6 +256,7 @@ class WorldFilter:
             measurements=tuple(one.measurement for one in lag.arrivals),
             delivery=lag.delivery,
             late_since_ns=lag.late_since_ns,
+            held=lag.held,
         )
         # What was predicted since the last measurement is predicted again.
         return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, lag.latest, past))
@@ -296,7 +297,7 @@ class WorldFilter:
 class FilterRecord:
     """All of a filter, as it is written."""
 
-    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.4.0")
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.5.0")
 
     context: Context
     policy: CueingPolicy

@@ -1,14 +1,17 @@
 """Fixed-lag buffer: what came in during the last seconds, so that a late measurement is put in its place.
 
 Order of arrival carries no meaning: a measurement that comes after later ones is taken in at its own time,
-and those after it once more. One that was delivered before is dropped, one older than the lag is counted.
+and those after it once more. One that was delivered before is dropped, one older than the lag is counted. One
+that is ahead of all others by more than the lag waits until another one confirms its stamp.
 """
 
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import TypeAlias
 
+from worldstate.ground.serialisation import ADDED
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
 from worldstate.state import Delivery
@@ -17,8 +20,8 @@ from .memory import Memory
 
 # Cameras and radios come up to half a second behind the sound; two seconds leave room for a bus that stalls.
 LAG_NS = nanoseconds(2.0)
-# Everything being too late for so long is no delay: the clock was set back, or a stamp from the future came
-# before. The filter begins anew at the time that is told now.
+# Everything being too late for so long is no delay: the clock was set back. The filter begins anew at the
+# time that is told now.
 REANCHOR_NS = nanoseconds(1.0)
 
 Timed: TypeAlias = Measurement | PositionScan | Odometry
@@ -46,37 +49,70 @@ class FixedLag:
     arrivals: tuple[Arrival, ...] = ()
     delivery: Delivery = field(default_factory=Delivery)
     late_since_ns: int | None = None  # First stamp of a run of measurements that were all too late
+    held: Timed | None = None  # Ahead of all others, until another one confirms its stamp
 
     @property
     def base(self) -> Memory:
         """The memory before the first arrival, from which all others follow."""
         return self.arrivals[0].before if self.arrivals else self.latest
 
-    def add(self, measurement: Timed, step: Step) -> "FixedLag | None":
-        """Return the buffer with one more measurement; None where all have been too late for a second."""
+    def add(self, measurement: Timed, now_ns: int, step: Step) -> "FixedLag | None":
+        """Return the buffer with one more measurement; None where all have been too late for a second.
+
+        A stamp that is ahead of `now_ns`, the time that the belief was predicted to, by more than the lag is
+        held back. It is confirmed by one that is ahead, too, and as near to it as it is to all others.
+        """
+        stamp_ns, held, latest_ns = measurement.stamp_ns, self.held, self.latest.stamp_ns
+        key = (stamp_ns, measurement.source)
+        if any(key == one.key for one in self.arrivals) or (held and key == (held.stamp_ns, held.source)):
+            return self._counted(repeated=1)
+        if stamp_ns < max(latest_ns - LAG_NS, self.base.stamp_ns):
+            return self._too_late(stamp_ns)
+        if not self._is_ahead(stamp_ns, now_ns):
+            refuted = held is not None and held.source == measurement.source
+            return replace(self, held=None if refuted else held)._taken(measurement, step)
+        if held is None or not self._is_ahead(held.stamp_ns, now_ns):
+            return replace(self._counted(held_back=1), held=measurement)
+        if not -LAG_NS <= stamp_ns - held.stamp_ns <= max(LAG_NS, held.stamp_ns - latest_ns):
+            return replace(self._counted(held_back=1), held=measurement)
+        first, second = sorted((held, measurement), key=attrgetter("stamp_ns"))
+        return replace(self._counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
+
+    def _is_ahead(self, stamp_ns: int, now_ns: int) -> bool:
+        """Tell whether a stamp is ahead of all others, and of the belief, by more than a delay explains."""
+        if not self.arrivals:
+            return False  # Of none
+        last = self.arrivals[-1]
+        # A slow stream goes on at its own pace; the first measurement of all has none.
+        pace_ns = last.measurement.stamp_ns - last.before.stamp_ns if last.before.seq else 0
+        return stamp_ns - max(now_ns, self.latest.stamp_ns) > max(LAG_NS, 2 * pace_ns)
+
+    def _taken(self, measurement: Timed, step: Step) -> "FixedLag":
+        """Return the buffer with a measurement in its place, and those after it taken in once more."""
         stamp_ns, keys = measurement.stamp_ns, [one.key for one in self.arrivals]
         at = bisect_left(keys, (stamp_ns, measurement.source))
-        if at < len(keys) and keys[at] == (stamp_ns, measurement.source):
-            delivery = replace(self.delivery, repeated=self.delivery.repeated + 1)
-            return replace(self, delivery=delivery)
-        if stamp_ns < max(self.latest.stamp_ns - LAG_NS, self.base.stamp_ns):
-            return self._too_late(stamp_ns)
         memory = self.arrivals[at].before if at < len(keys) else self.latest
-        moved = [one.measurement for one in self.arrivals[at:]]
         kept = list(self.arrivals[:at])
-        for one in (measurement, *moved):
+        for one in (measurement, *(later.measurement for later in self.arrivals[at:])):
             kept.append(Arrival(one, memory))
             memory = step(memory, one)
-        delivery = replace(self.delivery, replayed=self.delivery.replayed + bool(moved))
         oldest_ns = memory.stamp_ns - LAG_NS
-        return FixedLag(memory, tuple(one for one in kept if one.measurement.stamp_ns >= oldest_ns), delivery)
+        return replace(
+            self._counted(replayed=stamp_ns < self.latest.stamp_ns),
+            latest=memory,
+            arrivals=tuple(one for one in kept if one.measurement.stamp_ns >= oldest_ns),
+            late_since_ns=None,
+        )
+
+    def _counted(self, **more: int) -> "FixedLag":
+        counts = {name: getattr(self.delivery, name) + number for name, number in more.items()}
+        return replace(self, delivery=replace(self.delivery, **counts))
 
     def _too_late(self, stamp_ns: int) -> "FixedLag | None":
         since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
         if stamp_ns - since_ns >= REANCHOR_NS:
             return None
-        delivery = replace(self.delivery, too_late=self.delivery.too_late + 1)
-        return replace(self, delivery=delivery, late_since_ns=min(since_ns, stamp_ns))
+        return replace(self._counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +124,7 @@ class LagRecord:
     measurements: tuple[Timed, ...]
     delivery: Delivery
     late_since_ns: int | None
+    held: Timed | None = field(default=None, metadata=ADDED)
 
 
 def restored(latest: Memory, past: LagRecord, step: Step) -> FixedLag:
@@ -96,4 +133,4 @@ def restored(latest: Memory, past: LagRecord, step: Step) -> FixedLag:
     for one in past.measurements:
         arrivals.append(Arrival(one, memory))
         memory = step(memory, one)
-    return FixedLag(latest, tuple(arrivals), past.delivery, past.late_since_ns)
+    return FixedLag(latest, tuple(arrivals), past.delivery, past.late_since_ns, past.held)

@@ -1,9 +1,9 @@
 """Sensors of a snapshot: health, last views, order of delivery, and the ego vehicle by its odometry."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from worldstate.ground.serialisation import Count, Probability
+from worldstate.ground.serialisation import ADDED, Count, Probability
 
 Condition: TypeAlias = Literal["working", "impaired", "silent"]
 
@@ -101,13 +101,15 @@ class Delivery:
     Parameters
     ----------
     replayed : int
-        Late ones that were put where they belong.
+        Late ones, with a stamp before one already taken, that were put where they belong.
     repeated : int
         Delivered before, and dropped.
     too_late : int
         Later than the filter's lag, and dropped.
     reanchored : int
         Times that everything came too late for a second, by clocks that changed, and the belief began anew.
+    held_back : int
+        Ahead of all others by more than the filter's lag, and not confirmed by another one.
 
     Examples
     --------
@@ -119,3 +121,4 @@ class Delivery:
     repeated: Count = 0
     too_late: Count = 0
     reanchored: Count = 0
+    held_back: Count = field(default=0, metadata=ADDED)
