@@ -13,8 +13,7 @@ The published classifier is trained on --features, a table of windows such as th
 of tested recordings are left out; else on the recordings that are not tested; on simulated streets on other
 simulated recordings; else on the calibration recordings of each fold.
 
-OUT/report.html and OUT/report.md hold every table and figure beside the paper's, OUT/report_files the same as
-PNG and CSV.
+OUT/report.md holds every table and figure beside the paper's, OUT/report_files the same as PNG and CSV.
 
 What was heard is kept in OUT/cache by the content of each recording: an interrupted run goes on where it
 stopped, and a second one takes a minute. Least data: two approaches and two hazard-free recordings, and for

@@ -2,7 +2,7 @@
 
 A study returns its findings as `Table` values, and as `Figure` values where a picture is drawn. A command
 prints ``table.lines()``, puts ``plain(findings)`` into its JSON report and writes ``table.csv()``; a
-`Document` sets tables and figures into `report.html` and `report.md`.
+`Document` sets tables and figures into `report.md`.
 """
 
 import csv
