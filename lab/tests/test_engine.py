@@ -1,29 +1,18 @@
-"""One evaluation on one process, on several or on a cluster: the same tables, whatever happens meanwhile."""
+"""One evaluation on one process or on several: the same tables, whatever happens meanwhile."""
 
-import gc
 import os
 import signal
 import subprocess
 import sys
 import time
 import tracemalloc
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 from engine_work import Levels, end_at_one, write_sounds
 from worldstate_lab.trials.engine import Engine, Failed
 
-from worldstate.ground.errors import InvalidArgumentError, MissingExtraError, WorldstateError
-
-
-@pytest.fixture(scope="module")
-def cluster():
-    """A cluster of two workers on this machine: processes of their own, as elsewhere."""
-    import distributed
-
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
-        yield workers.scheduler_address
+from worldstate.ground.errors import WorldstateError
 
 
 def plain(outcome):
@@ -33,15 +22,11 @@ def plain(outcome):
     return outcome.name, {name: column.tobytes() for name, column in outcome.columns.items()}
 
 
-def test_every_engine_gives_the_same_and_reports_the_broken_recording(cluster, tmp_path):
+def test_every_engine_gives_the_same_and_reports_the_broken_recording(tmp_path):
     paths = write_sounds(tmp_path / "sounds", 6)
     paths[2].write_bytes(b"no sound")
     paths[4].unlink()
-    engines = {
-        "one": Engine(),
-        "two": Engine(jobs=2),
-        "cluster": Engine(scheduler=cluster, shared=(tmp_path / "sounds",)),
-    }
+    engines = {"one": Engine(), "two": Engine(jobs=2)}
     found = {}
     for name, engine in engines.items():
         # A cache of its own: nothing is taken over from the engine before.
@@ -49,72 +34,22 @@ def test_every_engine_gives_the_same_and_reports_the_broken_recording(cluster, t
         work.folder.mkdir(parents=True)
         found[name] = [plain(one) for one in engine.over(work, paths, name=lambda path: path.stem)]
         assert sorted((tmp_path / name / "log").read_text().split()) == [f"{i}.wav" for i in (0, 1, 2, 3, 5)]
-    assert found["one"] == found["two"] == found["cluster"]
+    assert found["one"] == found["two"]
     failed = [one for one in found["one"] if isinstance(one, Failed)]
     assert [one.name for one in failed] == ["2", "4"]
     assert f"{paths[2]}: expected a sound file" in failed[0].problem
     assert str(paths[4]) in failed[1].problem
 
 
-@pytest.mark.parametrize("jobs", [1, 2, None])
-def test_an_error_of_the_program_is_no_broken_recording(jobs, request):
-    engine = Engine(scheduler=request.getfixturevalue("cluster")) if jobs is None else Engine(jobs)
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_of_the_program_is_no_broken_recording(jobs):
     with pytest.raises(TypeError, match="has no len"):
-        list(engine.over(len, [[0], 1, [2]]))
+        list(Engine(jobs).over(len, [[0], 1, [2]]))
 
 
-def test_a_loop_that_is_left_leaves_no_work_on_the_cluster(cluster):
-    import distributed
-
-    with distributed.Client(cluster, set_as_default=False) as client:
-        with closing(Engine(scheduler=cluster).over(time.sleep, [0.0, *[0.5] * 40])) as slept:
-            next(slept)
-        deadline = time.monotonic() + 10.0
-        while any(client.processing().values()) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert not any(client.processing().values())
-
-
-def test_a_cluster_that_would_compute_something_else_is_refused(cluster, tmp_path, monkeypatch):
-    with pytest.raises(InvalidArgumentError, match=r"nowhere is not there.*same path"):
-        list(Engine(scheduler=cluster, shared=(tmp_path / "nowhere",)).over(abs, [1]))
-    monkeypatch.setattr("worldstate_lab.trials.engine.__version__", "0.0.1")
-    with pytest.raises(InvalidArgumentError, match=r"expected version 0\.0\.1 on tcp"):
-        list(Engine(scheduler=cluster).over(abs, [1]))
-
-
-def test_a_cluster_that_loses_a_worker_is_an_error_not_an_endless_wait(cluster):
-    with pytest.raises(WorldstateError, match="lost a worker"):
-        list(Engine(scheduler=cluster).over(end_at_one, [0, 1, 2]))
-
-
-def test_a_scheduler_that_does_not_answer_is_refused_with_what_to_do(monkeypatch):
-    monkeypatch.setattr("worldstate_lab.trials.engine.CONNECT_S", 0.2)
-    for address in ("127.0.0.1:1", "nonsense:xx"):
-        with pytest.raises(
-            InvalidArgumentError, match=f"{address}, none answers; start one with `dask sched"
-        ):
-            list(Engine(scheduler=address).over(abs, [1]))
-
-
-def test_a_cluster_without_workers_is_refused(monkeypatch):
-    import distributed
-
-    monkeypatch.setattr("worldstate_lab.trials.engine.CONNECT_S", 0.5)
-    # A client that never connected is closed when it is collected; collected while another loop starts, it
-    # waits for the lock that this start holds, for ever.
-    gc.collect()
-    with (
-        distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
-        pytest.raises(InvalidArgumentError, match="got none; start some with `dask worker"),
-    ):
-        list(Engine(scheduler=empty.scheduler_address).over(abs, [1]))
-
-
-def test_without_dask_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingExtraError, match=r"worldstate\[dask\]"):
-        list(Engine(scheduler="127.0.0.1:1").over(abs, [1]))
+def test_a_process_that_is_lost_is_an_error_not_an_endless_wait():
+    with pytest.raises(WorldstateError, match="a process ended before its work was done"):
+        list(Engine(2).over(end_at_one, [0, 1, 2]))
 
 
 RUN = """

@@ -140,22 +140,6 @@ def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_same_figures(smoke, tmp_path, monkeypatch):
-    """Two workers, which were started in another folder than the command and its relative paths."""
-    import distributed
-
-    out, report = smoke
-    shutil.copytree(out / "smoke", tmp_path / "again" / "smoke", copy_function=os.link)
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
-        monkeypatch.chdir(tmp_path)
-        there = ["--scheduler", workers.scheduler_address]
-        assert main(["table", "--smoke", "--out", "again", *there]) == 0
-    found = json.loads((tmp_path / "again" / "evaluation.json").read_text())
-    assert found.pop("against") == []
-    assert found == {name: value for name, value in report.items() if name != "against"}
-
-
-@pytest.mark.slow
 def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
     """The others are scored, and the model that ships, which was made for another array, is not."""
     root, out = tmp_path / "data", tmp_path / "out"

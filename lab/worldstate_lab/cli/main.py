@@ -70,7 +70,7 @@ def _run(run: Run, words: Sequence[str], arguments: argparse.Namespace) -> Comma
 
 
 # Options that say where work is done and what is written, and change no figure.
-_NO_FIGURE = ("--results", "--out", "--predictions", "--jobs", "--scheduler")
+_NO_FIGURE = ("--results", "--out", "--predictions", "--jobs")
 
 
 def result_key(words: Sequence[str]) -> str:

@@ -98,7 +98,7 @@ FULL_SEEDS = 5
 # Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`.
 PASSAGES = 6
 # Where the work is done and what is printed of it.
-_NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "scheduler", "against", "seeds")
+_NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "against", "seeds")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
 SHOWN = ("lead_s", "detection", "random_detection", "bearing_deg")
 
@@ -125,14 +125,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     add("--jobs", type=int, default=cores, help="processes (default: one a core)")
-    add("--scheduler", metavar="ADDRESS", help="work on the Dask cluster there, which sees the same paths")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     _check(arguments)
-    if arguments.scheduler is not None:
-        _in_full(arguments)
     output_folder(arguments.out, "evaluation.json")
     takes = _takes(arguments)
     lacking_data(takes)
@@ -143,7 +140,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         takes,
         Hearing(arguments.out / "cache", arguments.model),
         classifiers,
-        Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
+        Engine(arguments.jobs),
         track,
         EvaluationSettings(
             seeds,
@@ -220,15 +217,6 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
     if arguments.dataset is not None and arguments.smoke:
         raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
-
-
-def _in_full(arguments: argparse.Namespace) -> None:
-    """Name all files in full: the workers of a cluster were started in folders of their own."""
-    for name, value in vars(arguments).items():
-        if isinstance(value, Path):
-            setattr(arguments, name, value.absolute())
-        elif isinstance(value, list) and all(isinstance(one, Path) for one in value):
-            setattr(arguments, name, [one.absolute() for one in value])
 
 
 def _configuration(arguments: argparse.Namespace) -> list[tuple[str, str]]:
