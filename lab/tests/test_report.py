@@ -25,7 +25,7 @@ from worldstate_lab.evaluation.figures import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.front_end_study import front_end_study
 from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, ProtocolRun
 from worldstate_lab.evaluation.report.approach_timeline import approach_figure
-from worldstate_lab.evaluation.report.contents import evaluation_document, signature_values
+from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.panels import roc_curve
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
@@ -33,7 +33,6 @@ from worldstate_lab.methods.line_of_sight import VisionOnly
 from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.report.pages import Document, Section, markdown_page, write_document
 from worldstate_lab.report.table import Figure, Table, Value
-from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 from worldstate_lab.trials.takes import Take, TakeList
 from worldstate_lab.trials.trial import Decisions, Trial
 
@@ -310,21 +309,6 @@ def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation,
     assert worst == pytest.approx((0.45, 0.94))
     write_document(document, tmp_path)
     assert "<b>second" not in (tmp_path / "report.md").read_text(encoding="utf-8")
-
-
-def test_signature_rows_fill_the_paper_s_numbers_and_a_range_its_two_ends():
-    rows = tuple(
-        SignatureRow(str(i), "roadside", "AUROC", value, paper=paper)
-        for i, (value, paper) in enumerate(
-            ((0.99, (0.999, 0.999)), *((v, (0.76, 0.9)) for v in (0.7, 0.8, 0.75)), (None, (0.997, 0.997)))
-        )
-    )
-    values = signature_values(SignatureStudy(rows, True, None, ()))
-    assert {place[2]: value.value for place, value in values.items()} == {
-        "auroc_studio": 0.99,
-        "auroc_shape_least": 0.7,
-        "auroc_shape_most": 0.8,
-    }
 
 
 def test_results_are_merged_by_the_words_that_change_a_figure(tmp_path, capsys):

@@ -25,7 +25,6 @@ from worldstate_lab.signatures.simulated_corpora import (
     TOWN_ROAD,
     simulated_recording,
 )
-from worldstate_lab.trials.pass_cache import PassCache
 
 from worldstate.adapters.datasets.traffic_clips import BACKGROUND, KINDS, ClipLabels
 
@@ -182,17 +181,6 @@ def test_simulated_corpora_fill_every_row_and_leave_the_published_ones_open(clip
     assert all("SIMULATED" not in row.corpus and row.note for row in opened)
     areas = [row.value for row in filled if row.figure != "Hz"]
     assert areas == sorted(areas)
-
-
-def test_a_corpus_that_is_kept_in_a_file_gives_the_same_study(tmp_path):
-    made = drawn(np.random.default_rng(3), 6, 4, lift=1.0)
-    cache = PassCache(tmp_path)
-    kept = [cache.tables("signatures", 1, lambda: {"roads": made.table()})["roads"] for _ in range(2)]
-    studies = [
-        signature_study(corpus, None, np.random.default_rng(0))
-        for corpus in (made, *map(ClipSignatures.from_table, kept))
-    ]
-    assert studies[0].rows == studies[1].rows == studies[2].rows
 
 
 def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_path, capsys):

@@ -46,7 +46,6 @@ from worldstate.cli.common.sensors import detector_maker, detector_name
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.dataset.dataset import write_dataset
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate_lab.degradation.degradation_study import DegradationSettings
@@ -69,18 +68,12 @@ from worldstate_lab.evaluation.report.degradation_section import (
 from worldstate_lab.evaluation.report.warning_sections import equal_table
 from worldstate_lab.report.pages import write_document
 from worldstate_lab.report.table import Cell, Table, Value, plain
-from worldstate_lab.signatures.clip_signatures import ClipSignatures
-from worldstate_lab.signatures.signature_study import QUESTIONS, SignatureStudy, signature_study
-from worldstate_lab.signatures.simulated_corpora import LAYOUT, STREETS, simulated_corpora
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
 from worldstate_lab.trials.engine import Engine
 from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.pass_cache import PassCache
 from worldstate_lab.trials.takes import Take, TakeList, find_takes
-
-from .corpora import published_corpora
 
 EXAMPLE = """\
 examples:
@@ -95,8 +88,6 @@ SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 6.0
 # Images of OVAD's size take more than half of the time of a simulated recording.
 SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5
-# Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`.
-PASSAGES = 6
 # Where the work is done and what is printed of it.
 _NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "against", "seeds")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
@@ -117,8 +108,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--stage-streams", action="store_true", help="let camera and rain fail on the streams of it, too")
     add("--onnx-model", type=Path, metavar="ONNX", help="second detector (default: another without a model)")
     add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of that model")
-    add("--idmt", type=Path, metavar="DIR", help="IDMT-Traffic, for the signature study")
-    add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, for the signature study")
     add("--against", type=Path, metavar="DIR", help="a finished evaluation to compare this one with")
     add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
     add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times, all filmed recordings swept")
@@ -153,30 +142,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     compared = _compared(arguments)
     report = _report(found, compared)
     write_report(arguments.out / "evaluation.json", report)
-    signatures = None if arguments.smoke else _signatures(arguments)
-    write_document(evaluation_document(found, signatures, _configuration(arguments)), arguments.out)
+    write_document(evaluation_document(found, _configuration(arguments)), arguments.out)
     shown = {"out": str(arguments.out), "data": takes.origin, "windows": classifiers.told}
     return CommandResult(report, table=shown, lines=[*_lines(found), *_against_lines(compared)])
-
-
-def _signatures(arguments: argparse.Namespace) -> SignatureStudy:
-    """Return the signature study on the corpora that were given, else on simulated passages."""
-    # Apart, so that more recordings leave the folds and draws of a row as they are.
-    simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
-    if arguments.idmt is not None or arguments.melaudis is not None:
-        return signature_study(*published_corpora(arguments), draws)
-
-    def simulate() -> dict[str, HopTable]:
-        with progress_bar("simulating passages", PASSAGES * len(STREETS)) as bar:
-            made = simulated_corpora(PASSAGES, simulation, arguments.jobs, bar.advance)
-        return {name: corpus.table() for name, corpus in zip(("roads", "city"), made, strict=True)}
-
-    kept = PassCache(arguments.out / "cache").tables(
-        "signatures", [LAYOUT, PASSAGES, arguments.seed], simulate
-    )
-    roads, city = (ClipSignatures.from_table(kept[name]) for name in ("roads", "city"))
-    with progress_bar("measuring signatures", len(QUESTIONS)) as bar:
-        return signature_study(roads, city, draws, bar.advance)
 
 
 def _degradation(

@@ -12,7 +12,6 @@ from worldstate.frontend.levels import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
-from worldstate.operations.recordings.hop_table import HopTable
 
 # Bands end at whole bins of 512 samples, so clips of two rates would have different bands: all are brought
 # to the rate of the larger corpus first.
@@ -61,18 +60,6 @@ class ClipSignatures:
             splits=np.array([one.split for one in labels]),
             left_out=left_out,
         )
-
-    def table(self) -> HopTable:
-        """Return it as a table, to be kept in a file."""
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        about = {"simulated": self.simulated, "left_out": list(self.left_out)}
-        return HopTable(columns, self.name, about=about)
-
-    @classmethod
-    def from_table(cls, table: HopTable) -> "ClipSignatures":
-        """Return what was kept by `table`."""
-        about = table.about
-        return cls(table.name, about["simulated"], **table.columns, left_out=tuple(about["left_out"]))
 
     @property
     def background(self) -> BoolArray:

@@ -121,8 +121,6 @@ CITY_STREET = Roadside(
     kinds=(*WORDS,),
 )
 STREETS = (TOWN_ROAD, CITY_STREET)
-# Changes whenever a clip of the same seed would be another one.
-LAYOUT = 1
 
 
 def simulated_corpora(

@@ -16,12 +16,11 @@ from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STA
 from worldstate_lab.methods.table_rows import GROUNDED
 from worldstate_lab.report.pages import Document, Section
 from worldstate_lab.report.table import Cell, Figure, Table, Value
-from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 from worldstate_lab.trials.hearing import data_fingerprint
 
 from .approach_timeline import approach_section
 from .degradation_section import awareness_figures, degradation_section, sweep_values
-from .measured_values import PROPOSED, MeasuredValues, Place, printed, site_values
+from .measured_values import PROPOSED, MeasuredValues, printed, site_values
 from .recording_panels import bearing_gating_figure, junction_figure
 from .warning_sections import (
     budget_section,
@@ -206,50 +205,6 @@ def ablation_section(measured: MeasuredValues) -> Section:
     return Section("Ablations", (), (table, grounded))
 
 
-def signature_values(study: SignatureStudy) -> dict[Place, Value]:
-    """Return what was measured of the paper's numbers on signatures; of its range the least and the most."""
-    values: dict[Place, Value] = {}
-    wanted = [one for one in PAPER_VALUES if one.group == "signature study"]
-    for row in study.rows:
-        for one in wanted:
-            place, found = (one.group, one.row, one.figure), _signature(row)
-            if row.paper is None or row.value is None or one.value not in row.paper:
-                continue
-            # The paper's range spans several rows: its lower end is the least of ours, the upper the most.
-            least = min(row.paper) < max(row.paper) and one.value == min(row.paper)
-            before = values.get(place)
-            if before is None or (found.value < before.value) == least:
-                values[place] = found
-    return values
-
-
-def signature_section(study: SignatureStudy | None) -> Section:
-    """Return the separability of single clips, or what would fill it."""
-    if study is None:
-        return Section("Signature study", (f"Not part of this run: {COMMANDS['corpora']} fills it.",))
-    table = Table(
-        "signatures",
-        "Separability of single clips",
-        ("row", "corpus", "figure", "value", "clips", "how"),
-        [
-            (row.name, row.corpus, row.figure, _signature(row), str(row.n_clips), row.note)
-            for row in study.rows
-        ],
-    )
-    text = "SIMULATED clips stand for the corpora." if study.simulated else "Published corpora."
-    return Section("Signature study", (text,), (table,))
-
-
-def _signature(row: SignatureRow) -> Value:
-    value, low, high = (np.nan if one is None else one for one in (row.value, row.low, row.high))
-    digits = 0 if row.figure == "Hz" else 3
-    ends = dict.fromkeys(row.paper or ())
-    paper = Value(min(ends), min(ends), max(ends), digits) if len(ends) > 1 else None
-    if len(ends) == 1:
-        paper = Value(next(iter(ends)), digits=digits)
-    return Value(value, low, high, digits, paper=paper)
-
-
 def paper_section(measured: MeasuredValues) -> Section:
     """Return every number of the paper beside ours, and the command that fills it on what it stands on."""
     simulated = measured.found.takes.simulated
@@ -282,14 +237,9 @@ def _filled(one: PaperValue, simulated: bool) -> str:
     return {"array": "this run", "stated": "stated of the data"}.get(one.basis, COMMANDS[one.basis])
 
 
-def evaluation_document(
-    found: Evaluation,
-    signatures: SignatureStudy | None = None,
-    configuration: Sequence[tuple[str, str]] = (),
-) -> Document:
+def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, str]] = ()) -> Document:
     """Return the whole report; sections that nothing was measured for say so, and the options end it."""
     others = {} if found.degradation is None else sweep_values(found.degradation)
-    others |= {} if signatures is None else signature_values(signatures)
     measured = MeasuredValues.of(found, others)
     panels = () if found.degradation is None else awareness_figures(found.degradation)
     static = STATIC.name in found.runs
@@ -304,7 +254,6 @@ def evaluation_document(
             found.degradation, found.lacking.get("degradation sweep", "not asked for"), found.staged
         ),
         *((ablation_section(measured),) if static else ()),
-        signature_section(signatures),
         *((tracking_section(measured), strata_section(measured)) if static else ()),
         difference_section(found),
         paper_section(measured),
