@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
-from worldstate.frontend.array.geometry import Ambiguity
 from worldstate.frontend.direction.bearing import Peak
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.ground import FloatArray, NotUsable
@@ -31,25 +30,15 @@ class AcousticFrame:
     azimuths_rad : ndarray, shape (A,)
         Grid of `srp`, radians, ascending from right (negative) to left.
     srp : ndarray of float64, shape (A,)
-        SRP-PHAT of the decision window, 0..1; the maximum over elevations where these are searched.
-    elevations_rad : ndarray, shape (E,)
-        Rows of `srp_map`, ascending, radians, up positive.
-    srp_map : ndarray of float64, shape (E, A)
-        SRP-PHAT of the decision window over elevation and azimuth.
+        SRP-PHAT of the decision window, 0..1; the maximum over the elevations.
     bearing_rad, bearing_std_rad : float
-        Azimuth of the highest peak over the last `bearing_hops` hops and its standard deviation, radians.
+        Azimuth of the highest peak over the last two hops and its standard deviation, radians.
     prominence : float
         Peak-to-median ratio of the spectrum that the bearing was read from.
     least_prominence : float
         Ratio that noise reaches with this array; a peak not above it says nothing of any direction.
-    elevation_rad : float
-        Elevation of that peak, radians.
     peaks : tuple of Peak
-        All peaks of that spectrum, highest first, at most `max_peaks`; the first is the bearing.
-    ambiguity : str
-        Directions that the array cannot distinguish: see `MicrophoneArray.ambiguity`.
-    mirror_bearing_rad : float or NotUsable
-        Azimuth with the same delays as the bearing (front-back ambiguity), radians.
+        All peaks of that spectrum, highest first, at most four; the first is the bearing.
     band_log_energy : ndarray of float64, shape (16,)
         Natural logarithm of the mean square of the last hop per band.
     looming : Looming or NotUsable
@@ -61,7 +50,7 @@ class AcousticFrame:
     health : ArrayHealth or NotUsable
         Faults of the microphones and which were left out.
     tone : ToneReading or NotUsable
-        Engine line over the last `tone_hops` hops; not usable when it is off or no tone exceeds the noise.
+        Engine line over the decision window; not usable when it is off or no tone exceeds the noise.
     character : ndarray, shape (49,), or NotUsable
         What the middle microphone heard in the last two seconds, whatever its level: modulation, what bands
         have in common, tones, harmonics, which a `DomainGuard` reads; and how the level is shared between
@@ -83,15 +72,10 @@ class AcousticFrame:
     sample_index: int
     azimuths_rad: FloatArray
     srp: FloatArray
-    elevations_rad: FloatArray
-    srp_map: FloatArray
     bearing_rad: float
     bearing_std_rad: float
     prominence: float
-    elevation_rad: float
     peaks: tuple[Peak, ...]
-    ambiguity: Ambiguity
-    mirror_bearing_rad: float | NotUsable
     band_log_energy: FloatArray
     looming: Looming | NotUsable
     feature: FloatArray

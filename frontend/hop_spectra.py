@@ -8,7 +8,7 @@ import numpy as np
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
-from worldstate.frontend.direction.feature import feature_steering, pair_sum, pair_sum_of
+from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum, pair_sum_of
 from worldstate.frontend.direction.srp import steered_power
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, spanned
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
@@ -17,10 +17,10 @@ from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
 from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array, FloatArray
 
-from .settings import FrontEndSettings
+from .settings import ELEVATIONS_RAD, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 
 
-def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
+def hop_end(index: int, sample_rate_hz: float) -> int:
     """Sample at which hop k, `index`, ends: ``n_k = floor(k fs / r + 1/2)`` with r hops a second.
 
     Examples
@@ -28,7 +28,7 @@ def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
     >>> [hop_end(k, 47_998, 10) for k in (0, 1, 2, 10)]
     [0, 4800, 9600, 47998]
     """
-    return math.floor(index * sample_rate_hz / hop_rate_hz + 0.5)
+    return math.floor(index * sample_rate_hz / HOP_RATE_HZ + 0.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,12 +43,12 @@ class Hop:
 class HopCutter:
     """Collect blocks of any length and return whole hops, in time proportional to the samples."""
 
-    def __init__(self, n_channels: int, sample_rate_hz: float, hop_rate_hz: float) -> None:
-        self._rates = sample_rate_hz, hop_rate_hz
+    def __init__(self, n_channels: int, sample_rate_hz: float) -> None:
+        self._rate_hz = sample_rate_hz
         self._index = 1
-        self._start, self._end = 0, hop_end(1, *self._rates)
+        self._start, self._end = 0, hop_end(1, sample_rate_hz)
         self._filled = 0
-        self._buffer = np.empty((math.ceil(sample_rate_hz / hop_rate_hz) + 1, n_channels), np.float32)
+        self._buffer = np.empty((math.ceil(sample_rate_hz / HOP_RATE_HZ) + 1, n_channels), np.float32)
 
     def cut(self, block: Float32Array) -> Iterator[Hop]:
         """Take a block (n, M) and yield the hops that it completes; the iterator must be read to its end."""
@@ -71,7 +71,7 @@ class HopCutter:
 
     def _advance(self) -> None:
         self._index += 1
-        self._start, self._end = self._end, hop_end(self._index, *self._rates)
+        self._start, self._end = self._end, hop_end(self._index, self._rate_hz)
         self._filled = 0
 
 
@@ -84,8 +84,8 @@ class HopSums:
 
     n_frames: int
     centre: float  # Mean of the middles of these frames, samples from the start of the stream
-    # shape (E * A,): Steered power. Where microphones are left out, power and pairs are scaled to the value
-    # for all of them.
+    # shape (elevations * azimuths,): Steered power. Where microphones are left out, power and pairs are
+    # scaled to the value for all of them.
     power: FloatArray
     pairs: Complex128Array  # shape (30,): Pair sums of the published feature
     energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
@@ -96,10 +96,10 @@ class HopSpectra:
     """Transform, whiten and steer one hop; only the transform and the optional stages have a memory."""
 
     def __init__(self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings) -> None:
-        nfft, speed = settings.nfft, settings.speed_of_sound_m_s
+        nfft = settings.nfft
         self.srp_bins = band_bins(settings.srp_band_hz, sample_rate_hz, nfft)
-        self.feature_bins = band_bins(settings.feature_band_hz, sample_rate_hz, nfft)
-        looming_bins = band_bins(settings.looming_band_hz, sample_rate_hz, nfft)
+        self.feature_bins = band_bins(FEATURE_BAND_HZ, sample_rate_hz, nfft)
+        looming_bins = band_bins(LOOMING_BAND_HZ, sample_rate_hz, nfft)
         bands = (self.srp_bins, self.feature_bins, looming_bins)
         bins = range(min(b.start for b in bands), max(b.stop for b in bands))
         self._srp, self._feature, self._looming = (
@@ -109,10 +109,9 @@ class HopSpectra:
         # A row of elevation each: the few dimensions and nodes that do for one are too many for all together.
         azimuths = settings.azimuths_rad()
         self.beams = tuple(
-            Steering.towards(array, frequencies, azimuths, elevation, speed)
-            for elevation in settings.elevations_rad()
+            Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD
         )
-        self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft, speed)
+        self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft)
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft, self._order = nfft, settings.feature_order
         self._n_frames = 0
@@ -176,7 +175,7 @@ class HopSpectra:
         if not settings.watch_channels:
             return None
         frequencies = bin_frequencies_hz(self.feature_bins, sample_rate_hz, settings.nfft)
-        return ChannelMonitor(array, frequencies, sample_rate_hz, settings.speed_of_sound_m_s)
+        return ChannelMonitor(array, frequencies, sample_rate_hz)
 
     def _ego_noise(
         self, array: MicrophoneArray, sample_rate_hz: float, bins: range, settings: FrontEndSettings
@@ -190,8 +189,8 @@ class HopSpectra:
         part = spanned(part for _, part in beams)
         learned = bins[part]
         engine = HarmonicCanceller(learned, sample_rate_hz, nfft)
-        frequencies, speed = bin_frequencies_hz(learned, sample_rate_hz, nfft), settings.speed_of_sound_m_s
-        split = ElevationSplit.of(array, frequencies, speed) if chosen.only_below_horizon else None
+        frequencies = bin_frequencies_hz(learned, sample_rate_hz, nfft)
+        split = ElevationSplit.of(array, frequencies) if chosen.only_below_horizon else None
         frames_per_s = 2.0 * sample_rate_hz / nfft
         return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, split)
 

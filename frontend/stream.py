@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 
 from worldstate.frontend.approach.looming import EnergyFloor, Looming, fitted_looming
 from worldstate.frontend.approach.tone import ToneStage
-from worldstate.frontend.array.geometry import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of, highest_peaks
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
@@ -26,12 +25,14 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from .frame import CHARACTER_IS_OFF, TONE_IS_OFF, AcousticFrame
 from .hop_spectra import HopSpectra, HopSums
 from .levels import LevelMeter
-from .settings import FrontEndSettings
+from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
 
 __all__ = ["AcousticFrame", "FrontEnd"]
 
 # Far above full scale of any converter; the power of an STFT frame still fits single precision.
 _LOUDEST = 1e15
+# Peaks listed; more than two at a time are seldom vehicles.
+_MOST_PEAKS = 4
 
 
 def _full_scale(dtype: np.dtype[Any]) -> np.float32:
@@ -96,8 +97,8 @@ class FrontEnd:
         self.array = array
         self.sample_rate_hz = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
         self.settings = settings = settings or FrontEndSettings(nfft=feature_nfft(self.sample_rate_hz))
-        if settings.nfft > self.sample_rate_hz / settings.hop_rate_hz:
-            hop = self.sample_rate_hz / settings.hop_rate_hz
+        hop = self.sample_rate_hz / HOP_RATE_HZ
+        if settings.nfft > hop:
             raise InvalidArgumentError(
                 f"nfft: expected at most one hop of {hop:.0f} samples, got {settings.nfft}: "
                 "sound of a higher rate (6 kHz will do), or shorter frames"
@@ -105,10 +106,8 @@ class FrontEnd:
         self._start_ns = start_ns
         self._n_taken = 0
         self._azimuths = settings.azimuths_rad()
-        self._elevations = settings.elevations_rad()
-        self._azimuths.flags.writeable = self._elevations.flags.writeable = False
-        self._ambiguity, self._mirror = array.ambiguity, mirror_reflection(array.positions_m)
-        self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
+        self._azimuths.flags.writeable = False
+        self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz)
         with one_blas_thread():
             self._spectra = HopSpectra(array, self.sample_rate_hz, settings)
             self._least_prominence = self._noise_prominence()
@@ -117,7 +116,7 @@ class FrontEnd:
         self._energy_floor = EnergyFloor()
         self._character = SoundCharacter(self.sample_rate_hz) if settings.character else None
         self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
-        self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
+        self._hops: deque[HopSums] = deque(maxlen=WINDOW_HOPS)
 
     def process(self, block: ArrayLike, captured_ns: int | None = None) -> list[AcousticFrame]:
         """Take the next samples; return one result for every hop that they complete after the first window.
@@ -249,45 +248,37 @@ class FrontEnd:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
             if self._character is not None:
                 self._character.push(hop.samples[:, self._middle])
-            return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
+            return self._frame(hop, levels) if hop.index >= WINDOW_HOPS else None
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
-        settings, health = self.settings, self._hops[-1].health
-        recent, window = self._srp(settings.bearing_hops), self._srp(settings.window_hops)
-        spectrum, floor = recent.max(axis=0), self._least_prominence
-        peaks = highest_peaks(spectrum, self._azimuths, settings.max_peaks)
-        bearing = bearing_of(spectrum, peaks, self._azimuths, floor, settings.bearing_std_rad)
+        spectrum, floor = self._srp(BEARING_HOPS), self._least_prominence
+        peaks = highest_peaks(spectrum, self._azimuths, _MOST_PEAKS)
+        bearing = bearing_of(spectrum, peaks, self._azimuths, floor)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
             sample_index=hop.end,
             azimuths_rad=self._azimuths,
-            srp=window.max(axis=0),
-            elevations_rad=self._elevations,
-            srp_map=window,
+            srp=self._srp(WINDOW_HOPS),
             bearing_rad=bearing.azimuth_rad,
             bearing_std_rad=bearing.std_rad,
             prominence=bearing.prominence,
             least_prominence=floor,
-            elevation_rad=self._elevation_rad(recent, bearing.azimuth_rad),
             peaks=peaks,
-            ambiguity=self._ambiguity,
-            mirror_bearing_rad=mirror_azimuth_rad(self._mirror, bearing.azimuth_rad),
             band_log_energy=levels,
             looming=self._looming(hop.end),
             feature=self._feature(),
-            bearing_age_s=self._age_s(settings.bearing_hops, hop.end),
-            health=health,
+            bearing_age_s=self._age_s(hop.end),
+            health=self._hops[-1].health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
         )
 
     def _noise_prominence(self) -> float:
         """Return the peak-to-median ratio that noise reaches in the interval of a bearing."""
-        settings, spectra = self.settings, self._spectra
-        frequencies = bin_frequencies_hz(spectra.srp_bins, self.sample_rate_hz, settings.nfft)
-        n_frames = settings.bearing_hops * 2.0 * self.sample_rate_hz / (settings.hop_rate_hz * settings.nfft)
-        speed = settings.speed_of_sound_m_s
-        return noise_prominence(spectra.beams, self.array, frequencies, n_frames, speed)
+        nfft, spectra = self.settings.nfft, self._spectra
+        frequencies = bin_frequencies_hz(spectra.srp_bins, self.sample_rate_hz, nfft)
+        n_frames = BEARING_HOPS * 2.0 * self.sample_rate_hz / (HOP_RATE_HZ * nfft)
+        return noise_prominence(spectra.beams, self.array, frequencies, n_frames)
 
     def _last(self, n_hops: int) -> list[HopSums]:
         return list(self._hops)[-n_hops:]
@@ -309,34 +300,24 @@ class FrontEnd:
         return int(usable[0] if len(usable) else self._nearest[0])
 
     def _srp(self, n_hops: int) -> FloatArray:
-        """SRP-PHAT of the last hops, (E, A)."""
+        """SRP-PHAT of the last hops, (A,): the maximum over elevations."""
         hops = self._last(n_hops)
         total = np.sum([hop.power for hop in hops], axis=0)
         n_frames = sum(hop.n_frames for hop in hops)
         power = normalised(total, n_frames, len(self._spectra.srp_bins), self.array.n_microphones)
-        return power.reshape(len(self._elevations), len(self._azimuths))
-
-    def _elevation_rad(self, spectrum: FloatArray, azimuth_rad: float) -> float:
-        """Elevation of the peak next to an azimuth, interpolated where the grid has three."""
-        column = spectrum[:, np.abs(self._azimuths - azimuth_rad).argmin()]
-        if len(column) < 3 or not column.any():
-            return float(self._elevations[column.argmax()])
-        return highest_peaks(column, self._elevations, 1)[0].azimuth_rad
+        return np.asarray(power.reshape(-1, len(self._azimuths)).max(axis=0))
 
     def _tone_stage(self) -> ToneStage | None:
-        chosen = self.settings
-        if chosen.tone_band_hz is None:
-            return None
-        window_s = chosen.tone_hops / chosen.hop_rate_hz
-        return ToneStage(self.array, self.sample_rate_hz, chosen.tone_band_hz, window_s)
+        band_hz = self.settings.tone_band_hz
+        return None if band_hz is None else ToneStage(self.array, self.sample_rate_hz, band_hz)
 
-    def _age_s(self, n_hops: int, end: int) -> float:
-        hops = self._last(n_hops)
+    def _age_s(self, end: int) -> float:
+        hops = self._last(BEARING_HOPS)
         centre = sum(hop.n_frames * hop.centre for hop in hops) / sum(hop.n_frames for hop in hops)
         return (end - centre) / self.sample_rate_hz
 
     def _feature(self) -> FloatArray:
-        hops = self._last(self.settings.window_hops)
+        hops = list(self._hops)
         length = len(hops) // FEATURE_SEGMENTS
         segments = [hops[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
         n_bins, n_microphones = len(self._spectra.feature_bins), self.array.n_microphones
@@ -348,17 +329,13 @@ class FrontEnd:
         )
 
     def _looming(self, end: int) -> Looming | NotUsable:
-        settings = self.settings
-        hops = self._last(settings.looming_hops)
-        if len(hops) < settings.looming_hops:
-            return NotUsable(f"needs {settings.looming_hops} hops, got {len(hops)}")
         # The same microphones in the whole window: one that fails within it must not look like a step of
         # level.
-        energies = np.array([hop.energies for hop in hops])[:, self._used].mean(axis=1)
+        energies = np.array([hop.energies for hop in self._hops])[:, self._used].mean(axis=1)
         if energies.min() <= SILENCE:
             return NotUsable("silence within the window")
-        times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz
-        low, high = settings.looming_band_hz
-        scatter = ((high - low) / settings.hop_rate_hz) ** -0.5
+        times = (np.array([hop.centre for hop in self._hops]) - end) / self.sample_rate_hz
+        low, high = LOOMING_BAND_HZ
+        scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
         noise = self._energy_floor.read(float(energies.min()), scatter)
         return fitted_looming(times, np.log(energies), scatter, noise.mean, noise.std)

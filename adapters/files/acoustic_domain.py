@@ -121,7 +121,7 @@ def feature_order(
             f"sample rate: {expected}, or a half, a quarter or an eighth of both, got {got}. {way_out}"
         )
     made_with = _feature(domain.feature, domain.band_hz)
-    got = _feature(settings.feature_version, settings.feature_band_hz)
+    got = _feature(settings.feature_version, FEATURE_BAND_HZ)
     if got != made_with:
         raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {way_out}")
     order = check_array(domain, array, way_out)

@@ -249,6 +249,9 @@ def _checked_band(
 
 # Firing frequencies of road vehicles, idling motorcycle single to a car at high revolutions.
 ENGINE_BAND_HZ = (20.0, 400.0)
+# Length of the fit, and microphones that are averaged: at engine frequencies those near the centre of the
+# array lie within a fraction of a wavelength.
+_WINDOW_S, _MOST_CHANNELS = 1.0, 4
 # Bins per resolution (a grid this fine starts the climb within its lobe), resolutions per block of the coarse
 # floor, and the ring of resolutions around the line whose median is its floor: beyond its own side lobes.
 _PADDING = 2
@@ -305,21 +308,18 @@ class ToneStage:
         array: MicrophoneArray,
         sample_rate_hz: float,
         band_hz: tuple[float, float] = ENGINE_BAND_HZ,
-        window_s: float = 1.0,
-        n_channels: int = 4,
     ) -> None:
         low, high = band_hz
-        in_range("tone_band_hz: lower end", low, _FEWEST_PERIODS / window_s, high, open_high=True)
+        in_range("tone_band_hz: lower end", low, _FEWEST_PERIODS / _WINDOW_S, high, open_high=True)
         in_range("tone_band_hz: upper end", high, low, 0.5 * sample_rate_hz, open_high=True)
         self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
-        self._n_channels = n_channels
         self._weights, self._keep = self._mean_of(np.ones(array.n_microphones, bool))
         self._sample_rate_hz = sample_rate_hz
         self._decimator = Decimator(sample_rate_hz, high)
         self._rate = self._decimator.rate_hz
         self._n_pushed = 0
         self._n_out = 0
-        self._band_samples: FloatArray = np.zeros(_window(window_s * sample_rate_hz, self._decimator))
+        self._band_samples: FloatArray = np.zeros(_window(_WINDOW_S * sample_rate_hz, self._decimator))
         self._spectrum = _Spectrum(len(self._band_samples), self._rate, band_hz)
 
     def push(self, samples: Float32Array, mask: ChannelMask) -> None:
@@ -366,7 +366,7 @@ class ToneStage:
     def _mean_of(self, keep: BoolArray) -> tuple[Float32Array, BoolArray]:
         """Return weights of the usable microphones nearest to the centre, and their mask."""
         usable = self._nearest[keep[self._nearest]] if keep.any() else self._nearest
-        chosen = usable[: self._n_channels]
+        chosen = usable[:_MOST_CHANNELS]
         weights = np.zeros(len(keep), np.float32)
         weights[chosen] = 1.0 / len(chosen)
         return weights, keep.copy()
@@ -383,8 +383,7 @@ def _window(n_samples: float, decimator: Decimator) -> int:
     count = int((n_samples - decimator.n_taps) // decimator.factor)
     if count < 2 * _PADDING * _RING[1]:
         raise InvalidArgumentError(
-            f"tone_hops: expected a window well above the filter's {decimator.n_taps} samples, "
-            f"got {n_samples:.0f}"
+            f"tone_band_hz: expected a filter well below {n_samples:.0f} samples, got {decimator.n_taps}"
         )
     return count
 

@@ -1,12 +1,11 @@
 """Geometry of microphones and far-field directions, in `base_link` axes (x forward, y left, z up)."""
 
-import math
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, NotUsable
+from worldstate.ground import FloatArray
 
 SPEED_OF_SOUND_M_S = 343.0
 """Speed of sound in dry air at 20 degrees Celsius."""
@@ -77,48 +76,3 @@ def ambiguity(positions_m: FloatArray) -> Ambiguity:
     if normal[0] > _ALONG_AXIS:
         return "front-back"
     return "up-down" if normal[2] > _ALONG_AXIS else "mirror"
-
-
-# Horizontal part of a unit axis below which it is vertical and its cone holds every azimuth: rounding of the
-# SVD.
-_LEVEL = 1e-6
-
-
-def mirror_reflection(positions_m: FloatArray) -> FloatArray | NotUsable:
-    r"""Return the matrix that maps a horizontal direction to its mirror direction, shape (3, 3).
-
-    .. math:: T = I - 2 n n^T \text{ (planar)}, \qquad T = 2 a a^T - I \text{ (linear, level)}
-
-    A planar array has the same delays for u and for its mirror image in the array plane, with the unit normal
-    n (front-back ambiguity); a linear one with axis a has the same delays on the whole cone around it, which
-    meets the horizontal plane again if the axis is level.
-
-    Shapes: positions_m (M, 3).
-    """
-    # Delays depend on u through the products p . u only, which T preserves.
-    kind = ambiguity(positions_m)
-    if kind == "none":
-        return NotUsable("a three-dimensional array has no mirror direction")
-    if kind == "up-down":
-        return NotUsable("the mirror direction is up or down, at the same azimuth")
-    axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=True)[2]
-    if kind != "cone":
-        normal = axes[2]
-        return np.asarray(np.eye(3) - 2.0 * np.outer(normal, normal))
-    axis = axes[0]
-    if math.hypot(axis[0], axis[1]) < _LEVEL:
-        return NotUsable("a vertical line of microphones cannot distinguish azimuths")
-    return np.asarray(2.0 * np.outer(axis, axis) - np.eye(3))
-
-
-def mirror_azimuth_rad(reflection: FloatArray | NotUsable, azimuth_rad: float) -> float | NotUsable:
-    r"""Return the azimuth of the mirror direction, in (-pi, pi].
-
-    .. math:: \theta' = \mathrm{atan2}(u'_y, u'_x), \qquad u' = T\, (\cos\theta, \sin\theta, 0)^T
-
-    Shapes: reflection (3, 3).
-    """
-    if isinstance(reflection, NotUsable):
-        return reflection
-    x, y, _ = reflection @ (math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0)
-    return math.atan2(y, x)

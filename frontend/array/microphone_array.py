@@ -102,15 +102,10 @@ class MicrophoneArray:
         """Mean distance to the nearest neighbour, metres."""
         return float(nearest_spacings_m(self.positions_m).mean())
 
-    def alias_hz(self, speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S) -> float:
+    def alias_hz(self) -> float:
         """Return the frequency to which the mean spacing d samples every direction without aliasing, Hz.
 
         .. math:: f = c / (2 d)
-
-        Parameters
-        ----------
-        speed_of_sound_m_s : float
-            c, m/s.
 
         Returns
         -------
@@ -127,19 +122,14 @@ class MicrophoneArray:
         >>> MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]).alias_hz()
         857.5
         """
-        return speed_of_sound_m_s / (2.0 * self.mean_spacing_m)
+        return SPEED_OF_SOUND_M_S / (2.0 * self.mean_spacing_m)
 
     @property
     def ambiguity(self) -> Ambiguity:
         """Kind of directions that the array cannot distinguish: see `geometry.ambiguity`."""
         return ambiguity(self.positions_m)
 
-    def delays_s(
-        self,
-        azimuths_rad: ArrayLike,
-        elevations_rad: ArrayLike = 0.0,
-        speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-    ) -> FloatArray:
+    def delays_s(self, azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> FloatArray:
         r"""Return the far-field arrival time at every microphone relative to the origin, seconds.
 
         .. math:: \tau_m(\theta, \phi) = -p_m^T u(\theta, \phi) / c
@@ -148,8 +138,6 @@ class MicrophoneArray:
         ----------
         azimuths_rad, elevations_rad : array_like, broadcast together
             Azimuth, left positive, and elevation, up positive, radians.
-        speed_of_sound_m_s : float
-            c, m/s.
 
         Returns
         -------
@@ -166,14 +154,13 @@ class MicrophoneArray:
         array([-145.8,  145.8])
         """
         directions = direction_vectors(azimuths_rad, elevations_rad)
-        return np.asarray(-(directions @ self.positions_m.T) / speed_of_sound_m_s)
+        return np.asarray(-(directions @ self.positions_m.T) / SPEED_OF_SOUND_M_S)
 
     def steering(
         self,
         frequencies_hz: ArrayLike,
         azimuths_rad: ArrayLike,
         elevations_rad: ArrayLike = 0.0,
-        speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> Complex128Array:
         r"""Return steering vectors at given frequencies and directions.
 
@@ -185,8 +172,6 @@ class MicrophoneArray:
             Hz.
         azimuths_rad, elevations_rad : array_like, broadcast to shape (D,)
             Azimuth, left positive, and elevation, up positive, radians.
-        speed_of_sound_m_s : float
-            c, m/s.
 
         Returns
         -------
@@ -202,7 +187,7 @@ class MicrophoneArray:
         >>> MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]).steering([500.0, 1000.0], [0.0, 0.5, 1.0]).shape
         (2, 2, 3)
         """
-        delays = self.delays_s(np.atleast_1d(azimuths_rad), elevations_rad, speed_of_sound_m_s)
+        delays = self.delays_s(np.atleast_1d(azimuths_rad), elevations_rad)
         frequencies = np.atleast_1d(np.asarray(frequencies_hz, dtype=np.float64))
         return np.asarray(np.exp(-2j * np.pi * frequencies[:, None, None] * delays.T))
 

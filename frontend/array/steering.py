@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground.typing import Complex64Array, Complex128Array, FloatArray, IndexArray
 
-from .geometry import SPEED_OF_SOUND_M_S
 from .microphone_array import MicrophoneArray
 
 # Largest errors by interpolation, relative to the largest possible power, and of a steering vector by the
@@ -48,7 +47,6 @@ class Steering:
         frequencies_hz: ArrayLike,
         azimuths_rad: ArrayLike,
         elevations_rad: ArrayLike = 0.0,
-        speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> "Steering":
         r"""Build the beams of an array at the given frequencies and directions.
 
@@ -60,7 +58,7 @@ class Steering:
         elevations = np.broadcast_to(np.asarray(elevations_rad, np.float64), azimuths.shape)
         frequencies = np.asarray(frequencies_hz, np.float64)
         values = (one.tobytes() for one in (array.centred_m, frequencies, azimuths, elevations))
-        return _beams(*values, speed_of_sound_m_s)
+        return _beams(*values)
 
     def covariance(self, spectra: Complex64Array) -> Complex64Array:
         r"""Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
@@ -103,11 +101,11 @@ class Steering:
 # Every stream of an array needs the same two sets of beams, and they are nine tenths of the 50 ms that a
 # front-end for 56 microphones takes to make. Few are kept: a set for 1024 microphones holds 15 MB.
 @lru_cache(maxsize=4)
-def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: bytes, speed: float) -> Steering:
+def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: bytes) -> Steering:
     """Build the beams of `Steering.towards` from the bytes of its arguments, which can be compared."""
     array = MicrophoneArray(np.frombuffer(centred).reshape(-1, 3))
     frequencies_hz, azimuths_rad, elevations_rad = map(np.frombuffer, (frequencies, azimuths, elevations))
-    weights = array.steering(frequencies_hz, azimuths_rad, elevations_rad, speed).conj()
+    weights = array.steering(frequencies_hz, azimuths_rad, elevations_rad).conj()
     basis = _thin_basis(weights, max_rank=array.n_microphones // 2)
     thin = None if basis is None else np.ascontiguousarray(basis, np.complex64)
     weights = weights if basis is None else basis.conj().transpose(0, 2, 1) @ weights

@@ -10,10 +10,6 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S, direction_vectors
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 
-# Information below this share of its largest possible value is taken for zero: rounding of the inner
-# products.
-NEGLIGIBLE = 1e-12
-
 
 def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: float) -> float:
     r"""Return the bound on the variance of the delay between two microphones, eq. (3).
@@ -77,10 +73,7 @@ def bearing_crb_rad2(
     snr: ArrayLike,
     snapshots: int,
     *,
-    elevation_rad: float = 0.0,
-    elevation_known: bool = True,
     random_signal: bool = False,
-    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> float:
     r"""Return the bound on the variance of an azimuth, eq. (4) for any array.
 
@@ -98,21 +91,15 @@ def bearing_crb_rad2(
     positions_m : array_like, shape (M, 3)
         Microphones in `base_link` axes (x forward, y left, z up), metres.
     azimuth_rad : float
-        Azimuth of the source, radians, left positive.
+        Azimuth of the source, at the horizon, radians, left positive.
     frequencies_hz : float or array_like, shape (bins,)
         Narrowband frequency, or several bins whose information adds, Hz.
     snr : float or array_like, shape (bins,)
         Per microphone and snapshot, power ratio, spatially white noise.
     snapshots : int
         Number N of independent snapshots per bin.
-    elevation_rad : float
-        Elevation of the source, radians, up positive.
-    elevation_known : bool
-        False: the elevation is estimated with the azimuth, which never lowers the bound.
     random_signal : bool
         True: the unconditional bound, for a Gaussian signal, larger by 1 + 1 / (M SNR). False: the paper's.
-    speed_of_sound_m_s : float
-        c, m/s.
 
     Returns
     -------
@@ -137,33 +124,6 @@ def bearing_crb_rad2(
     >>> print(round(np.rad2deg(np.sqrt(2 * bearing_crb_rad2(plate, 0.0, 1000.0, 1.0, 1))), 2))
     1.8
     """
-    J = bearing_information(
-        positions_m, azimuth_rad, frequencies_hz, snr, snapshots,
-        elevation_rad=elevation_rad, random_signal=random_signal, speed_of_sound_m_s=speed_of_sound_m_s,
-    )  # fmt: skip
-    azimuth, cross, elevation = J[0, 0], J[0, 1], J[1, 1]
-    if elevation_known or elevation <= NEGLIGIBLE * J.trace():
-        return _inverse(azimuth)
-    remaining = azimuth - cross**2 / elevation
-    return _inverse(remaining if remaining > NEGLIGIBLE * azimuth else 0.0)
-
-
-def bearing_information(
-    positions_m: ArrayLike,
-    azimuth_rad: float,
-    frequencies_hz: ArrayLike,
-    snr: ArrayLike,
-    snapshots: int,
-    *,
-    elevation_rad: float = 0.0,
-    random_signal: bool = False,
-    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-) -> FloatArray:
-    r"""Return the Fisher information of (azimuth, elevation), shape (2, 2).
-
-    .. math:: J = \frac{8\pi^2 N}{c^2} \Big(\sum_b f_b^2\,\mathrm{SNR}_b\Big)\, D^T S D,
-              \qquad D = [\dot u_\theta\ \dot u_\phi]
-    """
     positions = finite_array("positions_m", positions_m, (None, 3))
     frequencies, ratio = np.broadcast_arrays(
         finite_array("frequencies_hz", np.atleast_1d(frequencies_hz), (None,)),
@@ -173,9 +133,12 @@ def bearing_information(
         raise InvalidArgumentError("expected at least 2 microphones and 1 snapshot, frequencies and snr >= 0")
     if random_signal:
         ratio = ratio * (len(positions) * ratio / (1.0 + len(positions) * ratio))
-    lever = (positions - positions.mean(axis=0)) @ _direction_slopes(azimuth_rad, elevation_rad)
-    weight = 8 * np.pi**2 * snapshots / speed_of_sound_m_s**2 * np.sum(frequencies**2 * ratio)
-    return np.asarray(weight * lever.T @ lever)
+    azimuth = in_range("azimuth_rad", azimuth_rad, -np.inf, np.inf)
+    # Derivatives of the direction by azimuth and by elevation, which is known: the first alone counts.
+    slopes = direction_vectors(azimuth + np.pi / 2), direction_vectors(azimuth, np.pi / 2)
+    lever = (positions - positions.mean(axis=0)) @ np.stack(slopes, axis=1)
+    weight = 8 * np.pi**2 * snapshots / SPEED_OF_SOUND_M_S**2 * np.sum(frequencies**2 * ratio)
+    return _inverse((weight * lever.T @ lever)[0, 0])
 
 
 def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> FloatArray:
@@ -253,9 +216,7 @@ def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
     return float(12.0 * rate**2 / ((2 * np.pi) ** 2 * eta * N * (N**2 - 1.0)))
 
 
-def radial_speed_crb_m2_s2(
-    frequency_variance_hz2: float, rest_frequency_hz: float, *, speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
-) -> float:
+def radial_speed_crb_m2_s2(frequency_variance_hz2: float, rest_frequency_hz: float) -> float:
     r"""Return the variance of a radial speed read from a tone of known frequency at rest.
 
     .. math:: \mathrm{var}(\hat v_r) = (c / f_0)^2\, \mathrm{var}(\hat f)
@@ -266,8 +227,6 @@ def radial_speed_crb_m2_s2(
         Variance of the received frequency, Hz squared, for example from `tone_crb_hz2`.
     rest_frequency_hz : float
         f_0 > 0, Hz.
-    speed_of_sound_m_s : float
-        c, m/s.
 
     Returns
     -------
@@ -295,16 +254,7 @@ def radial_speed_crb_m2_s2(
     """
     variance = in_range("frequency_variance_hz2", frequency_variance_hz2, 0.0, np.inf)
     rest = in_range("rest_frequency_hz", rest_frequency_hz, 0.0, np.inf, open_low=True)
-    return float((speed_of_sound_m_s / rest) ** 2 * variance)
-
-
-def _direction_slopes(azimuth_rad: float, elevation_rad: float) -> FloatArray:
-    """Derive the unit vector by azimuth and elevation, columns of (3, 2)."""
-    azimuth = in_range("azimuth_rad", azimuth_rad, -np.inf, np.inf)
-    elevation = in_range("elevation_rad", elevation_rad, -np.pi / 2, np.pi / 2)
-    by_azimuth = np.cos(elevation) * direction_vectors(azimuth + np.pi / 2)
-    by_elevation = direction_vectors(azimuth, elevation + np.pi / 2)
-    return np.stack([by_azimuth, by_elevation], axis=1)
+    return float((SPEED_OF_SOUND_M_S / rest) ** 2 * variance)
 
 
 def _horizontal_moments(positions_m: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -139,6 +139,8 @@ def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: f
 # stated deviation has a root mean square of .9 to 1.4 with 56, 14, 7 and 4 microphones. The exponent 2
 # states twice too much with 4.
 _REVERBERANT_SHARE = 0.08
+# Of a lone vehicle at broadside.
+_LONE_STD_RAD = float(np.radians(3.4))
 # Beyond 78 degrees from broadside the law 1/cos is cut: it has no meaning within a beamwidth of endfire.
 _MIN_COSINE = 0.2
 
@@ -157,7 +159,6 @@ def bearing_of(
     peaks: Sequence[Peak],
     azimuths_rad: FloatArray,
     least_prominence: float,
-    lone_std_rad: float,
 ) -> AcousticBearing:
     """Return the first of the peaks of a spectrum (A,) as a bearing; the middle of the grid if none."""
     uniform = float(azimuths_rad[-1] - azimuths_rad[0]) / np.sqrt(12.0)
@@ -166,13 +167,11 @@ def bearing_of(
     best = peaks[0]
     std = uniform
     if best.prominence > least_prominence:
-        std = min(_std_rad(spectrum, best, azimuths_rad, lone_std_rad, uniform), uniform)
+        std = min(_std_rad(spectrum, best, azimuths_rad, uniform), uniform)
     return AcousticBearing(best.azimuth_rad, std, best.prominence)
 
 
-def _std_rad(
-    spectrum: FloatArray, best: Peak, azimuths_rad: FloatArray, lone_std_rad: float, uniform: float
-) -> float:
+def _std_rad(spectrum: FloatArray, best: Peak, azimuths_rad: FloatArray, uniform: float) -> float:
     share = best.value * (1.0 - 1.0 / best.prominence)
     excess = np.maximum(spectrum / share - 1.0 / (best.prominence - 1.0), 0.0)
     density = np.square(np.square(excess))
@@ -181,7 +180,7 @@ def _std_rad(
     density[first : last + 1] = 0.0
     others = float(density @ np.square(azimuths_rad - best.azimuth_rad) / total)
     astray = min(0.5 * (_REVERBERANT_SHARE / share) ** 2, 1.0)
-    lone = lone_std_rad / max(np.cos(best.azimuth_rad), _MIN_COSINE)
+    lone = _LONE_STD_RAD / max(np.cos(best.azimuth_rad), _MIN_COSINE)
     return float(np.sqrt(lone**2 + (1.0 - astray) * others + astray * uniform**2))
 
 

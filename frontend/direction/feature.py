@@ -16,7 +16,6 @@ import numpy as np
 import scipy.signal
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz, whiten
@@ -67,7 +66,6 @@ def feature_steering(
     bins: range,
     sample_rate_hz: float,
     nfft: int = FEATURE_NFFT,
-    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> Steering:
     r"""Return the beams at the thirty published azimuths.
 
@@ -79,7 +77,7 @@ def feature_steering(
     (15, 2, 30)
     """
     frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)
-    return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD, speed_of_sound_m_s=speed_of_sound_m_s)
+    return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD)
 
 
 def pair_sum(

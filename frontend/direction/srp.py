@@ -119,7 +119,6 @@ def noise_prominence(
     array: MicrophoneArray,
     frequencies_hz: FloatArray,
     n_frames: float,
-    speed_of_sound_m_s: float,
 ) -> float:
     r"""Return the peak-to-median ratio up to which a peak is taken for noise.
 
@@ -133,7 +132,7 @@ def noise_prominence(
 
     .. math:: \rho_0 = 1 + 0.6 \Big( (1 + 3 \epsilon)\, \frac{\max_\theta D}{\mathrm{med}_\theta D} - 1 \Big)
     """
-    horizon = array.steering(frequencies_hz, _ALL_ROUND_RAD, 0.0, speed_of_sound_m_s).astype(np.complex64)
+    horizon = array.steering(frequencies_hz, _ALL_ROUND_RAD).astype(np.complex64)
     by_row = np.array([_heard(row, horizon) for row in rows])
     diffuse = by_row.mean(axis=1).max(axis=0)
     # Of the last row: rows differ little in how their bins share the power.

@@ -29,7 +29,6 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.stft import whiten
@@ -480,12 +479,7 @@ class ElevationSplit:
     is_separable: bool  # Whether the array has the vertical extent for it
 
     @classmethod
-    def of(
-        cls,
-        array: MicrophoneArray,
-        frequencies_hz: ArrayLike,
-        speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-    ) -> "ElevationSplit":
+    def of(cls, array: MicrophoneArray, frequencies_hz: ArrayLike) -> "ElevationSplit":
         r"""Build the model fields of an array at the frequencies of its bins.
 
         .. math:: \Gamma = \langle a a^H \rangle \text{ off the diagonal}, \qquad
@@ -493,7 +487,7 @@ class ElevationSplit:
         """
         # Means over the directions of each field, with G their inner products: the inner product of w with R
         # is the power times the determinant.
-        b, s = (_field(array, frequencies_hz, el, speed_of_sound_m_s) for el in (_BELOW_DEG, _STREET_DEG))
+        b, s = (_field(array, frequencies_hz, el) for el in (_BELOW_DEG, _STREET_DEG))
         bb, ss, bs = (np.einsum("kn,kn->k", x, y)[:, None] for x, y in ((b, b), (s, s), (b, s)))
         contrast = float((bb * ss - bs**2).sum() / max(float((bb * ss).sum()), _LEAST_POWER))
         below, street = ss * b - bs * s, bb * s - bs * b
@@ -526,11 +520,11 @@ def share_of(below: float, street: float) -> float:
 
 
 def _field(
-    array: MicrophoneArray, frequencies_hz: ArrayLike, elevations_deg: tuple[float, ...], speed: float
+    array: MicrophoneArray, frequencies_hz: ArrayLike, elevations_deg: tuple[float, ...]
 ) -> FloatArray:
     """Covariance between different microphones of plane waves at some elevations, (bins, 2 M^2)."""
     azimuths, elevations = np.meshgrid(_AZIMUTHS_RAD, np.radians(elevations_deg))
-    A = array.steering(frequencies_hz, azimuths.ravel(), elevations.ravel(), speed)
+    A = array.steering(frequencies_hz, azimuths.ravel(), elevations.ravel())
     field = A @ A.conj().transpose(0, 2, 1) / A.shape[2]
     field[:, np.arange(array.n_microphones), np.arange(array.n_microphones)] = 0.0
     return np.asarray(np.ascontiguousarray(field.reshape(len(field), -1)).view(np.float64))

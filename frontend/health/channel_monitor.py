@@ -253,13 +253,7 @@ _EVERY_HOPS = 10
 class ChannelMonitor:
     """Collect the statistics of all channels and report their faults; memory does not grow."""
 
-    def __init__(
-        self,
-        array: MicrophoneArray,
-        frequencies_hz: FloatArray,
-        sample_rate_hz: float,
-        speed_of_sound_m_s: float = 343.0,
-    ) -> None:
+    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray, sample_rate_hz: float) -> None:
         n = array.n_microphones
         self.clock = SampleClock(sample_rate_hz)
         self._activity = ChannelActivity(n)
@@ -271,7 +265,7 @@ class ChannelMonitor:
         self._dropout_finder = DropoutFinder(n)
         self._dropouts: tuple[Dropout, ...] = ()
         self._n_dropouts = 0
-        self._geometry_check = GeometryCheck(array, frequencies_hz, speed_of_sound_m_s)
+        self._geometry_check = GeometryCheck(array, frequencies_hz)
 
     def push(
         self,

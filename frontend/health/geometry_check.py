@@ -237,7 +237,6 @@ def position_weights(
     array: MicrophoneArray,
     frequencies_hz: FloatArray,
     usable: BoolArray,
-    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> Float32Array:
     r"""Weights of all other microphones in the prediction at every position.
 
@@ -248,7 +247,7 @@ def position_weights(
     """
     positions = array.positions_m
     distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    field = np.sinc(2.0 * frequencies_hz[:, None, None] * distance / speed_of_sound_m_s)
+    field = np.sinc(2.0 * frequencies_hz[:, None, None] * distance / SPEED_OF_SOUND_M_S)
     inverse = np.linalg.inv(field + np.diag(np.where(usable, _NOISE, _UNUSABLE)))
     own = np.einsum("kmm->km", inverse)
     weights = -inverse / own[:, :, None]
@@ -316,14 +315,14 @@ class PositionFit:
     J. Acoust. Soc. Am., 1955.
     """
 
-    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray, speed_of_sound_m_s: float) -> None:
+    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         n = array.n_microphones
         self.coherence: float | NotUsable = NotUsable("the first second is not over")
-        self._geometry = array, frequencies_hz, speed_of_sound_m_s
+        self._geometry = array, frequencies_hz
         self._sum = np.zeros((len(frequencies_hz), n, n), np.float32)
         self._n_frames = 0.0
         self._usable = np.ones(n, bool)
-        self._weights = position_weights(array, frequencies_hz, self._usable, speed_of_sound_m_s)
+        self._weights = position_weights(array, frequencies_hz, self._usable)
         self._suspects = np.zeros(n, bool)
         self._found: list[ChannelFault] = []
         self.faults: list[ChannelFault] = []  # Noisy, inverted and swapped channels
@@ -355,9 +354,8 @@ class PositionFit:
     def _use(self, usable: BoolArray) -> None:
         """Predict from these channels only; new weights take a few milliseconds, so they are kept."""
         if not np.array_equal(usable, self._usable):
-            array, frequencies_hz, speed = self._geometry
             self._usable = usable
-            self._weights = position_weights(array, frequencies_hz, usable, speed)
+            self._weights = position_weights(*self._geometry, usable)
 
     def _find(self, scores: FloatArray, typical: float, active: BoolArray) -> list[ChannelFault]:
         limit = typical * np.where(self._suspects, _WELL, _SUSPECT)
@@ -412,14 +410,14 @@ class GeometryCheck:
     # The position fit compares each channel with its neighbours: it finds noisy and inverted channels and, in
     # a large array, proposes exchanges. Plane waves over the whole array decide on them and find delays.
 
-    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray, speed_of_sound_m_s: float) -> None:
+    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         n = array.n_microphones
         high = np.flatnonzero(frequencies_hz >= _LOWEST_HZ)
         most = _MANY_BINS if n <= MAX_CHANNELS else _FEW_BINS
         self._bins = high[:: max(-(-len(high) // most), 1)]
         chosen = frequencies_hz[self._bins]
-        waves = PlaneWaves(array, chosen, speed_of_sound_m_s)
-        self._fit = PositionFit(array, frequencies_hz, speed_of_sound_m_s)
+        waves = PlaneWaves(array, chosen)
+        self._fit = PositionFit(array, frequencies_hz)
         self._order, self._delay = OrderCheck(waves), DelayCheck(array, waves, chosen)
         self._sum = np.zeros((len(chosen), n, n), np.complex64)
         self._hops, self._n_frames = 0, 0

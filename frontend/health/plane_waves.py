@@ -6,7 +6,6 @@ from itertools import combinations
 
 import numpy as np
 
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray, IndexArray
 
@@ -28,14 +27,9 @@ SILENCE = 1e-12
 class PlaneWaves:
     """Steering vectors of the directions that an array can tell apart."""
 
-    def __init__(
-        self,
-        array: MicrophoneArray,
-        frequencies_hz: FloatArray,
-        speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-    ) -> None:
+    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         azimuth, elevation = _directions()
-        delays = MicrophoneArray(array.centred_m).delays_s(azimuth, elevation, speed_of_sound_m_s)
+        delays = MicrophoneArray(array.centred_m).delays_s(azimuth, elevation)
         kept = np.unique(np.round(delays / _SAME_S), axis=0, return_index=True)[1]
         self.is_steep = np.abs(elevation[kept]) > _STEEP
         phase = -2j * np.pi * frequencies_hz[:, None, None] * delays[kept].T

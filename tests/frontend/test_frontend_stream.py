@@ -18,7 +18,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.settings import ELEVATIONS_RAD, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
@@ -167,12 +167,6 @@ def test_silence_says_so() -> None:
     assert np.isfinite(frame.band_log_energy).all()
 
 
-def test_looming_waits_for_its_own_window() -> None:
-    sound = noise_from(SQUARE, 0.0, RATE, 1.5)
-    frames = FrontEnd(SQUARE, RATE, FrontEndSettings(looming_hops=15)).process(sound)
-    assert [isinstance(f.looming, NotUsable) for f in frames] == [True] * 5 + [False]
-
-
 def test_a_refused_block_leaves_the_stream_as_it_was() -> None:
     sound = noise_from(SQUARE, 0.5, RATE, 1.0)
     front_end = FrontEnd(SQUARE, RATE)
@@ -208,9 +202,8 @@ def test_loud_is_not_infinite(scale: float) -> None:
         (4_000, {}, "nfft"),
         (0, {}, "sample_rate_hz"),
         (48_000, {"nfft": 511}, "nfft"),
-        (48_000, {"window_hops": 5}, "window_hops"),
-        (48_000, {"azimuth_step_deg": 0.7}, "divisor"),
-        (48_000, {"bearing_hops": 11}, "bearing_hops"),
+        (48_000, {"azimuth_span_deg": (-10.0, 10.5)}, "whole degrees"),
+        (48_000, {"azimuth_span_deg": (10.0, 5.0)}, "azimuth_span_deg"),
         (48_000, {"srp_band_hz": (1800.0, 300.0)}, "srp_band_hz"),
     ],
 )
@@ -278,7 +271,9 @@ def test_running_second_is_the_srp_of_the_frames_that_end_in_it() -> None:
     spectra = StreamingStft(4, 512, bins).push(sound)
     ends = 512 + 256 * np.arange(len(spectra))
     within = (ends > 0.2 * rate) & (ends <= 1.2 * rate)
-    steering = Steering.towards(array, bin_frequencies_hz(bins, rate, 512), frame.azimuths_rad)
-    np.testing.assert_allclose(frame.srp_map[1], srp_phat(spectra[within], steering), rtol=1e-5)
+    frequencies = bin_frequencies_hz(bins, rate, 512)
+    rows = [Steering.towards(array, frequencies, frame.azimuths_rad, el) for el in ELEVATIONS_RAD]
+    expected = np.max([srp_phat(spectra[within], row) for row in rows], axis=0)
+    np.testing.assert_allclose(frame.srp, expected, rtol=1e-5)
     centres = (ends - 256)[(ends > 1.0 * rate) & (ends <= 1.2 * rate)]
     assert frame.bearing_age_s == pytest.approx(1.2 - centres.mean() / rate)

@@ -26,7 +26,7 @@ from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
-from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.settings import BEARING_HOPS, HOP_RATE_HZ, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.blas_threads import one_blas_thread
@@ -300,7 +300,7 @@ def _music(
     bins = band_bins(chosen.srp_band_hz, rate, chosen.nfft)
     azimuths = chosen.azimuths_rad()
     steering = array.steering(bin_frequencies_hz(bins, rate, chosen.nfft), azimuths).astype(np.complex64)
-    length = round(chosen.bearing_hops * rate / chosen.hop_rate_hz)
+    length = round(BEARING_HOPS * rate / HOP_RATE_HZ)
     bearings = np.full(wanted.size, np.nan)
     with one_blas_thread():
         for i, frame in enumerate(frames):

@@ -66,7 +66,7 @@ def test_what_would_fold_into_the_band_is_gone(frequency_hz: float) -> None:
 def test_variance_meets_the_decimated_bound(snr_db: float, low_hz: float, high_hz: float) -> None:
     """Within 1.5 dB of the bound, never below it beyond sampling error; the claimed variance is right."""
     rng, trials, eta = np.random.default_rng(int(snr_db) + int(low_hz)), 150, 10 ** (snr_db / 10)
-    stage = ToneStage(PAIR, RATE, n_channels=1)
+    stage = ToneStage(PAIR, RATE)
     rate = Decimator(RATE, 400.0).rate_hz
     # White noise whose density makes this eta of the samples that are left: 1 / 2 eta of each.
     noise = np.sqrt(0.5 / eta * RATE / rate)
@@ -182,9 +182,6 @@ def test_not_usable_says_why() -> None:
     silent = FrontEnd(PAIR, 8_000, SETTINGS).process(np.zeros((8_000, 2)))[0]
     assert silent.tone == NotUsable("silence")
     assert isinstance(FrontEnd(PAIR, 8_000).process(np.zeros((8_000, 2)))[0].tone, NotUsable)
-    late = FrontEnd(PAIR, 8_000, FrontEndSettings(tone_band_hz=(20.0, 400.0), tone_hops=12))
-    usable = [isinstance(f.tone, ToneReading) for f in late.process(on_both(line(90.0, 1.4, 8_000)))]
-    assert usable == [False, False, True, True, True]
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e14])
@@ -201,7 +198,7 @@ def test_level_does_not_matter(scale: float) -> None:
     [
         (8_000, {"tone_band_hz": (1.0, 400.0)}, "tone_band_hz"),
         (8_000, {"tone_band_hz": (20.0, 4_000.0)}, "tone_band_hz"),
-        (8_000, {"tone_band_hz": (50.0, 400.0), "tone_hops": 1}, "tone_hops"),
+        (8_000, {"tone_band_hz": (10.0, 20.0)}, "tone_band_hz: expected a filter"),
         (8_000, {"tone_band_hz": (400.0, 20.0)}, "tone_band_hz"),
     ],
 )

@@ -18,6 +18,7 @@ from .hop_table import HopTable
 
 # Bins whose covariance is decomposed to count sources: evenly out of the band.
 _BINS = 12
+_FEWEST_FRAMES = 10  # From which their covariance means something
 
 
 # Of the table as text: middle of the sound that the bearing was read from; azimuth, left positive; its
@@ -79,7 +80,7 @@ def _sources_in(block: Float32Array, front_end: FrontEnd) -> int:
     chosen = np.unique(np.linspace(0, len(band) - 1, _BINS).round().astype(int))
     # Frames overlap by half; every second one is nearly independent of the last.
     frames = StreamingStft(block.shape[1], settings.nfft, band).push(block)[::2][:, chosen]
-    if len(frames) < settings.hop_rate_hz:
+    if len(frames) < _FEWEST_FRAMES:
         return 0
     covariance = np.einsum("tkm,tkn->kmn", frames, frames.conj()) / len(frames)
     return count_sources(np.maximum(np.linalg.eigvalsh(covariance), 0.0), len(frames))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.settings import HOP_RATE_HZ, WINDOW_HOPS
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import (
     BLUE,
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# From the middle of a decision window to its end, with the settings that a `Source` is listened to with.
-WINDOW_S = FrontEndSettings().window_hops / FrontEndSettings().hop_rate_hz
+# Length of a decision window.
+WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
 # Longest title in one line above a figure of this width.
 _TITLE_CHARACTERS = 100
 # Rows of the middle panel, from below.

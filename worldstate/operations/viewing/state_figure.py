@@ -12,6 +12,7 @@ from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.atomic import atomic_path
+from worldstate.frontend.settings import HOP_RATE_HZ, WINDOW_HOPS
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import InputFileError, seconds
 from worldstate.ground.typing import FloatArray
@@ -74,10 +75,9 @@ def sound_power(
         rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.process(block)]
         on_second()
     time_s, power = np.array([t for t, _ in rows]), np.array([row for _, row in rows])
-    settings = front_end.settings
     # Drawn at its end, a window of a second would lag the camera by half of one.
-    age_s = 0.5 * settings.window_hops / settings.hop_rate_hz
-    return SoundPower(time_s - age_s, settings.azimuths_rad(), power)
+    age_s = 0.5 * WINDOW_HOPS / HOP_RATE_HZ
+    return SoundPower(time_s - age_s, front_end.settings.azimuths_rad(), power)
 
 
 def write_state_figure(
