@@ -8,14 +8,7 @@ import numpy as np
 from worldstate.belief.kinematics import motion
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.measurement import Approach, Bearing
-from worldstate.smoothing import (
-    AngularHeight,
-    FixedLagSmoother,
-    PastEdge,
-    Range,
-    ReflectedBearing,
-    SmoothingSettings,
-)
+from worldstate.smoothing import AngularHeight, FixedLagSmoother, Range, SmoothingSettings
 
 HOP_S, HOP_NS, HOPS, HIDDEN_HOPS = 0.1, 100_000_000, 60, 35
 PSD = 1.0  # Of the vehicles' acceleration, m^2/s^3
@@ -86,16 +79,12 @@ def hidden_errors_m(seed: int) -> tuple[float, float]:
     )
 
 
-PASS_HOPS, ENTITIES, WALLS = 160, 3, ("opposite", "west", "back", "east")
+PASS_HOPS, ENTITIES = 160, 3
 
 
 def slots_of_a_street(hops: int, rng: np.random.Generator) -> int:
-    """Return the factor slots after a stream of three entities, with two corners and four walls."""
+    """Return the factor slots after a stream of three entities."""
     smoother = FixedLagSmoother()
-    smoother.add_corner("left", 1, (5.0, 3.0), (1.0, 0.5))
-    smoother.add_corner("right", -1, (5.0, -3.0), (1.0, 0.5))
-    for number, name in enumerate(WALLS):
-        smoother.add_wall(name, number * math.pi / 2.0, 8.0, (0.05, 0.5))
     for hop in range(hops):
         seen = {}
         for number in range(ENTITIES):
@@ -117,12 +106,6 @@ def crossing(hop: int, number: int, rng: np.random.Generator) -> list:
         Approach(inverse_tta + rng.normal(0.0, 0.25), 0.25),
     ]
     hidden = side * y / x > 0.6
-    corner = "left" if side > 0 else "right"
-    if hop % 10 == 0:
-        image = math.atan2(y, 16.0 - x)
-        heard.append(ReflectedBearing("opposite", image + rng.normal(0.0, 0.1), 0.1))
-    if abs(side * y / x - 0.6) < 0.2:
-        heard.append(PastEdge(corner, seen=not hidden))
     if not hidden:
         heard[0] = Bearing(azimuth + rng.normal(0.0, 0.01), 0.01)
         heard.append(AngularHeight(1.5 / r * math.exp(rng.normal(0.0, 0.03)), 0.03))

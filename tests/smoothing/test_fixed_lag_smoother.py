@@ -1,4 +1,4 @@
-"""The smoother against filterpy's RTS; late observations, a moving ego, corners and walls learned."""
+"""The smoother against filterpy's RTS; late observations, first sight."""
 
 import math
 
@@ -8,25 +8,15 @@ from smoothing_problem import (
     HOP_NS,
     HOP_S,
     PRIOR,
-    crossing,
     heard_then_seen,
     hidden_errors_m,
     slots_of_a_street,
 )
 
-from worldstate.belief.kinematics.cartesian import CartesianBelief
+from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Approach, Bearing, Position
-from worldstate.smoothing import (
-    AngularHeight,
-    EgoStep,
-    FixedLagSmoother,
-    PastEdge,
-    Range,
-    ReflectedBearing,
-    SmoothingSettings,
-    graph,
-)
+from worldstate.smoothing import AngularHeight, FixedLagSmoother, Range, SmoothingSettings
 
 EXACT = SmoothingSettings(robust_k=1e4)
 
@@ -40,11 +30,14 @@ def test_rts_of_filterpy_agrees():
     kalman.x, kalman.P = np.array([20.0, 10.0, -3.0, -2.0]), np.diag([4.0, 4.0, 1.0, 1.0])
     kalman.F, kalman.H, kalman.R = np.eye(4) + t * np.eye(4, k=2), np.eye(2, 4), np.diag([0.5, 0.8])
     kalman.Q = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
-    start = CartesianBelief(kalman.x.copy(), kalman.P.copy())
+    # Nothing is known of it but its first position and velocity.
+    anywhere = MotionBelief.around((0.5, 0.0, -0.2, math.log(22.0)), (1e4,) * 4)
+    first = Position((20.0, 10.0), tuple(map(tuple, kalman.P.tolist())), velocity_mps=(-3.0, -2.0))
     truth = np.array([20.5, 9.0, -3.2, -2.1])
     measured = [(truth[:2] + k * t * truth[2:] + rng.normal(0.0, 0.8, 2)).tolist() for k in range(40)]
     smoother = FixedLagSmoother()
-    smoother.begin("car", 0, start)
+    smoother.begin("car", 0, anywhere)
+    smoother.update(0, {"car": [first]})
     for k, place in enumerate(measured):
         smoother.update(k * HOP_NS, {"car": [Position(tuple(place), ((0.5, 0.0), (0.0, 0.8)))]})
     # filterpy predicts before its first update, where the belief is already that of the first measurement.
@@ -153,66 +146,39 @@ def test_who_stops_at_once_in_view_drove_on_before_it():
     assert hidden_error_m(1.0) < 0.5 * hidden_error_m(None)
 
 
-def test_a_wall_is_learned_from_images_and_a_height_from_boxes():
-    rng = np.random.default_rng(1)
-    smoother = FixedLagSmoother()
-    smoother.add_wall("far", 0.1, 13.0, (0.2, 2.0))
+def test_a_height_is_learned_from_boxes():
+    rng, smoother = np.random.default_rng(1), FixedLagSmoother()
     for hop in range(60):
         x, y = 8.0, 12.0 - 0.35 * hop
-        r, height = math.hypot(x, y), 1.8 / math.hypot(x, y)
-        observed = [
-            Bearing(math.atan2(y, x) + rng.normal(0.0, 0.01), 0.01),
-            Range(r + rng.normal(0.0, 0.3), 0.3),
-            ReflectedBearing("far", math.atan2(y, 24.0 - x) + rng.normal(0.0, 0.03), 0.03),
-            AngularHeight(height, 0.03),
-        ]
-        smoother.update(hop * HOP_NS, {"van": observed})
-    (azimuth, distance), spread = smoother.landmark("far")
-    assert abs(azimuth) < 0.03
-    assert abs(distance - 12.0) < 3.0 * math.sqrt(spread[1, 1]) < 1.5
+        r = math.hypot(x, y)
+        # The last ones without a range, of a body that is higher than most.
+        observed = [Bearing(math.atan2(y, x) + rng.normal(0.0, 0.01), 0.01), AngularHeight(1.8 / r, 0.03)]
+        ranged = [Range(r + rng.normal(0.0, 0.3), 0.3)] if hop < 40 else []
+        smoother.update(hop * HOP_NS, {"van": observed + ranged})
+    x, y, *_ = smoother.track("van").states[-1]
+    assert math.hypot(x - 8.0, y - (12.0 - 0.35 * 59)) < 0.5
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_first_sight_and_its_edge_are_learned_from_looks(side):
-    smoother, late_s = FixedLagSmoother(), []
-    smoother.add_corner("edge", side, (5.0, side * 3.4), (1e-3, 0.8))
-    true_edge, rng = math.atan2(3.0, 5.0), np.random.default_rng(2)
+def test_first_sight_is_when_the_edge_was_passed(side):
+    smoother, rng = FixedLagSmoother(), np.random.default_rng(2)
+    edge_rad, errors_s = side * math.atan2(3.0, 5.0), []
     for number in range(4):
-        start = 30_000_000_000 * number
         # Passes the edge's line of sight, y = 4.8 at x = 8, after 1.8 s.
+        start = 30_000_000_000 * number
         for hop in range(45):
             y = 12.0 - 0.4 * hop
-            beyond = math.atan2(y, 8.0) > true_edge
-            observed = [PastEdge("edge", seen=not beyond and rng.random() < 0.9)]
-            if observed[0].seen:
-                observed += [Bearing(side * math.atan2(y, 8.0), 0.01), Range(math.hypot(8.0, y), 0.3)]
-            else:
-                observed += [Bearing(side * (math.atan2(y, 8.0) + rng.normal(0.0, 0.1)), 0.1)]
+            std = 0.01 if y < 4.8 else 0.1
+            observed = [Bearing(side * (math.atan2(y, 8.0) + rng.normal(0.0, std)), std)]
+            observed += [Range(math.hypot(8.0, y), 0.3)] if y < 4.8 else []
             smoother.update(start + hop * HOP_NS, {str(number): observed})
-        first = smoother.first_sight(str(number), "edge")
-        assert first.std_s < 0.3
-        late_s.append(first.time_s - 1e-9 * start - 1.8)
-    assert np.abs(late_s).max() < 0.2
-    mean, _ = smoother.landmark("edge")
-    assert abs(math.atan2(*mean[::-1]) - side * true_edge) < math.radians(3.0)
-
-
-def test_a_moving_ego_sees_a_standing_vehicle_stand():
-    rng = np.random.default_rng(4)
-    smoother = FixedLagSmoother(SmoothingSettings(acceleration_psd=0.01))
-    for hop in range(50):
-        # Along a bend: 4 m/s, .1 rad/s.
-        heading = 0.01 * hop
-        ego = np.array([40.0 * math.sin(heading), 40.0 * (1.0 - math.cos(heading))])
-        x, y = np.array([30.0, 6.0]) - ego
-        azimuth = math.atan2(y, x) - heading + rng.normal(0.0, 0.01)
-        rate = 4.0 * math.cos(azimuth) / math.hypot(x, y) + rng.normal(0.0, 0.05)
-        odometry = EgoStep(0.4, 0.002, 0.01) if hop else None
-        smoother.update(hop * HOP_NS, {"parked": [Bearing(azimuth, 0.01), Approach(rate, 0.05)]}, odometry)
-    track = smoother.track("parked")
-    off = track.states[-1] - [30.0, 6.0, 0.0, 0.0]
-    assert off @ np.linalg.solve(track.covariance[-1], off) < 13.3  # .99 of chi-square, four degrees
-    assert np.abs(off).max() < 3.0
+        track = smoother.track(str(number))
+        first, sharp = (track.first_sight(side, edge_rad, std) for std in (math.radians(2.0), 0.0))
+        assert first.time_s == sharp.time_s
+        assert sharp.std_s < first.std_s < 0.3
+        errors_s.append(first.time_s - 1e-9 * start - 1.8)
+    assert np.abs(errors_s).max() < 0.2
+    assert track.first_sight(side, 1.5 * side, 0.0) is None
 
 
 def test_what_cannot_be_is_refused():
@@ -220,31 +186,8 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(InvalidArgumentError, match="begin with a bearing or position"):
         smoother.update(0, {"car": [Approach(0.1, 0.1)]})
     smoother.update(HOP_NS, {"car": [Bearing(0.1, 0.1)]})
-    with pytest.raises(InvalidArgumentError, match="expected one of"):
-        smoother.update(2 * HOP_NS, {"car": [PastEdge("nowhere", seen=True)]})
-    with pytest.raises(InvalidArgumentError, match="late"):
-        smoother.update(0, {}, EgoStep(1.0, 0.0, 0.0))
     with pytest.raises(InvalidArgumentError, match="'nobody'"):
         smoother.track("nobody")
-
-
-def test_what_marginalised_entities_left_may_be_summed_at_any_time(monkeypatch):
-    def landmarks(every: int) -> list[np.ndarray]:
-        monkeypatch.setattr(graph, "_SUMMED_EVERY", every)
-        smoother, rng = FixedLagSmoother(), np.random.default_rng(3)
-        smoother.add_corner("left", 1, (5.0, 3.0), (1.0, 0.5))
-        smoother.add_corner("right", -1, (5.0, -3.0), (1.0, 0.5))
-        smoother.add_wall("opposite", 0.0, 8.0, (0.05, 0.5))
-        for hop in range(700):
-            seen = {f"{k}-{(hop + 53 * k) // 160}": crossing((hop + 53 * k) % 160, k, rng) for k in (0, 1)}
-            smoother.update(hop * HOP_NS, seen)
-        found = [part for name in ("left", "right", "opposite") for part in smoother.landmark(name)]
-        return [*found, np.array([smoother.n_factor_slots])]
-
-    summed, apart = landmarks(100), landmarks(10**9)
-    for one, other in zip(summed[:-1], apart[:-1], strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
-    assert summed[-1] < apart[-1]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The past corrected: a fixed-lag smoother over entities, ego and site, beside the filter."""
+"""The past corrected: a fixed-lag smoother over entities, beside the filter."""
 
 import lazy_loader
 

@@ -1,17 +1,14 @@
 """What becomes known between two updates of the incremental smoother, and the smoother itself."""
 
-from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
 
-from .factors import CORNER, EGO, WALL, Factor, kind_of
+from .factors import Factor
 from .observations import SmoothingSettings
-
-# Updates between two sums of what marginalised entities left: a minute at ten a second.
-_SUMMED_EVERY = 600
 
 
 def _parameters() -> Any:
@@ -20,7 +17,7 @@ def _parameters() -> Any:
     parameters = gtsam.ISAM2Params()
     # Otherwise every factor that was ever marginalised keeps its slot: 4432 after 1500 steps, not 44.
     parameters.findUnusedFactorSlots = True
-    # Squared by Cholesky, a pose known to 1e-4 rad beside a range that is not measured is indeterminate.
+    # Squared by Cholesky, a range that is not measured is indeterminate.
     parameters.setFactorization("QR")
     return parameters
 
@@ -63,61 +60,29 @@ class FactorGraph:
         for factor in self._factors:
             graph.push_back(factor)
         for key, value in self._values.items():
-            values.insert(key, gtsam.Pose2(*value) if kind_of(key) == EGO else value)
+            values.insert(key, value)
         self._updates += 1
-        summed = self._summed_marginals(graph) if self._updates % _SUMMED_EVERY == 0 else []
-        self._smoother.update(graph, values, self._times, summed)
+        self._smoother.update(graph, values, self._times)
         # One estimate costs as much as all, a quarter of an update: in between, what variables began with is
         # near enough to begin the next ones with.
         self._near = {} if self._updates % self._every == 0 else self._near | self._values
         self._clear()
-
-    def _summed_marginals(self, graph: Any) -> list[int]:
-        """Add one factor for all that marginalised entities left on the same landmarks; return their slots.
-
-        Every entity that ended at a corner leaves a quadratic one; kept apart, they grow with the hours.
-        """
-        import gtsam
-
-        slots = self._smoother.getFactors()
-        left = defaultdict[tuple[int, ...], list[int]](list)
-        for i in range(slots.size()):
-            if slots.exists(i) and isinstance(slots.at(i), gtsam.LinearContainerFactor):
-                left[tuple(sorted(slots.at(i).keys()))].append(i)
-        alike = {
-            keys: places
-            for keys, places in left.items()
-            if all(kind_of(key) in (CORNER, WALL) for key in keys) and len(places) > 1
-        }
-        for places in alike.values():
-            linear = gtsam.GaussianFactorGraph()
-            for i in places:
-                linear.push_back(slots.at(i).factor())
-            # No linearisation point, as gtsam's own have none: it holds that of their variables fixed.
-            graph.push_back(gtsam.LinearContainerFactor(gtsam.HessianFactor(linear)))
-        return [i for places in alike.values() for i in places]
 
     def value(self, key: int) -> FloatArray:
         """Return an estimate of a variable, no older than the last relinearisation."""
         if key in self._values:
             return self._values[key]
         if key not in self._near:
-            self._near[key] = self._estimate(key)
+            self._near[key] = self._smoother.calculateEstimateVector(key)
         return self._near[key]
-
-    def _estimate(self, key: int) -> FloatArray:
-        if kind_of(key) == EGO:
-            pose = self._smoother.calculateEstimatePose2(key)
-            return np.array([pose.x(), pose.y(), pose.theta()])
-        return self._smoother.calculateEstimateVector(key)  # type: ignore[no-any-return]
 
     @property
     def n_factor_slots(self) -> int:
         """How many factors the graph has room for, used or not."""
         return int(self._smoother.getFactors().size())
 
-    def refined(self) -> "Refined":
-        """Return all that lies within the lag, relinearised until it no longer moves."""
+    def refined(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of variables, all that lies within the lag relinearised to the end."""
         import gtsam
 
         graph, slots = gtsam.NonlinearFactorGraph(), self._smoother.getFactors()
@@ -134,29 +99,4 @@ class FactorGraph:
         # gtsam's `Marginals` know Cholesky only from Python, which finds them indeterminate.
         solved = gtsam.ISAM2(_parameters())
         solved.update(graph, values)
-        return Refined(solved, values)
-
-
-class Refined:
-    """The converged estimate and its covariances."""
-
-    def __init__(self, solved: Any, values: Any) -> None:
-        self._values, self._solved = values, solved
-
-    def value(self, key: int) -> FloatArray:
-        """Return the estimate of a vector variable."""
-        return self._values.atVector(key)  # type: ignore[no-any-return]
-
-    def pose(self, key: int) -> FloatArray:
-        """Return the estimate of a pose."""
-        found = self._values.atPose2(key)
-        return np.array([found.x(), found.y(), found.theta()])
-
-    def covariance(self, key: int) -> FloatArray:
-        """Return the covariance of one variable."""
-        return self._solved.marginalCovariance(key)  # type: ignore[no-any-return]
-
-    def joint_covariance(self, one: int, other: int) -> FloatArray:
-        """Return the covariance of two variables, in this order."""
-        found = self._solved.jointMarginalCovariance([one, other])
-        return np.block([[found.at(a, b) for b in (one, other)] for a in (one, other)])
+        return np.array([*map(values.atVector, keys)]), np.array([*map(solved.marginalCovariance, keys)])

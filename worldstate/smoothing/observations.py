@@ -1,14 +1,13 @@
 """What the smoother takes, settings and observations, and what it gives: a track and its first sight."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.ground import FloatArray, IntArray, in_range, seconds
+from worldstate.belief.kinematics.motion import AZIMUTH, MotionBelief
+from worldstate.ground import FloatArray, IntArray, in_range, seconds, wrap_angle
 from worldstate.measurement import Approach, Bearing, Position
 
 from .geometry import cartesian
@@ -59,79 +58,7 @@ class AngularHeight:
     true_relative_std: float = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class ReflectedBearing:
-    """The azimuth of an entity's image in a wall.
-
-    Parameters
-    ----------
-    wall : str
-        Name of a wall of the smoother.
-    azimuth_rad, std_rad : float
-        As of a bearing.
-
-    Examples
-    --------
-    >>> ReflectedBearing("opposite", 0.4, 0.1).wall
-    'opposite'
-    """
-
-    wall: str
-    azimuth_rad: float
-    std_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class PastEdge:
-    """Whether a sensor that needs line of sight found an entity, which tells where it is beside an edge.
-
-    Parameters
-    ----------
-    corner : str
-        Name of a corner of the smoother.
-    seen : bool
-        Whether it was detected.
-    detection_probability : float
-        Of an entity in line of sight, in (0, 1).
-    clutter_rate : float
-        Probability that a detection is of nothing, in (0, 1).
-
-    Examples
-    --------
-    >>> PastEdge("left", seen=False).detection_probability
-    0.9
-    """
-
-    corner: str
-    seen: bool
-    detection_probability: float = 0.9
-    clutter_rate: float = 0.01
-
-
-@dataclass(frozen=True, slots=True)
-class EgoStep:
-    """How the ego has moved since the last update, in its own axes then.
-
-    Parameters
-    ----------
-    ahead_m, left_m, turn_rad : float
-        Way and turn, left positive.
-    std : (float, float, float)
-        Standard deviations of the three, > 0.
-
-    Examples
-    --------
-    >>> EgoStep(0.5, 0.0, 0.0).std
-    (0.02, 0.02, 0.002)
-    """
-
-    ahead_m: float
-    left_m: float
-    turn_rad: float
-    std: tuple[float, float, float] = (0.02, 0.02, 0.002)
-
-
-Observation: TypeAlias = Bearing | Approach | Position | Range | AngularHeight | ReflectedBearing | PastEdge
+Observation: TypeAlias = Bearing | Approach | Position | Range | AngularHeight
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +80,6 @@ class SmoothingSettings:
         at a lower cost than as white acceleration. None for a Gaussian.
     range_m, range_log_std : float
         Prior of the distance at which an entity is first observed, and its deviation as a factor's logarithm.
-    edge_std_rad : float
-        How sharply line of sight begins at an edge: a vehicle is no point.
     relinearize_every : int
         Updates between two relinearisations.
 
@@ -176,13 +101,12 @@ class SmoothingSettings:
     manoeuvre_k: float | None = None
     range_m: float = 25.0
     range_log_std: float = 0.7
-    edge_std_rad: float = math.radians(1.0)
     # Relinearising at every update costs four times as much and moves the result by less than a percent.
     relinearize_every: int = 10
 
     def __post_init__(self) -> None:
         in_range("lag_s", self.lag_s, 0.0, 600.0, open_low=True)
-        positive = ("acceleration_psd", "robust_k", "range_m", "range_log_std", "edge_std_rad")
+        positive = ("acceleration_psd", "robust_k", "range_m", "range_log_std")
         for name in positive:
             in_range(name, getattr(self, name), 0.0, 1e6, open_low=True)
         if self.manoeuvre_k is not None:
@@ -192,7 +116,7 @@ class SmoothingSettings:
 
 @dataclass(frozen=True, slots=True)
 class FirstSight:
-    """When an entity came into line of sight past a corner, T0.
+    """When an entity came into line of sight past an edge, T0.
 
     Parameters
     ----------
@@ -220,16 +144,14 @@ class SmoothedTrack:
     stamps_ns : ndarray, shape (n,)
         Of its states, in order.
     motion : MotionBelief
-        Polar states about `anchor_m`, mean (n, 4) and covariance (n, 4, 4).
-    anchor_m : ndarray, shape (2,)
-        Where the ego stood when the entity was first observed.
+        Polar states about the ego, mean (n, 4) and covariance (n, 4, 4).
     smoother : {"fixed-lag smoother", "RTS smoother"}
         By which it was made: gtsam's factor graph, or filterpy's where gtsam is not installed.
 
     Examples
     --------
     >>> belief = MotionBelief.stacked([MotionBelief.around((0.0, 0.0, -0.1, 3.0), (0.1, 0.1, 0.1, 0.2))])
-    >>> track = SmoothedTrack("car", np.array([0]), belief, np.zeros(2))
+    >>> track = SmoothedTrack("car", np.array([0]), belief)
     >>> track.states.round(2).tolist(), track.position_std_m.round(1).tolist()
     ([[20.09, 0.0, -2.01, 0.0]], [4.0])
     """
@@ -237,7 +159,6 @@ class SmoothedTrack:
     entity: str
     stamps_ns: IntArray
     motion: MotionBelief
-    anchor_m: FloatArray
     smoother: Literal["fixed-lag smoother", "RTS smoother"] = "fixed-lag smoother"
 
     @property
@@ -247,13 +168,13 @@ class SmoothedTrack:
 
     @property
     def states(self) -> FloatArray:
-        """Mean (x, y, vx, vy) in the map, shape (n, 4)."""
-        return np.array([cartesian(row, self.anchor_m)[0] for row in self.motion.mean])
+        """Mean (x, y, vx, vy), shape (n, 4)."""
+        return np.array([cartesian(row)[0] for row in self.motion.mean])
 
     @property
     def covariance(self) -> FloatArray:
         """Covariance of (x, y, vx, vy), shape (n, 4, 4), to first order."""
-        slopes = np.array([cartesian(row, self.anchor_m)[1] for row in self.motion.mean])
+        slopes = np.array([cartesian(row)[1] for row in self.motion.mean])
         return np.asarray(slopes @ self.motion.covariance @ slopes.mT)
 
     @property
@@ -261,19 +182,29 @@ class SmoothedTrack:
         """Standard deviation of the position along its longest axis, shape (n,)."""
         return np.asarray(np.sqrt(np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, -1]))
 
+    def first_sight(self, side: int, edge_rad: float, edge_std_rad: float) -> FirstSight | None:
+        r"""Return when it last passed the azimuth of an edge, None where it did not within the lag.
 
-def crossing(stamps_ns: Sequence[int], beyond: Sequence[float]) -> tuple[int, float, float] | None:
-    """Return the state after the last passage of an edge, its time, s, and the rate there; None without one.
+        With u the azimuth beyond the edge, side 1 left and -1 right of it,
 
-    Examples
-    --------
-    >>> crossing([0, 10**9], [0.25, -0.25])
-    (1, 0.5, 0.5)
-    """
-    crossed = [i for i in range(1, len(stamps_ns)) if beyond[i - 1] > 0.0 >= beyond[i]]
-    if not crossed:
-        return None
-    i = crossed[-1]
-    step_s = seconds(stamps_ns[i] - stamps_ns[i - 1])
-    share, rate = beyond[i - 1] / (beyond[i - 1] - beyond[i]), (beyond[i - 1] - beyond[i]) / step_s
-    return i, seconds(stamps_ns[i - 1]) + share * step_s, rate
+        .. math:: u(T_0) = 0, \qquad \sigma = \sqrt{\sigma_\theta^2 + \sigma_{edge}^2}\, /\, |\dot u|.
+
+        Examples
+        --------
+        >>> spread = 0.03, 0.1, 0.1, 0.2
+        >>> ends = [MotionBelief.around((at_rad, -0.5, 0.0, 3.0), spread) for at_rad in (0.8, 0.3)]
+        >>> track = SmoothedTrack("car", np.array([0, 10**9]), MotionBelief.stacked(ends))
+        >>> first = track.first_sight(1, edge_rad=0.55, edge_std_rad=0.04)
+        >>> round(first.time_s, 2), round(first.std_s, 2)
+        (0.5, 0.1)
+        """
+        beyond = side * wrap_angle(self.motion.mean[:, AZIMUTH] - edge_rad)
+        crossed = np.flatnonzero((beyond[:-1] > 0.0) & (beyond[1:] <= 0.0))
+        if not crossed.size:
+            return None
+        before, after = int(crossed[-1]), int(crossed[-1]) + 1
+        step_s = seconds(int(self.stamps_ns[after] - self.stamps_ns[before]))
+        passed = float(beyond[before] - beyond[after])
+        time_s = seconds(int(self.stamps_ns[before])) + float(beyond[before]) / passed * step_s
+        spread_rad = math.sqrt(self.motion.covariance[after, AZIMUTH, AZIMUTH] + edge_std_rad**2)
+        return FirstSight(time_s, spread_rad / (passed / step_s))

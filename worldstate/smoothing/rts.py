@@ -14,13 +14,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from worldstate.belief.kinematics.cartesian import CartesianBelief, constant_velocity, polar_motion
-from worldstate.belief.kinematics.motion import AZIMUTH, MotionBelief
-from worldstate.ground import FloatArray, seconds, wrap_angle
+from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.ground import FloatArray, seconds
 from worldstate.ground.extras import optional
 from worldstate.measurement.measurement import Bearing
 
 from .geometry import cartesian
-from .observations import AngularHeight, FirstSight, Observation, SmoothedTrack, crossing
+from .observations import AngularHeight, Observation, SmoothedTrack
 
 # m^2/s^3; hidden places of 259 simulated passes are off by 1.87 m with it, and by 1.34 m with robust losses.
 _ACCELERATION_PSD = 1.0
@@ -45,8 +45,8 @@ def rts_track(
     ('RTS smoother', [7.6, 1.7])
     """
     kalman = optional("filterpy.kalman").KalmanFilter(dim_x=4, dim_z=2)
-    stamps_ns, anchor_m = sorted(observed), np.zeros(2)
-    mean, slope = cartesian(start.mean, anchor_m)
+    stamps_ns = sorted(observed)
+    mean, slope = cartesian(start.mean)
     kalman.x, kalman.P, kalman.H = mean, slope @ start.covariance @ slope.T, np.eye(2, 4)
     means, covariances, flows, noises = [], [], [], []
     for before_ns, stamp_ns in zip([stamps_ns[0], *stamps_ns], stamps_ns, strict=False):
@@ -61,21 +61,7 @@ def rts_track(
         noises.append(_ACCELERATION_PSD * unit)
     means, covariances, _, _ = kalman.rts_smoother(np.array(means), np.array(covariances), flows, noises)
     motion = polar_motion(CartesianBelief(means, covariances), 0.0)
-    return SmoothedTrack(entity, np.array(stamps_ns, np.int64), motion, anchor_m, "RTS smoother")
-
-
-def rts_first_sight(
-    track: SmoothedTrack, side: int, edge_rad: float, edge_std_rad: float
-) -> FirstSight | None:
-    """Return when a track passed the azimuth of an edge, None where it did not; side 1 is left, -1 right."""
-    beyond = side * wrap_angle(track.motion.mean[:, AZIMUTH] - edge_rad)
-    passed = crossing(track.stamps_ns.tolist(), beyond.tolist())
-    if passed is None:
-        return None
-    at, time_s, rate = passed
-    return FirstSight(
-        time_s, math.sqrt(track.motion.covariance[at, AZIMUTH, AZIMUTH] + edge_std_rad**2) / rate
-    )
+    return SmoothedTrack(entity, np.array(stamps_ns, np.int64), motion, "RTS smoother")
 
 
 def _placed(every: Sequence[Observation]) -> tuple[FloatArray, FloatArray] | None:

@@ -1,7 +1,7 @@
 """Smooth every pass of a recording: where a vehicle was while it was hidden, and its T0."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 
@@ -19,7 +19,7 @@ from worldstate.smoothing.observations import (
     SmoothedTrack,
     SmoothingSettings,
 )
-from worldstate.smoothing.rts import rts_first_sight, rts_track
+from worldstate.smoothing.rts import rts_track
 from worldstate.state.context import blind_corner
 
 from .box_tracks import BoxTrack
@@ -36,8 +36,7 @@ _BODIES = {
 _OTHER_BODY = (1.7, 0.7, 0.1)
 # Three pixels of an image that is 69 degrees wide, and what a detector adds at a body's rounded corners.
 _BOX_STD_RAD, _HEIGHT_STD = math.radians(0.4), 0.05
-# Where the corner stands is not seen, only its direction; any distance does for an ego that stands.
-_CORNER_M, _LEAST_EDGE_STD_RAD = 6.0, math.radians(0.5)
+_LEAST_EDGE_STD_RAD = math.radians(0.5)
 # In the two seconds before T0 simulated drivers depart from the pace that they have then as under white
 # acceleration of .015 to .04 m^2/s^3 in the median, .04 to .26 in the mean square; with 1 m^2/s^3 and a scale
 # of 1 the stated variance of hidden places was four times the squared error. In the grid of densities and
@@ -113,34 +112,21 @@ def _smoothed(
 ) -> PassLabel | None:
     observed = _observations(one, camera_ahead_m)
     stamped = {nanoseconds(at * HOP_S): observed[at] for at in sorted(observed)}
-    smooth = _by_rts if find_spec("gtsam") is None else _by_graph
-    track, t0 = smooth(name, one.arm or "", edges[one.arm or ""], stamped)
-    return None if t0 is None else PassLabel(one.arm or "", one.label, t0, track, one.edge_rad)
+    arm = one.arm or ""
+    smooth = rts_track if find_spec("gtsam") is None else _graph_track
+    track = smooth(name, start_of(arm), stamped)
+    t0 = track.first_sight(1 if arm == "left" else -1, *edges[arm])
+    return None if t0 is None else PassLabel(arm, one.label, t0, track, one.edge_rad)
 
 
-def _by_graph(
-    name: str,
-    arm: str,
-    edge: tuple[float, float],
-    observed: dict[int, list[Observation]],
-) -> tuple[SmoothedTrack, FirstSight | None]:
+def _graph_track(
+    name: str, start: MotionBelief, observed: Mapping[int, Sequence[Observation]]
+) -> SmoothedTrack:
     smoother = FixedLagSmoother(_SMOOTHING)
-    place = _CORNER_M * np.array([math.cos(edge[0]), math.sin(edge[0])])
-    smoother.add_corner("edge", 1 if arm == "left" else -1, place.tolist(), (_CORNER_M * edge[1],) * 2)
-    smoother.begin(name, min(observed), start_of(arm))
+    smoother.begin(name, min(observed), start)
     for stamp_ns, every in observed.items():
         smoother.update(stamp_ns, {name: every})
-    return smoother.track(name), smoother.first_sight(name, "edge")
-
-
-def _by_rts(
-    name: str,
-    arm: str,
-    edge: tuple[float, float],
-    observed: dict[int, list[Observation]],
-) -> tuple[SmoothedTrack, FirstSight | None]:
-    track = rts_track(name, start_of(arm), observed)
-    return track, rts_first_sight(track, 1 if arm == "left" else -1, *edge)
+    return smoother.track(name)
 
 
 def _observations(one: BoxTrack, camera_ahead_m: float) -> dict[int, list[Observation]]:
