@@ -7,7 +7,7 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
   --protocol transfer  learn on windows of a standing ego, predict those of --group
 
   --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right).
-                       Keys that end in _absent are of eq. (6) with the visible explanation removed
+                       The row baseline_absent is of eq. (6) with the visible explanation removed
   --method worldstate  windows compared with what their site sounds like; mirror-symmetric ensemble; eq. (6)
                        with the visible explanation removed. "rows" and "gains" compare it with the baseline,
                        with the untrained loudest direction, and with itself under the other references.
@@ -24,6 +24,7 @@ Figures are means over the seeds; intervals are the middle 95 % of 500 bootstrap
 same for every method.
 
 With --model a finished model is evaluated instead; it is refused where it was trained on these recordings.
+Keys that end in _absent are of eq. (6) with the visible explanation removed.
 """
 
 import argparse
@@ -119,7 +120,7 @@ def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArra
 
 
 def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> dict[str, Any]:
-    """Return the mean figures over all passes (seeds), with their standard deviation between seeds."""
+    """Return the mean figures over all passes (seeds), of both statistics."""
     published, absent = ([one[beta] for one in passes] for beta in (1.0, 0.0))
     figures, others = ([window_figures(table, one) for one in some] for some in (published, absent))
     # The posteriors, and so the classes, are the same.
@@ -127,7 +128,6 @@ def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> d
     return {
         **mean_figures(figures),
         **means,
-        "seed_std": {key: np.std(np.array([one[key] for one in figures], float)).item() for key in DEVIATING},
         **count_windows(table),
         "per_group": report_groups(table, published),
     }
@@ -278,12 +278,13 @@ def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]
 def _row_figures(
     table: FeatureTable, passes: Sequence[Predictions], draws: Mapping[str, FloatArray], alpha: float
 ) -> dict[str, Any]:
-    figures = mean_figures([window_figures(table, one) for one in passes])
-    n = int(table.hazard_free.sum())
+    by_seed = [window_figures(table, one) for one in passes]
+    figures, n = mean_figures(by_seed), int(table.hazard_free.sum())
     # Probability of as many false positives or more, were the true rate the budget.
     p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
     return {
         **figures,
+        "seed_std": {key: np.std(np.array([one[key] for one in by_seed], float)).item() for key in DEVIATING},
         "fpr_p_value": p_value,
         "intervals": {name: middle(one) for name, one in draws.items()},
     }
@@ -354,10 +355,9 @@ def _evaluate_method(
 ) -> tuple[Report, list[Predictions]]:
     row = row_of(arguments.method, arguments.protocol, arguments.reference)
     passes = _passes(arguments, whole, table, row)
-    detail = report(table, passes[row]) if row == "baseline" else {}
     compared = comparison(table, passes, row, arguments.alpha)
     origin = _origin(arguments, arguments.method, arguments.protocol, arguments.seeds)
-    return origin | {"row": row} | detail | compared, row_predictions(passes, row)
+    return origin | {"row": row} | compared, row_predictions(passes, row)
 
 
 def _passes(
