@@ -9,12 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from worldstate_lab.cli.place import WALLS, followed_places, place_models, simulated_pass
-from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter, PlaceMeasurements
+from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter, added_position
 from worldstate_lab.places.spectrum_model import SpectrumModel, StreetWalls, sound_paths
 
 from worldstate.frontend import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.measurement import Measurement, PositionScan
 
 AZIMUTHS = np.radians(np.linspace(90.0, -90.0, 61))
 HZ = np.arange(200.0, 2000.0, 300.0)
@@ -122,18 +121,22 @@ def test_a_prediction_moves_the_mean_by_its_speed() -> None:
 
 
 def test_what_is_passed_on_completes_what_was_known() -> None:
-    adapter, heard = PlaceMeasurements(PLACES), plane_waves(-62.0, 32.0)
-    sent: list[Measurement | PositionScan] = []
-    for hop in range(1, 31):
-        sent += adapter.measure(hop * 100_000_000, heard)
-    scans = [one for one in sent if isinstance(one, PositionScan)]
-    assert adapter.estimate.stated
-    # The first scan alone is nearly the belief: before it nothing was known.
-    (first,) = scans[0].positions
-    assert first.position_m[1] == pytest.approx(adapter.estimate.mean_m, abs=2.0)
+    belief = carried = PLACES.unknown
+    for _ in range(10):
+        belief = PLACES.update(PLACES.predict(belief, 0.1), plane_waves(-62.0, 32.0))
+        carried = PLACES.predict(carried, 0.1)
+    now, before = PLACES.estimate(belief), PLACES.estimate(carried)
+    assert now.stated and not before.stated
+    # The first second alone is nearly the belief: before it nothing was known.
+    first = added_position(now, before, MODEL.walls.crossing_m)
+    assert first is not None
+    assert first.position_m[1] == pytest.approx(now.mean_m, abs=2.0)
     assert first.position_m[1] > MODEL.walls.sight_m[1]
-    with pytest.raises(InvalidArgumentError, match="stamp_ns"):
-        adapter.measure(1, heard)
+    # Both together are the belief again.
+    weights = 1.0 / first.covariance[1][1], before.std_m**-2
+    whole = (weights[0] * first.position_m[1] + weights[1] * before.mean_m) / sum(weights)
+    assert (whole, sum(weights)) == pytest.approx((now.mean_m, now.std_m**-2))
+    assert added_position(before, before, MODEL.walls.crossing_m) is None
 
 
 def test_the_example_gives_an_entity_its_place() -> None:

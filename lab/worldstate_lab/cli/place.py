@@ -33,11 +33,11 @@ from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
-from worldstate.ground.values import nanoseconds
+from worldstate.ground.values import nanoseconds, seconds
 from worldstate.simulation.dataset.recording import simulate_recording
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.settings import SimulationSettings
-from worldstate_lab.places.place_filter import PlaceEstimate, PlaceFilter, PlaceMeasurements
+from worldstate_lab.places.place_filter import PlaceEstimate, PlaceFilter
 from worldstate_lab.places.spectrum_model import RayModel, SpectrumModel, StreetWalls
 from worldstate_lab.report.table import Table
 
@@ -210,10 +210,13 @@ def _recordings(
 
 def followed_places(places: PlaceFilter, table: SpectrumTable) -> list[PlaceEstimate]:
     """Return what is said after every spectrum of a recording."""
-    adapter, said = PlaceMeasurements(places), []
-    for time_s, spectrum in zip(table.time_s.tolist(), table.spectra, strict=True):
-        adapter.measure(nanoseconds(time_s), spectrum)
-        said.append(adapter.estimate)
+    belief, said = places.unknown, []
+    # Whole nanoseconds: equal hops share one transition of the filter.
+    stamps_ns = [nanoseconds(time_s) for time_s in table.time_s.tolist()]
+    before_ns = stamps_ns[:1] + stamps_ns[:-1]
+    for stamp_ns, last_ns, spectrum in zip(stamps_ns, before_ns, table.spectra, strict=True):
+        belief = places.update(places.predict(belief, seconds(stamp_ns - last_ns)), spectrum)
+        said.append(places.estimate(belief))
     return said
 
 
