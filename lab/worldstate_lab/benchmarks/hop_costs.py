@@ -5,15 +5,13 @@ chain is repeated here. The window model is the one that ships. Trees and guard 
 `worldstate model make` trains: what they cost does not depend on what they have learned. `published_chain`
 restates the chain of the published acoustic baseline in its amortised form: scipy's STFT of the whole file,
 channel by channel, its cost shared among the hops; then for every hop two segments of half a second through
-pyroomacoustics' SRP, thirty azimuths, 50-1500 Hz. `published_chain_per_call` is the same where the sound
-comes as a stream, so that every hop transforms its own second.
+pyroomacoustics' SRP, thirty azimuths, 50-1500 Hz.
 """
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
-from importlib.util import find_spec
 from typing import Any
 from unittest.mock import patch
 
@@ -37,21 +35,17 @@ from worldstate.frontend.levels import LevelMeter
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
+from worldstate.ground.typing import Float32Array
 
 Milliseconds = list[float]
 Stages = Mapping[str, tuple[tuple[Any, str], ...]]
 
 RATE_HZ, NFFT = 47_998, 512
-GOAL: Stages = {
+FRONT_END: Stages = {
     "stft": ((StreamingStft, "push"),),
     "phat": ((hop_spectra, "power"), (hop_spectra, "whiten")),
     "srp181": ((hop_spectra, "steered_power"), (FrontEnd, "_srp")),
     "feature": ((hop_spectra, "cross_spectra"), (hop_spectra, "pair_sum_of"), (FrontEnd, "_feature")),
-}
-"""Stages of the first goal, by the functions that do their work."""
-FRONT_END: Stages = {
-    **GOAL,
     "peaks": ((stream, "highest_peaks"),),
     "bands": ((LevelMeter, "push"),),
     "looming": ((FrontEnd, "_looming"),),
@@ -122,57 +116,27 @@ def _clocked(stage: Callable[..., Any], name: str, spent: dict[str, float]) -> C
 
 
 REPEATS = 9
-SRP_BAND_HZ, FEATURE_BAND_HZ = [300.0, 1800.0], [50.0, 1500.0]
 
 
-def peer_times(
-    sound: Float32Array, frames: Complex64Array, azimuths_rad: FloatArray
-) -> dict[str, Milliseconds]:
-    """Return milliseconds per hop of each peer, keys beginning with ``peer_``; empty where none is installed.
-
-    Shapes: sound (n, M), frames (frames, bins, M), azimuths_rad (D,).
-    """
-    if find_spec("pyroomacoustics") is None:
-        return {}
+def published_chain_times(sound: Float32Array) -> Milliseconds:
+    """Return milliseconds per hop of the published chain on a sound, shape (n, M)."""
     import pyroomacoustics
-
-    positions = roof_array_56().positions_m.T
-    spectra = np.ascontiguousarray(frames.transpose(2, 1, 0))
-
-    def on_a_tenth(method: Any) -> Milliseconds:
-        peer = method(positions, RATE_HZ, NFFT, azimuth=azimuths_rad)
-        locate = partial(peer.locate_sources, spectra, freq_range=SRP_BAND_HZ)
-        return [elapsed_ms(locate) for _ in range(REPEATS)]
-
-    file_ms, halves_ms, second_ms = _published_chain(sound, pyroomacoustics.doa.SRP)
-    shared_ms = 0.1 * file_ms * RATE_HZ / len(sound)
-    return {
-        "peer_pyroomacoustics_srp": on_a_tenth(pyroomacoustics.doa.SRP),
-        "peer_pyroomacoustics_music": on_a_tenth(pyroomacoustics.doa.MUSIC),
-        "peer_published_chain": [ms + shared_ms for ms in halves_ms],
-        "peer_published_chain_per_call": [ms + second_ms for ms in halves_ms],
-    }
-
-
-def _published_chain(sound: Float32Array, method: Any) -> tuple[float, Milliseconds, float]:
-    """Return the STFT of the file, SRP of two half seconds several times, and the STFT of one second."""
     from scipy.signal import stft
 
     def transform(part: Float32Array) -> list[Any]:
         return [stft(channel, RATE_HZ, nperseg=NFFT)[2] for channel in part.T]
 
-    file_ms = elapsed_ms(lambda: transform(sound))
-    second_ms = elapsed_ms(lambda: transform(sound[:RATE_HZ]))
+    shared_ms = 0.1 * elapsed_ms(partial(transform, sound)) * RATE_HZ / len(sound)
     second = np.stack(transform(sound[:RATE_HZ]))
     azimuths = np.radians(np.linspace(-90.0, 90.0, 30))
-    peer = method(roof_array_56().positions_m.T, RATE_HZ, NFFT, azimuth=azimuths)
+    peer = pyroomacoustics.doa.SRP(roof_array_56().positions_m.T, RATE_HZ, NFFT, azimuth=azimuths)
     half = second.shape[2] // 2
 
     def one_hop() -> None:
         for segment in (second[..., :half], second[..., half : 2 * half]):
-            peer.locate_sources(segment, freq_range=FEATURE_BAND_HZ)
+            peer.locate_sources(segment, freq_range=[50.0, 1500.0])
 
-    return file_ms, [elapsed_ms(one_hop) for _ in range(REPEATS)], second_ms
+    return [elapsed_ms(one_hop) + shared_ms for _ in range(REPEATS)]
 
 
 ROUNDS, LEAVES = 60, 8  # A round is a tree for each group
@@ -181,7 +145,7 @@ _ROWS, _WINDOWS = 150, 40  # Few: the peers' cost does not depend on them either
 
 
 def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:
-    """Time the evidence and its parts on every frame, and two peers, keys beginning with ``peer_``."""
+    """Time the evidence and its parts on every frame, and two peers."""
     # A limit holds for libraries that are loaded. On a busy machine two threads wait for one another at every
     # one of 900 small trees, for minutes.
     import sklearn.ensemble  # noqa: F401
@@ -194,8 +158,8 @@ def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:
         # Before, trees are not asked.
         times = {name: spent[LEAST_HOPS:] for name, spent in times.items()}
         classify, window = _peer_classifier(rng).decision_function, frames[-1].feature[None]
-        times["peer_scikit_learn_trees"] = [elapsed_ms(partial(trees.predict_proba, two)) for two in rows]
-        times["peer_scikit_learn_classifier"] = [elapsed_ms(partial(classify, window)) for _ in rows]
+        times["scikit_learn_trees"] = [elapsed_ms(partial(trees.predict_proba, two)) for two in rows]
+        times["scikit_learn_classifier"] = [elapsed_ms(partial(classify, window)) for _ in rows]
     return times
 
 

@@ -9,6 +9,7 @@ import argparse
 import os
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
@@ -19,34 +20,34 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import roof_array_56
-from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.music import music_spectrum, signal_subspace
-from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.checks import in_range
-from worldstate.ground.typing import Complex64Array, Float32Array
+from worldstate.ground.typing import Float32Array
 from worldstate_lab.benchmarks.hop_costs import (
     FRONT_END,
-    GOAL,
-    NFFT,
     RATE_HZ,
     Milliseconds,
     elapsed_ms,
     evidence_times,
-    peer_times,
+    published_chain_times,
     stage_times,
 )
 
 EXAMPLE = "example: worldstate-lab bench"
 
 SECONDS = 6
-SRP_BINS, AZIMUTHS_RAD = range(3, 19), np.radians(np.arange(-90.0, 91.0))
 # Running seconds are full after ten hops, and caches warm.
 WARM_UP_HOPS = 11
 EVERYTHING = FrontEndSettings(tone_band_hz=ENGINE_BAND_HZ, character=True)
+FEATURE_CHAIN = ("stft", "phat", "feature")
+AGAINST = {
+    "published_chain": "feature_chain",
+    "scikit_learn_trees": "sequence_reader",
+    "scikit_learn_classifier": "window_evidence",
+}
+"""Row of ours that does the work of a peer."""
 SETTINGS = {
     "stages": "56 channels, 47,998 Hz, Hann 512, hop 256, 18 or 19 new frames a hop; STFT bins 1-18; SRP "
     "bins 3-18, 181 azimuths; feature bins 1-15, 30 azimuths x 2 halves; "
@@ -54,10 +55,6 @@ SETTINGS = {
     "published_chain": "per hop: scipy.signal.stft of the file, channel by channel, its cost shared among "
     "the hops; pyroomacoustics SRP, 30 azimuths, 50-1500 Hz (bins 1-15), on each half of one second; against "
     "stft + phat + feature",
-    "published_chain_per_call": "the same with the STFT of the second computed on every hop",
-    "pyroomacoustics_srp": "the same 19 frames of a tenth of a second, 181 azimuths, 300-1800 Hz (bins "
-    "3-18); against srp181_on_a_tenth",
-    "pyroomacoustics_music": "the same 19 frames, azimuths and bins, 1 source; against music_on_a_tenth",
     "scikit_learn_trees": "the two rows of a hop through 60 rounds of 15 trees of 8 leaves, as a histogram "
     "classifier; against sequence_reader, its inputs included",
     "scikit_learn_classifier": "the published linear machines on one window, without probabilities; against "
@@ -89,16 +86,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 def report_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the report for people."""
-    blas, threads, rounds = ", ".join(report["blas"]), report["threads"], report["rounds"]
-    total = {"median_ms": report["total_ms"], "p99_ms": report["p99_ms"]}
-    rows = report["stages"] | {"STFT + PHAT + SRP181 + feature": total}
-    return [
-        f"BLAS {blas}; {threads} thread; median of {rounds} rounds; load {report['load']:.1f}; ms per hop",
-        *(f"  {name:32s} {one['median_ms']:9.3f}   p99 {one['p99_ms']:9.3f}" for name, one in rows.items()),
-        *(f"  peer {name:27s} {median:9.3f}" for name, median in report["peers"].items()),
-        *(f"  ratio {name:26s} {ratio:9.1f}" for name, ratio in report["ratios"].items()),
-        *(f"{name}: {setting}" for name, setting in report["settings"].items()),
-    ]
+    blas, rounds = ", ".join(report["blas"]), report["rounds"]
+    lines = [f"BLAS {blas}; 1 thread; median of {rounds} rounds; load {report['load']:.1f}; ms per hop"]
+    for name, one in report["costs"].items():
+        ratio = f"   {report['ratios'][name]:5.1f} of {AGAINST[name]}" if name in report["ratios"] else ""
+        lines.append(f"  {name:32s} {one['median_ms']:9.3f}   p99 {one['p99_ms']:9.3f}{ratio}")
+    return lines + [f"{name}: {setting}" for name, setting in report["settings"].items()]
 
 
 def _source(rng: np.random.Generator) -> Float32Array:
@@ -119,16 +112,16 @@ def _kernel(info: Mapping[str, Any]) -> str:
 
 def _one_round(street: Float32Array) -> Mapping[str, Milliseconds]:
     hops = _hops(street)
-    spectra = StreamingStft(56, NFFT, range(NFFT // 2 + 1)).push(street[:5000])[:19]
     plain, _ = processed(hops, FrontEndSettings())
     everything, heard = processed(hops, EVERYTHING)
     ours = stage_times(FRONT_END, processed(hops, EVERYTHING)[0])
-    ours["goal"] = [sum(parts) for parts in zip(*(ours[name] for name in GOAL), strict=True)]
-    whole = {"front_end": plain, "everything": everything}
-    ours |= {name: [elapsed_ms(hop) for hop in calls] for name, calls in whole.items()}
+    ours["feature_chain"] = [sum(parts) for parts in zip(*map(ours.get, FEATURE_CHAIN), strict=True)]
+    for name, calls in (("front_end", plain), ("everything", everything)):
+        ours[name] = [elapsed_ms(hop) for hop in calls]
     ours = {name: times[WARM_UP_HOPS:] for name, times in ours.items()}
-    ours |= _on_a_tenth(spectra) | evidence_times(heard)
-    return ours | peer_times(street, spectra, AZIMUTHS_RAD)
+    installed = find_spec("pyroomacoustics") is not None
+    peer = {"published_chain": published_chain_times(street)} if installed else {}
+    return ours | evidence_times(heard) | peer
 
 
 def _hops(sound: Float32Array) -> list[Float32Array]:
@@ -148,44 +141,20 @@ def processed(
     return [partial(process, samples) for samples in hops], heard
 
 
-def _on_a_tenth(frames: Complex64Array) -> dict[str, Milliseconds]:
-    """Time SRP and MUSIC on exactly the frames that the peers get."""
-    used = np.ascontiguousarray(frames[:, SRP_BINS.start : SRP_BINS.stop])
-    frequencies = bin_frequencies_hz(SRP_BINS, RATE_HZ, NFFT)
-    beams = Steering.towards(roof_array_56(), frequencies, AZIMUTHS_RAD)
-    responses = roof_array_56().steering(frequencies, AZIMUTHS_RAD).astype(np.complex64)
-    calls: dict[str, Callable[[], object]] = {
-        "srp181_on_a_tenth": lambda: srp_phat(used, beams),
-        "music_on_a_tenth": lambda: music_spectrum(signal_subspace(used, 1), responses),
-    }
-    return {name: [elapsed_ms(call) for _ in range(40)] for name, call in calls.items()}
-
-
 def _report(runs: list[Mapping[str, Milliseconds]], kernels: tuple[str, ...]) -> dict[str, Any]:
-    medians = {name: float(np.median([np.median(run[name]) for run in runs])) for name in runs[0]}
-    p99 = {name: float(np.median([np.percentile(run[name], 99) for run in runs])) for name in runs[0]}
-    ours = {name for name in medians if not name.startswith("peer_")}
-    peers = {name.removeprefix("peer_"): ms for name, ms in medians.items() if name not in ours}
-    chain_ms = sum(medians[name] for name in GOAL if name != "srp181")
-    work_ms = {
-        "published_chain": chain_ms,
-        "published_chain_per_call": chain_ms,
-        "pyroomacoustics_srp": medians["srp181_on_a_tenth"],
-        "pyroomacoustics_music": medians["music_on_a_tenth"],
-        "scikit_learn_trees": medians["sequence_reader"],
-        "scikit_learn_classifier": medians["window_evidence"],
+    costs = {
+        name: {
+            "median_ms": float(np.median([np.median(run[name]) for run in runs])),
+            "p99_ms": float(np.median([np.percentile(run[name], 99) for run in runs])),
+        }
+        for name in runs[0]
     }
-    shown = {name: {"median_ms": medians[name], "p99_ms": p99[name]} for name in medians if name in ours}
-    total = shown.pop("goal")
+    pairs = [(peer, one) for peer, one in AGAINST.items() if peer in costs]
     return {
         "blas": kernels,
-        "threads": 1,
         "rounds": len(runs),
         "load": os.getloadavg()[0],  # Of the machine over the last minute, at the end
         "settings": SETTINGS,
-        "stages": shown,
-        "total_ms": total["median_ms"],
-        "p99_ms": total["p99_ms"],
-        "peers": peers,
-        "ratios": {name: peers[name] / ms for name, ms in work_ms.items() if name in peers},
+        "costs": costs,
+        "ratios": {peer: costs[peer]["median_ms"] / costs[one]["median_ms"] for peer, one in pairs},
     }
