@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.approach.looming import EnergyFloor, Looming, fitted_looming
+from worldstate.frontend.approach.looming import EnergyFloor, Looming, looming
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of, highest_peaks
@@ -338,4 +338,4 @@ class FrontEnd:
         low, high = LOOMING_BAND_HZ
         scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
         noise = self._energy_floor.read(float(energies.min()), scatter)
-        return fitted_looming(times, np.log(energies), scatter, noise.mean, noise.std)
+        return looming(times, np.log(energies), scatter, noise.mean, noise.std)

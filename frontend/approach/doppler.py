@@ -16,12 +16,12 @@ from numpy.polynomial import legendre
 from scipy.optimize import OptimizeResult, least_squares
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
-from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
+from worldstate.ground import FloatArray, NotUsable
 
 from .engine_line import HarmonicTrack
 
 # Limits of the fit: a slower source has no visible S-curve, a farther one no audible line.
-SLOWEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 0.3, 300.0
+SLOWEST_M_S, FASTEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 40.0, 0.3, 300.0
 # Starting points of the fit, because chi-squared has local minima: times of the closest approach as shares of
 # the track, and pairs of speed and range.
 START_PLACES = (-0.1, 0.15, 0.35, 0.5, 0.65, 0.85, 1.1)
@@ -53,9 +53,7 @@ class PassBy:
     chi_squared: float  # Sum of squared normalised residuals
 
 
-def radial_speed_m_s(
-    time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float, sound_m_s: float
-) -> FloatArray:
+def radial_speed_m_s(time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float) -> FloatArray:
     r"""Return the radial speed at emission of the sound that arrives at `time_s`, positive while receding.
 
     .. math:: v_r = \frac{v^2 s}{\sqrt{d^2 + v^2 s^2}}, \qquad
@@ -63,22 +61,16 @@ def radial_speed_m_s(
 
     Examples
     --------
-    >>> radial_speed_m_s(np.array([-100.0, 0.01, 100.0]), 15.0, 0.0, 3.43, 343.0).round(2)
+    >>> radial_speed_m_s(np.array([-100.0, 0.01, 100.0]), 15.0, 0.0, 3.43).round(2)
     array([-15.,   0.,  15.])
     """
-    c, v, d = sound_m_s, speed_m_s, range_m
+    c, v, d = SPEED_OF_SOUND_M_S, speed_m_s, range_m
     T = time_s - closest_s
     emission = (c**2 * T - np.sqrt(d**2 * (c**2 - v**2) + (v * c * T) ** 2)) / (c**2 - v**2)
     return np.asarray(v**2 * emission / np.sqrt(d**2 + (v * emission) ** 2))
 
 
-def fit_pass_by(
-    time_s: FloatArray,
-    frequency_hz: FloatArray,
-    std_hz: FloatArray,
-    max_speed_m_s: float,
-    sound_m_s: float,
-) -> PassBy:
+def fit_pass_by(time_s: FloatArray, frequency_hz: FloatArray, std_hz: FloatArray) -> PassBy:
     r"""Fit the four parameters by weighted least squares from several starting points.
 
     .. math:: \chi^2 = \min_{f_0, v, \tau_0, d} \sum_k
@@ -89,10 +81,10 @@ def fit_pass_by(
     """
     duration = float(np.ptp(time_s))
     low = np.array([0.7 * frequency_hz.min(), SLOWEST_M_S, time_s[0] - 2 * duration - 1, NEAREST_M])
-    high = np.array([1.4 * frequency_hz.max(), max_speed_m_s, time_s[-1] + 2 * duration + 1, FARTHEST_M])
+    high = np.array([1.4 * frequency_hz.max(), FASTEST_M_S, time_s[-1] + 2 * duration + 1, FARTHEST_M])
 
     def residuals(values: FloatArray) -> FloatArray:
-        received = values[0] / (1 + _radial_speed(time_s, values, sound_m_s) / sound_m_s)
+        received = values[0] / (1 + radial_speed_m_s(time_s, *values[1:]) / SPEED_OF_SOUND_M_S)
         return np.asarray((received - frequency_hz) / std_hz)
 
     scale = np.array([frequency_hz.mean() * 0.01, 5.0, 0.5, 5.0])
@@ -109,7 +101,7 @@ def fit_pass_by(
     return PassBy(best.x, covariance, 2.0 * float(best.cost))
 
 
-def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: float) -> FloatArray:
+def radial_speed_gradient(time_s: FloatArray, values: FloatArray) -> FloatArray:
     r"""Differentiate the radial speed by (f_0, v, tau_0, d) with central differences, shape (K, 4).
 
     .. math:: \frac{\partial v_r}{\partial p_i} \approx \frac{v_r(p + h_i) - v_r(p - h_i)}{2 h_i}, \qquad
@@ -119,21 +111,16 @@ def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: flo
 
     Examples
     --------
-    >>> radial_speed_gradient(np.array([60.0]), np.array([100.0, 12.0, 0.0, 5.0]), 343.0).round(3) + 0.0
+    >>> radial_speed_gradient(np.array([60.0]), np.array([100.0, 12.0, 0.0, 5.0])).round(3) + 0.0
     array([[0., 1., 0., 0.]])
     """
     columns = [np.zeros_like(time_s)]
     for k in (1, 2, 3):
         step = np.zeros(4)
         step[k] = 1e-5 * max(1.0, abs(values[k]))
-        ahead, behind = (_radial_speed(time_s, values + side, sound_m_s) for side in (step, -step))
+        ahead, behind = (radial_speed_m_s(time_s, *(values + side)[1:]) for side in (step, -step))
         columns.append((ahead - behind) / (2 * step[k]))
     return np.stack(columns, axis=1)
-
-
-def _radial_speed(time_s: FloatArray, values: FloatArray, sound_m_s: float) -> FloatArray:
-    _, speed, closest, distance = values
-    return radial_speed_m_s(time_s, float(speed), float(closest), float(distance), sound_m_s)
 
 
 def _starts(time_s: FloatArray, frequency_hz: FloatArray) -> list[FloatArray]:
@@ -204,9 +191,7 @@ class RadialSpeed:
     misfit: float
 
 
-def radial_speed(
-    track: HarmonicTrack, *, min_partials: int = 1, max_speed_m_s: float = 40.0
-) -> RadialSpeed | NotUsable:
+def radial_speed(track: HarmonicTrack, *, min_partials: int = 1) -> RadialSpeed | NotUsable:
     r"""Estimate the radial speed from a tracked engine line, or return the reason why it is not identifiable.
 
     The S-curve with k = 4 parameters (f_0, v, tau_0, d) is compared with a constant line and with polynomial
@@ -221,9 +206,6 @@ def radial_speed(
     min_partials : int
         Fewest harmonics (median over windows); with 1 a single tone is accepted, without a check of
         agreement.
-    max_speed_m_s : float
-        Highest speed. An engine whose speed falls during the pass-by looks like a faster vehicle: in town,
-        set the speed that is driven there.
 
     Returns
     -------
@@ -231,11 +213,6 @@ def radial_speed(
         The reason is one of: too few windows, too few harmonics, harmonics that disagree, a constant line, a
         line explained as well by drift, a line that no S-curve explains, a level that does not follow the
         range, or too large a variance.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the track is not finite or its arrays differ in length.
 
     Notes
     -----
@@ -251,7 +228,7 @@ def radial_speed(
     Examples
     --------
     >>> t = np.arange(0.0, 4.0, 0.1)
-    >>> v_r = radial_speed_m_s(t, 12.0, 2.0, 5.0, 343.0)
+    >>> v_r = radial_speed_m_s(t, 12.0, 2.0, 5.0)
     >>> ones, level_db = np.ones(40), -20 * np.log10(np.hypot(5, 12 * (t - 2)))
     >>> rest = (1e-4 * ones, ones.astype(int), 0 * ones, level_db, 40)
     >>> moving = radial_speed(HarmonicTrack(t, 100 / (1 + v_r / 343), *rest))
@@ -260,13 +237,12 @@ def radial_speed(
     >>> radial_speed(HarmonicTrack(t, 100 * ones, *rest))
     NotUsable(reason='the line does not move: its frequency at rest is unknown')
     """
-    time, frequency, variance = _checked(track)
-    in_range("max_speed_m_s", max_speed_m_s, 1.0, 100.0)
+    time, frequency = track.time_s, track.frequency_hz
     insufficient = _insufficient(track, min_partials)
     if insufficient is not None:
         return insufficient
-    std = np.sqrt(variance + (_JITTER * frequency) ** 2)
-    fit = fit_pass_by(time, frequency, std, max_speed_m_s, SPEED_OF_SOUND_M_S)
+    std = np.sqrt(track.variance_hz2 + (_JITTER * frequency) ** 2)
+    fit = fit_pass_by(time, frequency, std)
     speed = _read_out(time, fit)
     rejected = _rejected(time, frequency, std, fit) or _wrong_level(track.level_db, speed)
     if rejected is not None:
@@ -275,18 +251,6 @@ def radial_speed(
     if not typical <= _MOST_STD_M_S:
         return NotUsable(f"radial speed known to {typical:.1f} m/s only, more than {_MOST_STD_M_S:g}")
     return speed
-
-
-def _checked(track: HarmonicTrack) -> tuple[FloatArray, FloatArray, FloatArray]:
-    time = finite_array("time_s", track.time_s, (None,))
-    frequency = finite_array("frequency_hz", track.frequency_hz, time.shape)
-    variance = finite_array("variance_hz2", track.variance_hz2, time.shape)
-    finite_array("n_partials", track.n_partials, time.shape)
-    finite_array("misfit", track.misfit, time.shape)
-    finite_array("level_db", track.level_db, time.shape)
-    if np.any(frequency <= 0) or np.any(variance < 0) or np.any(np.diff(time) <= 0):
-        raise InvalidArgumentError("track: expected ascending times, frequencies > 0 and variances >= 0")
-    return time, frequency, variance
 
 
 def _insufficient(track: HarmonicTrack, min_partials: int) -> NotUsable | None:
@@ -343,18 +307,17 @@ def _wrong_level(level_db: FloatArray, speed: RadialSpeed) -> NotUsable | None:
 
 
 def _read_out(time: FloatArray, fit: PassBy) -> RadialSpeed:
-    sound = SPEED_OF_SOUND_M_S
     f0, v, closest, d = (float(x) for x in fit.values)
     misfit = fit.chi_squared / (len(time) - PARAMETERS)
-    gradient = radial_speed_gradient(time, fit.values, sound)
+    gradient = radial_speed_gradient(time, fit.values)
     variance = np.einsum("ki,ij,kj->k", gradient, fit.covariance, gradient) * max(misfit, 1.0)
     return RadialSpeed(
         time_s=time,
-        radial_speed_m_s=radial_speed_m_s(time, v, closest, d, sound),
+        radial_speed_m_s=radial_speed_m_s(time, v, closest, d),
         variance_m2_s2=variance,
         rest_frequency_hz=f0,
         speed_m_s=v,
         closest_range_m=d,
-        closest_time_s=closest + d / sound,
+        closest_time_s=closest + d / SPEED_OF_SOUND_M_S,
         misfit=misfit,
     )

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array
 
 # Two parameters and a scatter of their own need two degrees of freedom.
 MIN_POINTS = 4
@@ -115,8 +115,7 @@ def looming(
     Raises
     ------
     InvalidArgumentError
-        On fewer than four points, another shape, unsorted times, negative noise or numbers that are not
-        finite.
+        On fewer than four points, another shape, unsorted times or numbers that are not finite.
 
     References
     ----------
@@ -140,32 +139,19 @@ def looming(
     """
     times = finite_array("times_s", times_s, (None,))
     energies = finite_array("log_energy", log_energy, times.shape)
-    floor = in_range("floor_std", floor_std, 0.0, np.inf, open_low=True, open_high=True)
-    if len(times) < MIN_POINTS or np.any(np.diff(times) <= 0.0):
-        raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, got {times}")
-    noise = in_range("noise_energy", noise_energy, 0.0, np.inf, open_high=True)
-    noise_std = in_range("noise_energy_std", noise_energy_std, 0.0, np.inf, open_high=True)
-    return fitted_looming(times, energies, floor, noise, noise_std)
-
-
-def fitted_looming(
-    times: FloatArray, energies: FloatArray, floor: float, noise: float = 0.0, noise_std: float = 0.0
-) -> Looming | NotUsable:
-    """Return what `looming` does for arrays that are finite and fit each other.
-
-    Shapes: times (n,), energies (n,).
-    """
+    if len(times) < MIN_POINTS or np.any(np.diff(times) <= 0.0) or not floor_std > 0.0:
+        raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, floor_std > 0")
     level = float(energies.mean())
     scale = np.exp(-level)
     exponential = _fit_line(times, energies - level, np.ones_like(times))
-    source = _fit_source(times, np.exp(energies - level), noise * scale)
+    source = _fit_source(times, np.exp(energies - level), noise_energy * scale)
     if source is None:
         return NotUsable("range reaches zero within the window")
     if min(exponential.scatter, source.scatter) > MAX_LOG_STD:
         return NotUsable("energy scatters by more than 3 dB about the fit")
-    if source.level**-2 < _LEAST_RATIO * noise * scale:
+    if source.level**-2 < _LEAST_RATIO * noise_energy * scale:
         return NotUsable(f"the source has less than {_LEAST_RATIO} times the energy of the noise")
-    return _read(exponential, source, floor, noise_std * scale)
+    return _read(exponential, source, floor_std, noise_energy_std * scale)
 
 
 def _read(exponential: "_Line", source: "_Source", floor: float, noise_std: float) -> Looming | NotUsable:

@@ -1,8 +1,8 @@
 r"""Maximum-likelihood frequency of a single tone, and the engine line of a stream.
 
-In white noise the likelihood of a complex tone has its maximum where the periodogram has. A coarse search on
-a zero-padded FFT finds the main lobe, Gauss-Newton steps in (in-phase, quadrature, frequency) find the
-maximum. A real tone is fitted as a cosine and a sine, so that its negative frequency does not bias it.
+A coarse search on a zero-padded FFT finds the main lobe, Gauss-Newton steps in (in-phase, quadrature,
+frequency) find the maximum of the likelihood in white noise. The tone is fitted as a cosine and a sine, so
+that its negative frequency does not bias it.
 
 Source: D. C. Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time observations",
 IEEE Trans. IT 20, 1974.
@@ -18,7 +18,7 @@ from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneAr
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
 from worldstate.frontend.spectra.decimator import Decimator
 from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
-from worldstate.ground.checks import finite_array, finite_complex, in_range
+from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, ComplexArray, Float32Array, FloatArray
 
 # Three parameters are fitted; with fewer samples the residual gives no estimate of the noise.
@@ -41,13 +41,13 @@ class Tone:
     Parameters
     ----------
     frequency_hz : float
-        f, Hz; negative only for a complex signal.
+        f, Hz.
     amplitude : float
         Peak amplitude A, unit of the samples.
     phase_rad : float
-        Phase at the first sample: A cos(2 pi f t + phase), or A exp(j(2 pi f t + phase)).
+        Phase at the first sample.
     snr : float
-        eta: A^2 / (2 sigma^2) for a real signal; A^2 / sigma^2 for a complex one, sigma^2 per quadrature.
+        eta: A^2 / (2 sigma^2).
     frequency_std_hz : float
         Cramer-Rao bound at this SNR, Hz.
 
@@ -64,29 +64,20 @@ class Tone:
     frequency_std_hz: float
 
 
-def estimate_tone(
-    samples: ArrayLike,
-    sample_rate_hz: float,
-    *,
-    low_hz: float | None = None,
-    high_hz: float | None = None,
-) -> Tone:
-    r"""Estimate the strongest tone in a band.
+def estimate_tone(samples: ArrayLike, sample_rate_hz: float) -> Tone:
+    r"""Estimate the strongest tone.
 
-    .. math:: \hat f = \arg\max_f \; y^H H (H^H H)^{-1} H^H y
+    .. math:: \hat f = \arg\max_f \; y^T H (H^T H)^{-1} H^T y
 
-    with H the columns :math:`\cos 2\pi f t, \sin 2\pi f t` for real samples, or :math:`e^{j 2\pi f t}` for
-    complex ones, where it is the maximum of the periodogram.
+    with H the columns :math:`\cos 2\pi f t, \sin 2\pi f t`. One resolution, rate / n, is left out at 0 and at
+    rate / 2, where a tone is not distinguishable from an offset.
 
     Parameters
     ----------
     samples : array_like, shape (n,)
-        Real or complex, n >= 8; the noise around the tone is taken for white.
+        n >= 8; the noise around the tone is taken for white.
     sample_rate_hz : float
         Samples per second, > 0.
-    low_hz, high_hz : float, optional
-        Band searched, Hz. By default all frequencies; for real samples one resolution, rate / n, is left out
-        at 0 and at rate / 2, where a real tone is not distinguishable from an offset.
 
     Returns
     -------
@@ -96,7 +87,7 @@ def estimate_tone(
     Raises
     ------
     InvalidArgumentError
-        On a wrong shape, non-finite samples, an empty band or a signal that is zero.
+        On a wrong shape, non-finite samples or a signal that is zero.
 
     Notes
     -----
@@ -114,36 +105,25 @@ def estimate_tone(
     >>> round(tone.frequency_hz, 6), round(tone.amplitude, 6), round(tone.phase_rad, 6)
     (123.4, 2.0, 0.5)
     """
-    y = finite_complex("samples", samples, (None,)).astype(np.complex128)
+    y = finite_array("samples", samples, (None,))
     rate = in_range("sample_rate_hz", sample_rate_hz, 0.0, np.inf, open_low=True)
     if len(y) < FEWEST_SAMPLES:
         raise InvalidArgumentError(f"samples: expected at least {FEWEST_SAMPLES}, got {len(y)}")
     if not np.any(y):
         raise InvalidArgumentError("samples: expected a signal, got zeros only")
-    real = not np.iscomplexobj(samples)
-    low, high = _checked_band(low_hz, high_hz, rate, rate / len(y) if real else -0.5 * rate)
-    omega = 2 * np.pi / rate * _coarse_peak(y, rate, low, high)
-    # The frequencies of complex samples form a circle: a search of the whole circle has no limits.
-    endless = not real and low_hz is None and high_hz is None
-    bounds = (-np.inf, np.inf) if endless else (2 * np.pi * low / rate, 2 * np.pi * high / rate)
-    return _tone(y.real if real else y, *climb(y.real if real else y, omega, bounds), rate)
-
-
-def _coarse_peak(y: ComplexArray, rate: float, low: float, high: float) -> float:
-    size = scipy.fft.next_fast_len(ZERO_PADDING * len(y))
-    power = np.abs(scipy.fft.fft(y, size)) ** 2
-    frequency = scipy.fft.fftfreq(size, 1.0 / rate)
-    inside = (frequency >= low) & (frequency <= high)
-    if not inside.any():
-        narrow = f"expected a band wider than {rate / size:.3g} Hz, got {low} .. {high} Hz"
-        raise InvalidArgumentError(f"low_hz, high_hz: {narrow}")
-    return float(frequency[inside][np.argmax(power[inside])])
+    resolution = 2 * np.pi / len(y)
+    bounds = resolution, np.pi - resolution
+    size = scipy.fft.next_fast_len(ZERO_PADDING * len(y), real=True)
+    omegas = 2 * np.pi / size * np.arange(size // 2 + 1)
+    inside = (omegas >= bounds[0]) & (omegas <= bounds[1])
+    coarse = omegas[inside][np.argmax(np.abs(scipy.fft.rfft(y, size))[inside])]
+    return _tone(y, *climb(y, float(coarse), bounds), rate)
 
 
 def climb(
-    y: FloatArray | ComplexArray,
+    y: FloatArray,
     omega: float,
-    bounds: tuple[float, float] = (-np.inf, np.inf),
+    bounds: tuple[float, float],
     tolerance: float = 1e-7,
     steps: int = STEPS,
 ) -> tuple[float, complex]:
@@ -164,7 +144,7 @@ def climb(
         moved, omega = abs(target - omega), target
         if moved < tolerance * reach:
             break
-    return omega, complex(fit[0]) if np.iscomplexobj(y) else complex(fit[0], fit[1])
+    return omega, complex(*fit)
 
 
 def tone_wave(omega: float, count: int) -> ComplexArray:
@@ -183,32 +163,26 @@ def tone_wave(omega: float, count: int) -> ComplexArray:
     return np.asarray(np.multiply.outer(coarse, fine).ravel()[:count])
 
 
-def _step(
-    y: FloatArray | ComplexArray, omega: float, n: FloatArray
-) -> tuple[float, FloatArray | ComplexArray]:
+def _step(y: FloatArray, omega: float, n: FloatArray) -> tuple[float, FloatArray]:
     """Least-squares step in frequency, the amplitude being refitted along with it (variable projection)."""
     # Everything is a product of few rows: the tone's H, its derivative by omega, and y.
     rows = _rows(y, omega, n)
-    gram = rows.conj() @ rows.T
-    k = len(rows) // 2
+    gram = rows @ rows.T
     # A row of zeros, the sine of 0 Hz, gets no amplitude.
-    inner = gram[:k, :k].copy()
-    inner.flat[:: k + 1] += _ROUNDING * len(y)
-    onto = np.linalg.solve(inner, gram[:k, k:])
-    fit = onto[:, k]
-    free, rest = np.zeros((2, 2 * k + 1), gram.dtype)
-    free[:k], free[k : 2 * k] = -(onto[:, :k] @ fit), fit
-    rest[:k], rest[-1] = -fit, 1.0
-    image = free.conj() @ gram
-    size = float((image @ free).real)
-    return float((image @ rest).real) / size if size > 0.0 else 0.0, fit
+    inner = gram[:2, :2].copy()
+    inner.flat[::3] += _ROUNDING * len(y)
+    onto = np.linalg.solve(inner, gram[:2, 2:])
+    fit = onto[:, 2]
+    free = np.concatenate([-(onto[:, :2] @ fit), fit, [0.0]])
+    rest = np.concatenate([-fit, [0.0, 0.0, 1.0]])
+    image = free @ gram
+    size = float(image @ free)
+    return float(image @ rest) / size if size > 0.0 else 0.0, np.asarray(fit)
 
 
-def _rows(y: FloatArray | ComplexArray, omega: float, n: FloatArray) -> FloatArray | ComplexArray:
-    """Columns of H, their derivatives by omega, and y: (3, n) complex, or (5, n) real."""
+def _rows(y: FloatArray, omega: float, n: FloatArray) -> FloatArray:
+    """Columns of H, their derivatives by omega, and y, (5, n)."""
     wave = tone_wave(omega, len(y))
-    if np.iscomplexobj(y):
-        return np.asarray(np.stack([wave, 1j * n * wave, y]), np.complex128)
     rows = np.empty((5, len(y)))
     rows[0] = wave.real
     np.negative(wave.imag, out=rows[1])
@@ -218,33 +192,16 @@ def _rows(y: FloatArray | ComplexArray, omega: float, n: FloatArray) -> FloatArr
     return rows
 
 
-def _tone(y: FloatArray | ComplexArray, omega: float, amplitude: complex, rate: float) -> Tone:
-    complex_signal, count, size = np.iscomplexobj(y), len(y), abs(amplitude)
-    model = amplitude * tone_wave(omega, count)
-    residual = y - (model if complex_signal else model.real)
-    # Three real parameters are fitted; a complex sample is worth two real ones.
-    power = float(np.vdot(residual, residual).real) / (2 * count - 3 if complex_signal else count - 3)
-    snr = size**2 / max(power if complex_signal else 2.0 * power, np.finfo(float).tiny)
+def _tone(y: FloatArray, omega: float, amplitude: complex, rate: float) -> Tone:
+    count, size = len(y), abs(amplitude)
+    residual = y - (amplitude * tone_wave(omega, count)).real
+    # Three parameters are fitted.
+    power = float(residual @ residual) / (count - 3)
+    snr = size**2 / max(2.0 * power, np.finfo(float).tiny)
     snr = min(max(snr, np.finfo(float).tiny), 1e300)
     std = float(np.sqrt(tone_crb_hz2(snr, count, rate)))
     phase = float(np.angle(amplitude) - omega * 0.5 * (count - 1))
-    frequency = wrap_angle(omega) * rate / (2 * np.pi)
-    return Tone(frequency, size, wrap_angle(phase), snr, std)
-
-
-def _checked_band(
-    low_hz: float | None, high_hz: float | None, rate: float, lowest: float
-) -> tuple[float, float]:
-    """Return the band asked for, by default from `lowest` to its mirror image below half the sample rate."""
-    highest = 0.5 * rate - max(lowest, 0.0)
-    low = lowest if low_hz is None else float(finite_array("low_hz", low_hz, ()))
-    high = highest if high_hz is None else float(finite_array("high_hz", high_hz, ()))
-    floor = min(lowest, 0.0)
-    if not floor <= low < high <= 0.5 * rate:
-        raise InvalidArgumentError(
-            f"low_hz, high_hz: expected a band within {floor} .. {0.5 * rate} Hz, got {low} .. {high} Hz"
-        )
-    return low, high
+    return Tone(omega * rate / (2 * np.pi), size, wrap_angle(phase), snr, std)
 
 
 # Firing frequencies of road vehicles, idling motorcycle single to a car at high revolutions.

@@ -1,4 +1,4 @@
-r"""Delays between microphone pairs by generalised cross-correlation.
+r"""Delays between microphone pairs by generalised cross-correlation, GCC-PHAT.
 
 The weighted cross-correlation of a pair (i, j) over the observed bins is
 
@@ -11,7 +11,6 @@ biased.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,15 +19,10 @@ from worldstate.ground.checks import finite_array, finite_complex
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray, IndexArray
 
-Weighting = Literal["phat", "ml"]
-WEIGHTINGS: tuple[Weighting, ...] = ("phat", "ml")
-
 # Lags per period of the highest frequency: the nearest one is then pi/8 rad from the peak at most.
 LAGS_PER_PERIOD = 8
 # Newton steps converge quadratically from there.
 NEWTON_STEPS = 4
-# An estimated coherence of exactly one would weigh its bin infinitely.
-LARGEST_COHERENCE = 1.0 - 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,19 +62,14 @@ def gcc_delays(
     spectra: ArrayLike,
     frequencies_hz: ArrayLike,
     max_delay_s: ArrayLike,
-    *,
-    weighting: Weighting = "phat",
 ) -> PairDelays:
     r"""Estimate the delay of every pair, between samples, by generalised cross-correlation.
 
     .. math:: \hat\tau_{ij} = \arg\max_{|\tau| \le \tau_{max}}
               \mathrm{Re} \sum_f \Psi(f)\, G_{ij}(f)\, e^{j 2\pi f \tau}
 
-    Cross-spectra are averaged over frames first and weighted afterwards:
-
-    - ``phat``: :math:`1 / |G_{ij}|`; with a flat coherence it is maximum likelihood;
-    - ``ml``: :math:`C / (|G_{ij}| (1 - C))` of Hannan and Thomson, with the coherence estimated from the same
-      frames.
+    Cross-spectra are averaged over frames first, then weighted by :math:`\Psi = 1 / |G_{ij}|` (PHAT); with a
+    flat coherence that is maximum likelihood.
 
     Parameters
     ----------
@@ -90,8 +79,6 @@ def gcc_delays(
         Centre of each bin, Hz, ascending.
     max_delay_s : float or array_like, shape (P,)
         Largest delay to search, seconds; for microphones at distance d this is d / c.
-    weighting : {"phat", "ml"}
-        As above.
 
     Returns
     -------
@@ -101,8 +88,8 @@ def gcc_delays(
     Raises
     ------
     InvalidArgumentError
-        On wrong shapes or values, an unknown weighting, ``ml`` with a single frame, or a search range in
-        which equally spaced bins repeat themselves (max_delay_s >= 1 / (2 bin spacing)).
+        On wrong shapes or values, or a search range in which equally spaced bins repeat themselves
+        (max_delay_s >= 1 / (2 bin spacing)).
 
     References
     ----------
@@ -121,38 +108,17 @@ def gcc_delays(
     frequencies = _checked_frequencies(frequencies_hz, X.shape[1])
     index = all_pairs(X.shape[2])
     limit = _checked_limit(max_delay_s, len(index), frequencies)
-    if weighting not in WEIGHTINGS:
-        raise InvalidArgumentError(f"weighting: expected one of {WEIGHTINGS}, got {weighting!r}")
-    if weighting == "ml" and X.shape[0] < 2:
-        raise InvalidArgumentError("weighting: 'ml' estimates a coherence and needs at least 2 frames, got 1")
-    cross = _weighted(*_moments(X, index), weighting)
+    cross = _whitened(X, index)
     delay, height = _peaks(cross, frequencies, limit)
     return PairDelays(index, delay, height)
 
 
-def _moments(X: ComplexArray, pairs: IndexArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
-    """Cross-spectra (P, bins) and the two auto-spectra, averaged over frames."""
+def _whitened(X: ComplexArray, pairs: IndexArray) -> ComplexArray:
+    """Cross-spectra averaged over frames, (P, bins), of modulus one."""
     R = np.einsum("fbi,fbj->bij", X, X.conj(), optimize=True) / X.shape[0]
-    i, j = pairs.T
-    power = np.einsum("bii->ib", R).real.astype(np.float64)
-    return R[:, i, j].T, power[i], power[j]
-
-
-def _coherence(cross: ComplexArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    product = first * second
-    ratio = np.divide(np.abs(cross) ** 2, product, out=np.zeros_like(product), where=product > 0)
-    return np.asarray(np.minimum(ratio, 1.0))
-
-
-def _weighted(
-    cross: ComplexArray, first: FloatArray, second: FloatArray, weighting: Weighting
-) -> ComplexArray:
+    cross = R[:, pairs[:, 0], pairs[:, 1]].T
     magnitude = np.abs(cross)
-    whitened = np.divide(cross, magnitude, out=np.zeros_like(cross), where=magnitude > 0)
-    if weighting == "phat":
-        return whitened
-    coherence = np.minimum(_coherence(cross, first, second), LARGEST_COHERENCE)
-    return np.asarray(whitened * (coherence / (1.0 - coherence)))
+    return np.asarray(np.divide(cross, magnitude, out=np.zeros_like(cross), where=magnitude > 0))
 
 
 def _peaks(cross: ComplexArray, frequencies: FloatArray, limit: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -214,7 +214,7 @@ def test_closed_form_emission_time_equals_root_finding(time, speed, closest, dis
     tau = brentq(late, time - 5, time, xtol=1e-13)
     along = speed * (tau - closest)
     expected = speed * along / np.hypot(distance, along)
-    got = radial_speed_m_s(np.array([time]), speed, closest, distance, SOUND_M_S)
+    got = radial_speed_m_s(np.array([time]), speed, closest, distance)
     assert got[0] == pytest.approx(expected, abs=1e-6 * speed)
 
 
@@ -226,9 +226,6 @@ def test_closed_form_emission_time_equals_root_finding(time, speed, closest, dis
         lambda: track_fundamental(np.zeros(8000), 2000.0),
         lambda: HarmonicSettings(low_hz=5.0),
         lambda: HarmonicSettings(low_hz=100.0, high_hz=90.0),
-        lambda: radial_speed(
-            HarmonicTrack(*(np.zeros(20) for _ in range(6)), windows=20)  # type: ignore[arg-type]
-        ),
     ],
 )
 def test_bad_input_is_refused(call):

@@ -28,30 +28,16 @@ def test_noiseless_real_tone_is_exact(frequency, phase, amplitude, n):
     assert np.exp(1j * tone.phase_rad) == pytest.approx(np.exp(1j * phase), abs=1e-5)
 
 
-@settings(max_examples=40, deadline=None)
-@given(frequency=st.floats(-495.0, 495.0), n=st.integers(8, 300))
-def test_noiseless_complex_tone_is_exact_and_keeps_its_sign(frequency, n):
-    t = np.arange(n) / RATE
-    tone = estimate_tone(3.0 * np.exp(2j * np.pi * frequency * t - 1j), RATE)
-    assert tone.frequency_hz == pytest.approx(frequency, abs=1e-6)
-    assert (tone.amplitude, tone.phase_rad) == pytest.approx((3.0, -1.0), abs=1e-5)
-
-
-@pytest.mark.parametrize("kind", ["real", "complex"])
 @pytest.mark.parametrize("snr_db", [0.0, 10.0, 25.0])
-def test_variance_meets_the_bound(kind, snr_db):
+def test_variance_meets_the_bound(snr_db):
     """Within 1.5 dB of eq. (9) of Rife and Boorstyn, never below it beyond three standard errors."""
-    rng = np.random.default_rng(int(snr_db) + len(kind))
+    rng = np.random.default_rng(int(snr_db) + 4)
     n, trials, eta = 256, 800, 10 ** (snr_db / 10)
     t, errors, claimed, found = np.arange(n) / RATE, [], [], []
     for _ in range(trials):
         frequency, phase = rng.uniform(40, 460), rng.uniform(-np.pi, np.pi)
-        wave = np.exp(1j * (2 * np.pi * frequency * t + phase))
-        if kind == "real":
-            y = wave.real + rng.normal(size=n) * np.sqrt(1 / (2 * eta))
-        else:
-            y = wave + (rng.normal(size=n) + 1j * rng.normal(size=n)) * np.sqrt(1 / eta)
-        tone = estimate_tone(y, RATE)
+        wave = np.cos(2 * np.pi * frequency * t + phase)
+        tone = estimate_tone(wave + rng.normal(size=n) * np.sqrt(1 / (2 * eta)), RATE)
         errors.append(tone.frequency_hz - frequency)
         claimed.append(tone.frequency_std_hz**2)
         found.append(tone.snr)
@@ -76,11 +62,10 @@ def test_real_estimate_is_the_least_squares_optimum():
     assert estimate_tone(y, RATE).frequency_hz == pytest.approx(best.x, abs=1e-5)
 
 
-def test_band_selects_the_tone():
+def test_the_strongest_tone_is_found():
     t = np.arange(500) / RATE
     y = 5 * np.cos(2 * np.pi * 80 * t) + np.cos(2 * np.pi * 200.3 * t)
     assert estimate_tone(y, RATE).frequency_hz == pytest.approx(80, abs=0.05)
-    assert estimate_tone(y, RATE, low_hz=150, high_hz=250).frequency_hz == pytest.approx(200.3, abs=0.1)
 
 
 def test_an_offset_is_no_tone():
@@ -89,18 +74,15 @@ def test_an_offset_is_no_tone():
 
 
 @pytest.mark.parametrize(
-    ("samples", "rate", "band"),
+    ("samples", "rate"),
     [
-        (np.ones(7), RATE, {}),
-        (np.zeros(64), RATE, {}),
-        (np.full(64, np.nan), RATE, {}),
-        (np.ones((8, 8)), RATE, {}),
-        (np.ones(64), 0.0, {}),
-        (np.ones(64), RATE, {"low_hz": 400.0, "high_hz": 300.0}),
-        (np.ones(64), RATE, {"low_hz": -10.0}),
-        (np.ones(64), RATE, {"low_hz": 101.0, "high_hz": 101.1}),
+        (np.ones(7), RATE),
+        (np.zeros(64), RATE),
+        (np.full(64, np.nan), RATE),
+        (np.ones((8, 8)), RATE),
+        (np.ones(64), 0.0),
     ],
 )
-def test_bad_input_is_refused(samples, rate, band):
+def test_bad_input_is_refused(samples, rate):
     with pytest.raises(InvalidArgumentError):
-        estimate_tone(samples, rate, **band)
+        estimate_tone(samples, rate)
