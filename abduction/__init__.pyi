@@ -34,4 +34,3 @@ from .signature.published_signature import SignatureModel as SignatureModel
 from .signature.site_estimate import SiteEstimate as SiteEstimate
 from .signature.site_estimate import SiteEstimateSettings as SiteEstimateSettings
 from .signature.site_estimate import SiteSignature as SiteSignature
-from .signature.window_classes import ClassifierSignature as ClassifierSignature

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.serialisation import Layout
 
 Rows = tuple[tuple[float, ...], ...]
@@ -85,7 +85,7 @@ class MissRateTable:
         return np.interp(magnitude_deg, self.azimuth_deg, along, right=1.0)
 
 
-def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:
+def default_miss_rates() -> MissRateTable:
     r"""Return the table used where none was measured.
 
     .. math:: \beta(\theta, d) = (1 - d)\, \min(0.04 + 0.004\, |\theta_{deg}|,\; 0.97) + 0.97\, d
@@ -93,16 +93,13 @@ def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:
     Examples
     --------
     >>> table = default_miss_rates()
-    >>> round(table(0.0), 2), round(table(np.radians(-25.0)), 2), round(table(0.0, 1.0), 2), table(1.5)
+    >>> round(table(0.0), 2), round(table(np.radians(-25.0)), 2), round(table(0.0, 1.0), 2), table(1.6)
     (0.04, 0.14, 0.97, 1.0)
     """
-    # Clean frames: .04 at boresight, .14 at 25 deg and on at that slope to the edge of the view; from there
-    # linearly in d to .97 everywhere.
-    edge_deg = in_range("half_view_deg", half_view_deg, 0.0, 180.0, open_low=True)
-    clean = min(BORESIGHT_MISS_RATE + MISS_RATE_PER_DEG * edge_deg, HARSHEST_MISS_RATE)
-    return MissRateTable(
-        (0.0, edge_deg), (0.0, 1.0), ((BORESIGHT_MISS_RATE, HARSHEST_MISS_RATE), (clean, HARSHEST_MISS_RATE))
-    )
+    # Clean frames: .04 at boresight, .14 at 25 deg and on at that slope over the half plane, for a view ends
+    # by the camera's own angle; from there linearly in d to .97 everywhere.
+    clean = BORESIGHT_MISS_RATE, BORESIGHT_MISS_RATE + MISS_RATE_PER_DEG * 90.0
+    return MissRateTable((0.0, 90.0), (0.0, 1.0), tuple((rate, HARSHEST_MISS_RATE) for rate in clean))
 
 
 def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:

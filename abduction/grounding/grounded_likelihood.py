@@ -301,52 +301,28 @@ BACKGROUNDS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class AzimuthPrior:
-    """Prior of a source's azimuth under one explanation: a normal law truncated at +-90 degrees."""
-
-    azimuth_rad: float  # Centre, left positive, and standard deviation; infinite for any azimuth alike
-    std_rad: float
-
-    def log_prior(self, azimuths_rad: FloatArray) -> FloatArray:
-        r"""Return log P(theta) on a grid, normalised over it, shape (n,), nats.
-
-        .. math:: P(\theta_i) \propto \exp\big(-\tfrac12 (\theta_i - \theta_0)^2 / \sigma^2\big), \qquad
-                  \sum_i P(\theta_i) = 1
-
-        Shapes: azimuths_rad (n,).
-        """
-        log_weight = -0.5 * ((azimuths_rad - self.azimuth_rad) / self.std_rad) ** 2
-        return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
+# Deviation of the azimuth of a source in plain view, and of the strongest direction of a hidden one: it is a
+# wall or an edge that is heard, whose side says little of the side that the vehicle comes from.
+_VISIBLE_STD_RAD, _HIDDEN_STD_RAD = float(np.radians(35.0)), np.inf
 
 
 @dataclass(frozen=True, slots=True)
 class GroundedSettings:
-    """Azimuth priors and the couplings that are used.
+    """Which observables are used.
 
     Parameters
     ----------
-    hidden : AzimuthPrior
-        Of the strongest direction of a hidden source. It is a wall or an edge that is heard, whose side says
-        little of the side that the vehicle comes from: by default any azimuth alike, from both sides.
-    visible : AzimuthPrior
-        Of a source in plain view.
     without : frozenset of str
         Observables that are left out, for ablations: of a coupling, or of the approach rate,
         `radial_speed_m_s` and `inverse_tta_hz`.
-    backgrounds : mapping of str to Background
-        One for every observable that a descriptor couples.
 
     Examples
     --------
-    >>> GroundedSettings(without=frozenset({"line_spacing_hz"})).hidden.std_rad
-    inf
+    >>> len(GroundedSettings(without=frozenset({"line_spacing_hz"})).without)
+    1
     """
 
-    hidden: AzimuthPrior = AzimuthPrior(0.0, np.inf)
-    visible: AzimuthPrior = AzimuthPrior(0.0, np.radians(35.0))
     without: frozenset[str] = frozenset()
-    backgrounds: Mapping[str, Background] = field(default_factory=lambda: BACKGROUNDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -416,7 +392,7 @@ def ground(
     descriptors : sequence of Descriptor
         Classes of road users, at least one, names all different.
     settings : GroundedSettings, optional
-        Sectors and switched-off couplings.
+        Switched-off couplings.
 
     Returns
     -------
@@ -426,7 +402,7 @@ def ground(
     Raises
     ------
     InvalidArgumentError
-        If there is no descriptor, a name comes twice, or a measured observable has no background.
+        If there is no descriptor or a name comes twice.
 
     References
     ----------
@@ -447,7 +423,7 @@ def ground(
         raise InvalidArgumentError(f"descriptors: expected one or more with different names, got {names}")
     over_speed = _over_speed(observation, descriptors, chosen)
     hidden_azimuth, visible_azimuth = (
-        _over_azimuth(observation.bearing_rad, sector) for sector in (chosen.hidden, chosen.visible)
+        _over_azimuth(observation.bearing_rad, std_rad) for std_rad in (_HIDDEN_STD_RAD, _VISIBLE_STD_RAD)
     )
     per_class = np.logaddexp.reduce(over_speed, axis=1)
     moving = np.logaddexp.reduce(per_class)
@@ -484,9 +460,7 @@ def _log_couplings(
         seen = observation.signature.get(coupling.observable)
         if seen is None or coupling.observable in settings.without:
             continue
-        if coupling.observable not in settings.backgrounds:
-            raise InvalidArgumentError(f"backgrounds: expected one of {coupling.observable}")
-        background = settings.backgrounds[coupling.observable].log_density(seen.value)
+        background = BACKGROUNDS[coupling.observable].log_density(seen.value)
         total += coupling.log_likelihood(seen.value, seen.std, _SPEEDS_M_S) - background
     return total
 
@@ -495,19 +469,20 @@ def _log_approach(observation: GroundedObservation, settings: GroundedSettings) 
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
     if isinstance(speed, Observable) and "radial_speed_m_s" not in settings.without:
-        background = settings.backgrounds["radial_speed_m_s"].log_density(speed.value)
+        background = BACKGROUNDS["radial_speed_m_s"].log_density(speed.value)
         return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - background
     if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in settings.without:
-        background = settings.backgrounds["inverse_tta_hz"].log_density(inverse_tta.value)
+        background = BACKGROUNDS["inverse_tta_hz"].log_density(inverse_tta.value)
         ranges = _SPEED_CELL_M_S / _RANGES_M
         over_range = _log_normal(inverse_tta, _SPEEDS_M_S[:, None] / _RANGES_M, ranges)
         return np.asarray(np.logaddexp.reduce(over_range, axis=1) - np.log(_RANGES_M.size) - background)
     return np.zeros(_SPEEDS_M_S.size)
 
 
-def _over_azimuth(bearing: Observable | NotUsable, sector: AzimuthPrior) -> FloatArray:
+def _over_azimuth(bearing: Observable | NotUsable, std_rad: float) -> FloatArray:
     """Log of P(theta | h) p(bearing | theta) over that of any azimuth alike, shape (azimuths,)."""
-    prior = sector.log_prior(_AZIMUTHS_RAD)
+    prior: FloatArray = -0.5 * (_AZIMUTHS_RAD / std_rad) ** 2
+    prior -= np.logaddexp.reduce(prior)
     if isinstance(bearing, NotUsable):
         return prior
     fit = _log_normal(bearing, _AZIMUTHS_RAD, _AZIMUTH_CELL_RAD)

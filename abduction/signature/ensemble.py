@@ -38,12 +38,10 @@ from .published_signature import SignatureModel
 from .site_reference import KINDS, SiteReference, log_levels
 from .window_classes import (
     CLASSES,
-    DIRECTIONS,
     EXPLANATION_COLUMNS,
     SMALLEST_PROBABILITY,
     checked_classes,
     explained,
-    explanation_ratios,
     mirrored_classes,
     window_evidence,
 )
@@ -120,11 +118,6 @@ class EnsembleModel:
             check_shape("expert: intercepts", expert.intercepts.shape, known)
 
     @property
-    def directions(self) -> tuple[str, ...]:
-        """Names of the hidden hypotheses of `evidence`."""
-        return DIRECTIONS
-
-    @property
     def n_features(self) -> int:
         """Length of the feature vector of one window."""
         return int(self.home.mean.size)
@@ -179,24 +172,6 @@ class EnsembleModel:
         Derived here: see the head of `worldstate.abduction.signature.window_classes`.
         """
         return explained(self.predict_proba(X), self.classes, self.class_prior)
-
-    def log_likelihoods(self, X: ArrayLike) -> FloatArray:
-        r"""Return log-likelihoods of left, right, front (visible), none, shape (n, 4), nats.
-
-        .. math:: \log \ell_c = \log P_c - \log \pi_c
-
-        Errors are those of `predict_proba`.
-
-        Parameters
-        ----------
-        X : array_like, shape (n, features) or (n, 4 * features)
-            As for `predict_proba`.
-
-        References
-        ----------
-        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
-        """
-        return explanation_ratios(self.explain(X), self._explained_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         r"""Return the log-likelihoods of one window, shape (features,) or (4 * features,).

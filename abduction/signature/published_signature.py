@@ -21,7 +21,6 @@ from worldstate.ground.serialisation import ADDED, Layout
 from .model_domain import ModelDomain
 from .window_classes import (
     CLASSES,
-    DIRECTIONS,
     EXPLANATION_COLUMNS,
     SMALLEST_PROBABILITY,
     evidence_of,
@@ -99,11 +98,6 @@ class SignatureModel:
         return CLASSES
 
     @property
-    def directions(self) -> tuple[str, ...]:
-        """Names of the hidden hypotheses of `evidence`."""
-        return DIRECTIONS
-
-    @property
     def n_features(self) -> int:
         """Length of the feature vector."""
         return int(self.mean.size)
@@ -156,24 +150,6 @@ class SignatureModel:
         """
         return couple(sigmoid(self.decision_values(X), self.slopes, self.offsets), len(CLASSES))
 
-    def log_likelihoods(self, X: ArrayLike) -> FloatArray:
-        r"""Return log-likelihoods of left, right, front (visible), none, shape (n, 4), nats.
-
-        .. math:: \log \ell_c = \log P_c - \log \pi_c
-
-        Errors are those of `decision_values`.
-
-        Parameters
-        ----------
-        X : array_like, shape (n, features)
-            One row a window.
-
-        References
-        ----------
-        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
-        """
-        return explanation_ratios(self.predict_proba(X), self.class_prior)
-
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         r"""Return the log-likelihoods of one feature vector, shape (features,).
 
@@ -193,7 +169,8 @@ class SignatureModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
+        posteriors = self.predict_proba(np.atleast_2d(feature))
+        return evidence_of(explanation_ratios(posteriors, self.class_prior)[0])
 
 
 def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:

@@ -135,8 +135,7 @@ class VisionQuery:
     ) -> None:
         self.camera = camera
         self.detections = detections
-        # The field of view is applied here, so that the default table covers the whole half plane.
-        self.miss_rate = miss_rate or default_miss_rates(half_view_deg=90.0)
+        self.miss_rate = miss_rate or default_miss_rates()
         self.settings = settings or VisionSettings()
         self._degradation = degradation if callable(degradation) else lambda stamp_ns: degradation
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())

@@ -283,7 +283,7 @@ def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(appr
 
 def test_a_degraded_camera_misses_what_its_table_says_and_never_less():
     box = DetectionFrame(np.array([[900.0, 500.0, 1000.0, 600.0]]), np.array([0.9]), ("car",))
-    log, table = DetectionLog.at_rate([box] * 2000, 10.0), default_miss_rates(90.0)
+    log, table = DetectionLog.at_rate([box] * 2000, 10.0), default_miss_rates()
     left = {
         d: np.array(
             [len(one.boxes_px) for one in missed(log, WHOLE, table, d, np.random.default_rng(1)).frames]

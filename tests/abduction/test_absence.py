@@ -59,7 +59,7 @@ def test_the_default_is_what_the_paper_measured():
     assert table(0.0) == pytest.approx(0.04)
     assert table(np.radians(25)) == pytest.approx(0.14)
     assert table(0.0, 1.0) == pytest.approx(0.97)
-    assert table(np.radians(60)) == 1.0
+    assert table(np.radians(91)) == 1.0
 
 
 def test_a_class_may_have_rows_of_its_own():

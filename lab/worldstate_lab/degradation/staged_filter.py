@@ -218,7 +218,7 @@ class StreamSweep:
 
 def states_told() -> list[str]:
     """Return all that the advisories depend on beside the stream, the model and the seed."""
-    return [*(state.name for state in STATES), *map(repr, RAIN_DB), repr(default_miss_rates(90.0))]
+    return [*(state.name for state in STATES), *map(repr, RAIN_DB), repr(default_miss_rates())]
 
 
 def staged_advisories(path: Path, model: Path | None, seed: int) -> HopTable:
@@ -279,7 +279,7 @@ def _query(source: Source, state: Condition, seed: int) -> VisionQuery | None:
     """Return the camera of a state, which knows how degraded it is; None for none."""
     if state.family == OFF or source.detections is None:
         return None
-    table, degradation = default_miss_rates(90.0), state.degradation if state.family in (LENS, RAIN) else 0.0
+    table, degradation = default_miss_rates(), state.degradation if state.family in (LENS, RAIN) else 0.0
     # The same luck in every state: what is missed with a better camera is missed with a worse one.
     rng = np.random.default_rng(seed)
     return VisionQuery(
