@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from worldstate_lab.trials.pass_cache import PassCache, fingerprint
 
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.recordings.hop_table import HopTable, load_named, load_tables, save_named
+from worldstate.operations.recordings.hop_table import HopTable, load_named, load_streams, save_named
 
 DTYPES = st.sampled_from([np.float64, np.float32, np.int64, np.bool_, "<U7"])
 NAMES = st.text("abc_", min_size=1, max_size=4)
@@ -87,7 +87,8 @@ def test_a_damaged_file_is_made_again_with_a_warning(damage, tmp_path):
 
 def test_tables_of_one_kind_are_no_streams_of_a_user(tmp_path):
     save_named(tmp_path / "a.npz", some_tables())
-    assert load_tables(tmp_path / "a.npz", "hop streams") == []
+    with pytest.raises(InputFileError, match="at least one hop stream"):
+        load_streams(tmp_path / "a.npz")
 
 
 def recording(folder):

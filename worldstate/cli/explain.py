@@ -10,6 +10,7 @@ none.
 
 import argparse
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,21 +39,23 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.state_log import read_log, read_state_near
     from worldstate.ground.checks import in_range
     from worldstate.ground.values import nanoseconds, seconds
-    from worldstate.operations.recordings.evidence_report import common_lines, evidence_report
-    from worldstate.operations.recordings.warning import told_advisories
+    from worldstate.operations.recordings.evidence_report import (
+        common_lines,
+        evidence_report,
+        told_advisories,
+    )
 
     listed, told = list[str](), {}
     if arguments.time is None:
-        found = told_advisories((state for _, state in read_log(arguments.states)), arguments.side)
-        stamp_ns, listed = found.explained_ns, [*found.lines(), ""]
-        told = {"advisories": [asdict(one) for one in found.advisories]}
+        found, stamp_ns = told_advisories((state for _, state in read_log(arguments.states)), arguments.side)
+        which = "at the first onset" if found else "none; at the highest risk"
+        listed = ["advisories", *(f"  {one.line()}" for one in found), f"  {which}, another by --time", ""]
+        told = {"advisories": [asdict(one) for one in found]}
     else:
         stamp_ns = nanoseconds(in_range("--time", arguments.time, -9e9, 9e9))
     state = read_state_near(arguments.states, stamp_ns)
     _check_side(state, arguments.side)
-    begun = {cue.direction: cue.advisory.since_ns for cue in state.cues if cue.advisory is not None}
-    onsets = {side: read_state_near(arguments.states, since_ns) for side, since_ns in begun.items()}
-    reports = evidence_report(state, onsets, arguments.side)
+    reports = evidence_report(state, partial(read_state_near, arguments.states), arguments.side)
     now_s = seconds(state.stamp_ns)
     written = state.to_dict()
     common = {key: written[key] for key in ("sensors", "searched", "events", "domain", "no_sequence")}

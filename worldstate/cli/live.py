@@ -25,7 +25,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,6 +32,7 @@ from worldstate.cli.common import exports, inputs, listening, sensors
 from worldstate.cli.common.command import stopped_by_signals
 from worldstate.cli.common.early_checks import check_call
 from worldstate.cli.common.output import CommandResult, check_outputs
+from worldstate.cli.common.progress import can_draw
 from worldstate.ground.extras import check_extra
 from worldstate.ground.values import seconds
 
@@ -226,11 +226,12 @@ def _listen(
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
-    from worldstate.adapters.live.live_listening import live_steps
+    from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter, live_steps
     from worldstate.adapters.state_log import states_writer
-    from worldstate.operations.recordings.live_report import LiveReport
+    from worldstate.operations.recordings.warning import WarningMeter
 
-    report, notice = LiveReport(source), _loss_notices()
+    warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
+    notice = _loss_notices()
     start_s, last = seconds(source.start_ns), None
     with (
         states_writer(arguments.out) as write,
@@ -241,8 +242,10 @@ def _listen(
         for live in live_steps(source):
             write(live.step.state.to_json())
             export(live.step)
-            for watcher in (report.add, show, notice):
-                watcher(live)
+            warnings.update(live.step.state)
+            latency.add(live.latency_s)
+            show(live)
+            notice(live)
             last = live.step
             if (
                 arguments.duration is not None
@@ -251,16 +254,24 @@ def _listen(
                 break
     if arguments.save_state is not None and last is not None:
         save_checkpoint(arguments.save_state, last.checkpoint)
-    return report.to_dict(sound)
+    return {
+        "states": warnings.states,
+        "sound_s": sound.frames / sound.sample_rate_hz,
+        "overruns": sound.overruns,
+        "lost_s": sound.lost_s,
+        "latency_median_s": latency.quantile_s(0.5),
+        "latency_p99_s": latency.quantile_s(0.99),
+        "latency_largest_s": latency.quantile_s(1.0),
+        **cost.read(),
+        "peak_risk": warnings.peak_risk,
+        "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
+    }
 
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
     """Lend a function that shows a hop where --view or a terminal asks for it."""
-    shown = arguments.view
-    if shown is None:
-        shown = sys.stderr.isatty() and find_spec("rich") is not None
-    if not shown:
+    if not (can_draw() if arguments.view is None else arguments.view):
         yield lambda live: None
         return
     from worldstate.cli.common.live_view import live_view

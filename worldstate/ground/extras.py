@@ -55,6 +55,16 @@ def check_extra(*modules: str) -> None:
     >>> check_extra("sklearn", "matplotlib")
     """
     for module in modules:
-        package = module.partition(".")[0]
-        if find_spec(package) is None:
-            raise MissingExtraError(*EXTRAS[package])
+        if not has_extra(module):
+            raise MissingExtraError(*EXTRAS[module.partition(".")[0]])
+
+
+def has_extra(module: str) -> bool:
+    """Return whether the package of an optional module is installed; nothing is imported.
+
+    Examples
+    --------
+    >>> has_extra("sklearn.isotonic")
+    True
+    """
+    return find_spec(module.partition(".")[0]) is not None

@@ -5,8 +5,9 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, TypeVar
+
+from worldstate.ground.extras import has_extra
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
@@ -44,9 +45,13 @@ def progress_bar(description: str, total: float | None, *, quiet: bool = False) 
     if quiet:
         yield bar
         return
-    in_terminal = sys.stderr.isatty() and find_spec("rich") is not None
-    with _drawn(description, bar) if in_terminal else _told(description, bar):
+    with _drawn(description, bar) if can_draw() else _told(description, bar):
         yield bar
+
+
+def can_draw() -> bool:
+    """Return whether standard error is a terminal, and what draws there is installed."""
+    return sys.stderr.isatty() and has_extra("rich")
 
 
 @contextmanager

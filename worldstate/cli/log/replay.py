@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
     check_outputs(arguments, "out", exported=exported_files(arguments))
     crossing_m = in_range("--crossing", arguments.crossing, 1.0, 100.0)
-    meter, stamps_ns, peak_risk = WarningMeter(t0_s=None), [], 0.0
+    meter = WarningMeter(t0_s=None)
     with (
         states_writer(arguments.out) as write,
         open_exports(arguments, crossing_m=crossing_m) as exports,
@@ -49,14 +49,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             write(line)
             exports.state(state)
             meter.update(state)
-            stamps_ns.append(state.stamp_ns)
-            peak_risk = max(peak_risk, state.risk)
             bar.advance()
     summary = {
-        "states": len(stamps_ns),
-        "first_s": seconds(stamps_ns[0]),
-        "last_s": seconds(stamps_ns[-1]),
-        "peak_risk": peak_risk,
+        "states": meter.states,
+        "first_s": seconds(meter.first_ns),
+        "last_s": seconds(meter.last_ns),
+        "peak_risk": meter.peak_risk,
         "advisory_onsets_s": list(meter.summary().advisory_onsets_s),
     }
     return CommandResult(summary)

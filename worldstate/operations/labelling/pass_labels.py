@@ -3,12 +3,11 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import numpy as np
 
 from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.ground.extras import check_extra
+from worldstate.ground.extras import check_extra, has_extra
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 from worldstate.smoothing.fixed_lag_smoother import FixedLagSmoother
@@ -72,7 +71,7 @@ def label_passes(
 
     By the factor graph; where gtsam is not installed, by the RTS smoother of filterpy.
     """
-    if find_spec("gtsam") is None:
+    if not has_extra("gtsam"):
         check_extra("filterpy")
     coming = [one for one in tracks if one.arm is not None]
     edges = {arm: _edge(coming, arm) for arm in ("left", "right")}
@@ -113,7 +112,7 @@ def _smoothed(
     observed = _observations(one, camera_ahead_m)
     stamped = {nanoseconds(at * HOP_S): observed[at] for at in sorted(observed)}
     arm = one.arm or ""
-    smooth = rts_track if find_spec("gtsam") is None else _graph_track
+    smooth = _graph_track if has_extra("gtsam") else rts_track
     track = smooth(name, start_of(arm), stamped)
     t0 = track.first_sight(1 if arm == "left" else -1, *edges[arm])
     return None if t0 is None else PassLabel(arm, one.label, t0, track, one.edge_rad)

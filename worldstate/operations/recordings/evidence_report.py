@@ -1,7 +1,7 @@
-"""Which evidence raised or holds the advisories of a snapshot, side by side."""
+"""The advisories of a run, and which evidence raised or holds those of a snapshot, side by side."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Literal, TypeAlias
 
@@ -21,6 +21,41 @@ _OF = {
     "hidden": "somebody is hidden on any side, by this window alone",
     "announced": "somebody is hidden, by messages alone",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class ToldAdvisory:
+    """An advisory of one side, from its onset to the last snapshot that has it.
+
+    Examples
+    --------
+    >>> ToldAdvisory("left", 700_000_000, 1_500_000_000).line()
+    'left   0.70 to 1.50 s'
+    """
+
+    direction: str
+    since_ns: int
+    last_ns: int
+
+    def line(self) -> str:
+        """Return it for people."""
+        return f"{self.direction:6s} {seconds(self.since_ns):.2f} to {seconds(self.last_ns):.2f} s"
+
+
+def told_advisories(states: Iterable[WorldState], side: str | None = None) -> tuple[list[ToldAdvisory], int]:
+    """Return advisories of one side or all by onset, and the first onset, or when risk was highest."""
+    last_ns: dict[tuple[int, str], int] = {}
+    highest, riskiest_ns = -1.0, 0
+    for state in states:
+        cues = [cue for cue in state.cues if side in (None, cue.direction)]
+        for cue in cues:
+            if cue.advisory is not None:
+                last_ns[cue.advisory.since_ns, cue.direction] = state.stamp_ns
+        risk = max((cue.risk for cue in cues), default=0.0)
+        if risk > highest:
+            highest, riskiest_ns = risk, state.stamp_ns
+    told = [ToldAdvisory(direction, since, last) for (since, direction), last in sorted(last_ns.items())]
+    return told, told[0].since_ns if told else riskiest_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +128,15 @@ class SideEvidenceReport:
 
 
 def evidence_report(
-    state: WorldState, onsets: dict[str, WorldState], side: str | None = None
+    state: WorldState, read: Callable[[int], WorldState], side: str | None = None
 ) -> dict[str, SideEvidenceReport]:
-    """Return the report of every side, or one; `onsets` are the states in which their advisories began."""
+    """Return the report of every side, or one; `read` returns the state in which an advisory began."""
     entities = {entity.id: entity for entity in state.entities}
     reports = {}
     for cue in state.cues:
         if side in (None, cue.direction):
-            began = onsets.get(cue.direction)
-            first = None if began is None else _cue_of(began, cue.direction)
+            began = () if cue.advisory is None else read(cue.advisory.since_ns).cues
+            first = next((one for one in began if one.direction == cue.direction), None)
             reports[cue.direction] = SideEvidenceReport(cue, first, entities.get(cue.entity_id or ""))
     return reports
 
@@ -122,10 +157,6 @@ def common_lines(state: WorldState) -> Iterator[str]:
         yield f"look of {view.sensor} at {seconds(view.stamp_ns):.2f} s: {found}, misses {view.miss_rate:.2f}"
     for event in state.events:
         yield f"event: {event.entity_id[:8]} {event.kind.replace('_', ' ')}"
-
-
-def _cue_of(state: WorldState, direction: str) -> RiskCue | None:
-    return next((cue for cue in state.cues if cue.direction == direction), None)
 
 
 def _row(name: str, *nats: float) -> str:

@@ -1,7 +1,7 @@
 """A recording as a table: one row a hop, columns by name."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -140,20 +140,6 @@ def save_tables(path: str | Path, tables: Iterable[HopTable]) -> None:
     _save(path, {"": list(tables)})
 
 
-def load_tables(
-    path: str | Path, what: str, check: Callable[[HopTable], None] = lambda table: None
-) -> list[HopTable]:
-    """Read what `save_tables` wrote; `check` refuses what does not fit."""
-
-    def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
-        tables = _tables(arrays).get("", [])
-        for table in tables:
-            check(table)
-        return tables
-
-    return load_npz(path, what, MAX_BYTES, read)
-
-
 def save_named(path: str | Path, tables: Mapping[str, HopTable]) -> None:
     """Write tables with columns of their own as npz without objects, whole or not at all."""
     _save(path, {name: [table] for name, table in tables.items()})
@@ -185,16 +171,12 @@ def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]]) -> None:
     ]
     head = {"version": VERSION, "recordings": about}
     columns = {
-        _member(kind, name): column
+        # Columns of the nameless kind keep their names.
+        f"{kind}/{name}" if kind else name: column
         for kind, tables in kinds.items()
         for name, column in joined(tables).columns.items()
     }
     save_npz(path, {"": np.array(json.dumps(head)), **columns})
-
-
-def _member(kind: str, column: str) -> str:
-    """Name of a column in the file: columns of the nameless kind keep theirs."""
-    return f"{kind}/{column}" if kind else column
 
 
 def _tables(arrays: dict[str, AnyArray]) -> dict[str, list[HopTable]]:
@@ -255,7 +237,14 @@ def hop_stream(
 
 def load_streams(path: str | Path) -> list[HopTable]:
     """Read the hop streams that `save_tables` wrote, and check them: a user may bring them."""
-    streams = load_tables(path, "hop streams", check=_check_stream)
+
+    def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
+        streams = _tables(arrays).get("", [])
+        for stream in streams:
+            _check_stream(stream)
+        return streams
+
+    streams = load_npz(path, "hop streams", MAX_BYTES, read)
     if not streams:
         raise InputFileError(path, "expected at least one hop stream")
     return streams

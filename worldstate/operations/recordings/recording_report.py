@@ -134,14 +134,13 @@ def run_recording(
             log.add(step)
             on_hop(step)
             end = step.checkpoint
-    elapsed_s, start_s = time.perf_counter() - started, seconds(source.start_ns)
-    hops = HopTable.of_rows(_COLUMNS, log.rows)
+    elapsed_s, last_ns = time.perf_counter() - started, max(log.meter.last_ns, source.start_ns)
     return RecordingReport(
         warning=log.meter.summary(),
-        timeline=log.timeline(hops, source, title),
-        hops=len(hops),
-        peak_risk=float(hops.risk.max(initial=0.0)),
-        realtime_factor=(float(hops.time_s.max(initial=start_s)) - start_s) / elapsed_s,
+        timeline=log.timeline(source, title),
+        hops=log.meter.states,
+        peak_risk=log.meter.peak_risk,
+        realtime_factor=seconds(last_ns - source.start_ns) / elapsed_s,
         health=log.health.summary(),
         end=end,
     )
@@ -155,7 +154,7 @@ class _HopLog:
     health: HealthLog = field(default_factory=HealthLog)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
     entities: dict[str, list[tuple[float, float, float, bool]]] = field(default_factory=dict)
-    moving_rad: list[list[float]] = field(default_factory=list)
+    boxes: list[tuple[float, float]] = field(default_factory=list)
     azimuths_rad: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def add(self, step: Step) -> None:
@@ -171,17 +170,16 @@ class _HopLog:
             if entity.moving and entity.existence_probability >= LIKELY:
                 row = now_s, entity.azimuth_rad, entity.azimuth_std_rad, entity.status == "hidden"
                 self.entities.setdefault(entity.id, []).append(row)
-        self.moving_rad.append([seen.azimuth_rad for seen in step.measurement.sightings if seen.moving])
+        self.boxes += [(now_s, seen.azimuth_rad) for seen in step.measurement.sightings if seen.moving]
 
-    def timeline(self, hops: HopTable, source: Source, title: str) -> Timeline:
-        boxes = [(t, azimuth) for t, row in zip(hops.time_s, self.moving_rad, strict=True) for azimuth in row]
+    def timeline(self, source: Source, title: str) -> Timeline:
         return Timeline(
-            hops=hops,
+            hops=HopTable.of_rows(_COLUMNS, self.rows),
             threshold=source.policy.gamma,
             alpha=source.policy.alpha,
             azimuths_rad=self.azimuths_rad,
             entities=tuple(np.array(rows, dtype=np.float64) for rows in self.entities.values()),
-            sightings=np.array(boxes, dtype=np.float64).reshape(-1, 2),
+            sightings=np.array(self.boxes, dtype=np.float64).reshape(-1, 2),
             t0_s=source.t0_s,
             truth=read_true_tracks(source.audio_path.parent),
             title=title,

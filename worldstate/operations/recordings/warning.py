@@ -1,6 +1,5 @@
 """What one recording's stream of states amounts to: advisories, lead time, hand-over."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from worldstate.ground.values import seconds
@@ -30,10 +29,14 @@ class WarningSummary:
 
 @dataclass(slots=True)
 class WarningMeter:
-    """Counts advisories while states go by, and keeps none of them."""
+    """Counts states and advisories while they go by, and keeps none of them."""
 
     t0_s: float | None  # Line-of-sight entry on the clock of the states, seconds
     hazard_free: bool = False  # Whether the recording is known to hold no vehicle
+    states: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    peak_risk: float = 0.0
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None
@@ -41,6 +44,8 @@ class WarningMeter:
 
     def update(self, state: WorldState) -> None:
         """Take in the next state of the recording."""
+        self.first_ns, self.last_ns = self.first_ns if self.states else state.stamp_ns, state.stamp_ns
+        self.states, self.peak_risk = self.states + 1, max(self.peak_risk, state.risk)
         raised = [cue for cue in state.cues if cue.advisory]
         if raised and not self._raised:
             self._onsets.append((seconds(state.stamp_ns), _strongest(raised).entity_id))
@@ -83,57 +88,3 @@ def _first_visible(state: WorldState) -> str | None:
         if entity.status == "visible" and entity.moving:
             return entity.id
     return None
-
-
-@dataclass(frozen=True, slots=True)
-class ToldAdvisory:
-    """An advisory of one side, from its onset to the last snapshot that has it.
-
-    Examples
-    --------
-    >>> ToldAdvisory("left", 700_000_000, 1_500_000_000).line()
-    'left   0.70 to 1.50 s'
-    """
-
-    direction: str
-    since_ns: int
-    last_ns: int
-
-    def line(self) -> str:
-        """Return it for people."""
-        return f"{self.direction:6s} {seconds(self.since_ns):.2f} to {seconds(self.last_ns):.2f} s"
-
-
-@dataclass(frozen=True, slots=True)
-class ToldAdvisories:
-    """The advisories of a file, in the order of their onsets, and when its risk was highest."""
-
-    advisories: tuple[ToldAdvisory, ...]
-    riskiest_ns: int
-
-    @property
-    def explained_ns(self) -> int:
-        """The first onset; where there is no advisory, the time of the highest risk."""
-        return self.advisories[0].since_ns if self.advisories else self.riskiest_ns
-
-    def lines(self) -> Iterator[str]:
-        """Yield them for people, and which is explained."""
-        yield from ("advisories", *(f"  {one.line()}" for one in self.advisories))
-        which = "at the first onset" if self.advisories else "none; at the highest risk"
-        yield f"  {which}, another by --time"
-
-
-def told_advisories(states: Iterable[WorldState], side: str | None = None) -> ToldAdvisories:
-    """Return the advisories of snapshots, of one side or of all."""
-    last_ns: dict[tuple[int, str], int] = {}
-    highest, riskiest_ns = -1.0, 0
-    for state in states:
-        cues = [cue for cue in state.cues if side in (None, cue.direction)]
-        for cue in cues:
-            if cue.advisory is not None:
-                last_ns[cue.advisory.since_ns, cue.direction] = state.stamp_ns
-        risk = max((cue.risk for cue in cues), default=0.0)
-        if risk > highest:
-            highest, riskiest_ns = risk, state.stamp_ns
-    told = (ToldAdvisory(direction, since, last) for (since, direction), last in sorted(last_ns.items()))
-    return ToldAdvisories(tuple(told), riskiest_ns)
