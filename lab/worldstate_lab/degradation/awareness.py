@@ -19,7 +19,7 @@ from worldstate.operations.metrics.approach_table import (
 )
 from worldstate.operations.recordings.hop_table import HOP_S, UNQUERIED, HopTable
 from worldstate.operations.recordings.stream_statistic import stream_statistic
-from worldstate_lab.metrics.intervals import deal_folds, middle
+from worldstate_lab.metrics.intervals import deal_folds, middle, ratio
 
 from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions
 
@@ -172,8 +172,7 @@ class _Counts:
     def _share(self, part: FloatArray) -> tuple[float, FloatArray]:
         hops, drawn = self._hops[self._draws].sum(axis=1), part[self._draws].sum(axis=1)
         # A draw without anything in view has no share; `middle` leaves it out.
-        shares = np.divide(drawn, hops, out=np.full(hops.shape, np.nan), where=hops > 0)
-        return float(part.sum() / self._hops.sum()), shares
+        return float(part.sum() / self._hops.sum()), ratio(drawn, hops)
 
 
 def _judge(others: Sequence[Staged], prior: Sequence[float], hops: int) -> Callable[[HopTable], _Judged]:

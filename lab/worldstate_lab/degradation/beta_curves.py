@@ -17,7 +17,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, AbsenceTally
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.intervals import middle
+from worldstate_lab.metrics.intervals import draw_weights, middle, ratio
 
 from .conditions import FAMILIES, at_level
 from .looks import detections_in, health_of
@@ -131,15 +131,12 @@ def beta_curves(counts: Sequence[Counts], draws: IndexArray) -> BetaCurves:
         np.array([[getattr(one[family], name) for family in FAMILIES] for one in counts])
         for name in ("looks", "misses")
     )
-    # How often each recording is in each draw, so that a draw is a product and no loop.
-    weight = np.stack([np.bincount(drawn, minlength=len(counts)) for drawn in draws]).astype(float)
-    drawn_bins = _ratio(np.tensordot(weight, misses, 1), np.tensordot(weight, looks, 1))
-    drawn_all = _ratio(
-        np.tensordot(weight, misses.sum(axis=2), 1), np.tensordot(weight, looks.sum(axis=2), 1)
-    )
+    weight = draw_weights(draws, len(counts))
+    drawn_bins = ratio(np.tensordot(weight, misses, 1), np.tensordot(weight, looks, 1))
+    drawn_all = ratio(np.tensordot(weight, misses.sum(axis=2), 1), np.tensordot(weight, looks.sum(axis=2), 1))
     total, missed = looks.sum(axis=0), misses.sum(axis=0)
-    by_azimuth = _band(_ratio(missed, total), drawn_bins)
-    overall = _band(_ratio(missed.sum(axis=1), total.sum(axis=1)), drawn_all)
+    by_azimuth = _band(ratio(missed, total), drawn_bins)
+    overall = _band(ratio(missed.sum(axis=1), total.sum(axis=1)), drawn_all)
     found = BetaCurves(edges, total, by_azimuth, overall, ())
     falls = sorted(_falls(found, drawn_bins, drawn_all), key=lambda fall: -fall.by)
     return BetaCurves(edges, total, by_azimuth, overall, tuple(falls))
@@ -170,10 +167,6 @@ def _fall(
 
 def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, values.tolist()))
-
-
-def _ratio(part: FloatArray, whole: FloatArray) -> FloatArray:
-    return np.asarray(np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0))
 
 
 def _band(value: FloatArray, drawn: FloatArray) -> Band:

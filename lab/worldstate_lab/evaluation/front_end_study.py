@@ -9,15 +9,13 @@ from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate_lab.metrics.bearing_gating import gated_median_deg
-from worldstate_lab.metrics.intervals import middle, stratified_draws
+from worldstate_lab.metrics.intervals import Interval, middle, pooled_draws, stratified_draws
 from worldstate_lab.trials.trial import Trial
 
 # The paper's figure of looming is of the last three seconds before the pass.
 IMMINENT_S = 3.0
 # A slope read as a time: beyond this there is nothing that approaches.
 LONGEST_TTA_S = 30.0
-
-Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +102,8 @@ def _looming(approaches: Sequence[HopTable], calm: Sequence[HopTable]) -> dict[s
 
 def _site_error(approaches: Sequence[HopTable], rng: np.random.Generator, draws: int) -> SiteError:
     errors = [_known(_error(hops, "srp_rad")) for hops in approaches]
-    drawn = rng.integers(len(errors), size=(draws, len(errors)))
-    medians = [_median(_flat([errors[i] for i in rows])) for rows in drawn.tolist()]
-    every = _flat(errors)
-    interval = middle(np.degrees(np.array(medians)))
+    medians = [_median(one) for one in pooled_draws(errors, [0] * len(errors), rng, draws)]
+    every, interval = _flat(errors), middle(np.degrees(np.array(medians)))
     return SiteError(float(np.degrees(_median(every))), interval, every.size)
 
 

@@ -17,6 +17,7 @@ from worldstate_lab.evaluation.figures import FIGURES
 from worldstate_lab.metrics.bearing_gating import PUBLISHED_COVERAGE
 from worldstate_lab.metrics.by_group import worst_group
 from worldstate_lab.metrics.intervals import (
+    Interval,
     draw_weights,
     highest_share,
     known_mean,
@@ -27,8 +28,6 @@ from worldstate_lab.metrics.intervals import (
     weighted_median,
 )
 from worldstate_lab.trials.trial import Decisions, Trial
-
-Interval = tuple[float, float]
 
 _HOURS = HOP_S / SECONDS_PER_HOUR
 _RATIOS = {name: (*kind.counts, kind.unit) for name, kind in FIGURES.items() if any(kind.counts)}

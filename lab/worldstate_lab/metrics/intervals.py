@@ -11,7 +11,8 @@ one kind. A figure is formed on every draw, by its rows or by `draw_weights`, an
 Exact intervals of counts and shares are in `worldstate.operations.metrics.approach_table`.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +32,7 @@ COVERAGE = 0.95
 FOLDS = 5
 
 Interval = tuple[float, float]
+Part = TypeVar("Part", IndexArray, FloatArray)
 
 
 def stratified_draws(strata: Sequence[Hashable], rng: np.random.Generator, draws: int = DRAWS) -> IndexArray:
@@ -52,6 +54,21 @@ def stratified_draws(strata: Sequence[Hashable], rng: np.random.Generator, draws
     for rows in map(np.array, members.values()):
         drawn[:, rows] = rng.choice(rows, (draws, rows.size))
     return drawn
+
+
+def pooled_draws(
+    parts: Sequence[Part], strata: Sequence[Hashable], rng: np.random.Generator, draws: int = DRAWS
+) -> Iterator[Part]:
+    """Yield what recordings hold together in each draw of them: their rows, or their values.
+
+    Examples
+    --------
+    >>> parts = [np.array([0, 1]), np.array([2])]
+    >>> [one.tolist() for one in pooled_draws(parts, [0, 0], np.random.default_rng(0), draws=2)]
+    [[2, 2], [2, 0, 1]]
+    """
+    for one in stratified_draws(strata, rng, draws).tolist():
+        yield np.concatenate([parts[i] for i in one])
 
 
 def middle(values: FloatArray, coverage: float = COVERAGE) -> Interval:
@@ -89,7 +106,7 @@ def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = 
     keys, labels = table.recording_keys, recording_labels(table)
     rows = [np.flatnonzero(keys == key) for key in labels]
     strata = [(key.split("/")[0], label) for key, label in labels.items()]
-    return [np.concatenate([rows[i] for i in one]) for one in stratified_draws(strata, rng, draws)]
+    return list(pooled_draws(rows, strata, rng, draws))
 
 
 def poisson_upper(count: int, exposure: float, confidence: float = 0.9) -> float:

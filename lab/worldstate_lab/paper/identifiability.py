@@ -15,6 +15,7 @@ from worldstate.ground.checks import check_shape, finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate_lab.features.methods import method_of
+from worldstate_lab.metrics.intervals import pooled_draws
 
 # Estimators count in nats, the paper and the report in bits.
 _BITS = 1.0 / math.log(2.0)
@@ -508,8 +509,5 @@ def _spread(q: FloatArray, states: NDArray[np.int_], units: IndexArray, rng: np.
     """Return the bootstrap standard deviation of the lower bound, whole recordings drawn."""
     order = np.argsort(units, kind="stable")
     rows = np.split(order, np.cumsum(np.bincount(units))[:-1])
-    draws = []
-    for _ in range(_BOOTSTRAPS):
-        chosen = np.concatenate([rows[i] for i in rng.integers(0, len(rows), len(rows))])
-        draws.append(information_from_posteriors(q[chosen], states[chosen]).lower)
-    return float(np.std(draws))
+    chosen = pooled_draws(rows, [0] * len(rows), rng, _BOOTSTRAPS)
+    return float(np.std([information_from_posteriors(q[one], states[one]).lower for one in chosen]))

@@ -9,7 +9,7 @@ import numpy as np
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate_lab.metrics.by_group import auroc_by_group
-from worldstate_lab.metrics.intervals import DRAWS, FOLDS, Interval, middle, stratified_draws
+from worldstate_lab.metrics.intervals import FOLDS, Interval, middle, pooled_draws
 
 from .clip_signatures import ClipSignatures, signature_edges_hz
 from .fisher_profile import BandProfile, discriminative_range_hz, level_invariant_shape, profile_of
@@ -124,7 +124,7 @@ def interval(figure: Callable[[ClipScores], float], scores: ClipScores, rng: np.
 def draw_recordings(
     recordings: TextArray, vehicle: BoolArray, rng: np.random.Generator
 ) -> Iterator[IndexArray]:
-    """Yield the rows of draws of recordings with replacement.
+    """Return the rows of draws of recordings with replacement.
 
     Shapes: recordings, vehicle (n,).
     """
@@ -132,8 +132,7 @@ def draw_recordings(
     rows = [np.flatnonzero(of_clip == i) for i in range(len(names))]
     # Drawn apart by what they hold, or a draw could be without any background.
     holds = [(bool(vehicle[one].any()), bool(vehicle[one].all())) for one in rows]
-    for draw in stratified_draws(holds, rng, DRAWS).tolist():
-        yield np.concatenate([rows[i] for i in draw])
+    return pooled_draws(rows, holds, rng)
 
 
 def _features(energy: FloatArray, by: By) -> FloatArray:
