@@ -46,7 +46,7 @@ from worldstate_lab.evaluation.report.degradation_section import (
     stream_table,
     sweep_tables,
 )
-from worldstate_lab.trials.engine import Engine, Failed
+from worldstate_lab.trials.engine import Failed, attempted
 from worldstate_lab.trials.pass_cache import PassCache
 
 from worldstate.abduction.absence import default_miss_rates
@@ -424,7 +424,7 @@ def test_the_study_end_to_end_again_from_what_it_kept_and_without_a_broken_recor
     settings = DegradationSettings(detectors=MOTION, approaches=3, hazard_free=2, width_px=320)
 
     def over(work, items):
-        return [one.problem if isinstance(one, Failed) else one for one in Engine(jobs=2).over(work, items)]
+        return [one.problem if isinstance(one, Failed) else one for one in attempted(work, items, jobs=2)]
 
     first = degradation_study(recordings, settings, over=over, keep=keep)
     assert set(first.skipped) == {broken.recording_id}

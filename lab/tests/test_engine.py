@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from engine_work import Levels, end_at_one, write_sounds
-from worldstate_lab.trials.engine import Engine, Failed
+from worldstate_lab.trials.engine import Failed, attempted
 
 from worldstate.ground.errors import WorldstateError
 
@@ -22,17 +22,16 @@ def plain(outcome):
     return outcome.name, {name: column.tobytes() for name, column in outcome.columns.items()}
 
 
-def test_every_engine_gives_the_same_and_reports_the_broken_recording(tmp_path):
+def test_any_number_of_processes_gives_the_same_and_reports_the_broken_recording(tmp_path):
     paths = write_sounds(tmp_path / "sounds", 6)
     paths[2].write_bytes(b"no sound")
     paths[4].unlink()
-    engines = {"one": Engine(), "two": Engine(jobs=2)}
     found = {}
-    for name, engine in engines.items():
+    for name, jobs in (("one", 1), ("two", 2)):
         # A cache of its own: nothing is taken over from the engine before.
         work = Levels(tmp_path / name / "cache")
         work.folder.mkdir(parents=True)
-        found[name] = [plain(one) for one in engine.over(work, paths, name=lambda path: path.stem)]
+        found[name] = [plain(one) for one in attempted(work, paths, jobs, name=lambda path: path.stem)]
         assert sorted((tmp_path / name / "log").read_text().split()) == [f"{i}.wav" for i in (0, 1, 2, 3, 5)]
     assert found["one"] == found["two"]
     failed = [one for one in found["one"] if isinstance(one, Failed)]
@@ -44,24 +43,24 @@ def test_every_engine_gives_the_same_and_reports_the_broken_recording(tmp_path):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_of_the_program_is_no_broken_recording(jobs):
     with pytest.raises(TypeError, match="has no len"):
-        list(Engine(jobs).over(len, [[0], 1, [2]]))
+        list(attempted(len, [[0], 1, [2]], jobs))
 
 
 def test_a_process_that_is_lost_is_an_error_not_an_endless_wait():
     with pytest.raises(WorldstateError, match="a process ended before its work was done"):
-        list(Engine(2).over(end_at_one, [0, 1, 2]))
+        list(attempted(end_at_one, [0, 1, 2], 2))
 
 
 RUN = """
 import signal, sys
 from pathlib import Path
 from engine_work import Levels
-from worldstate_lab.trials.engine import Engine
+from worldstate_lab.trials.engine import attempted
 def end(number, frame): raise SystemExit(128 + number)
 signal.signal(signal.SIGTERM, end)
 folder, pause_s = Path(sys.argv[1]), float(sys.argv[2])
 paths = sorted((folder / "sounds").iterdir())
-for one in Engine(jobs=2).over(Levels(folder / "cache", pause_s), paths):
+for one in attempted(Levels(folder / "cache", pause_s), paths, 2):
     print(one.name, one.level.tobytes().hex(), one.gram.tobytes().hex(), flush=True)
 """
 
@@ -109,7 +108,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same(number, 
     fresh.mkdir()
     (fresh / "cache").mkdir()
     (tmp_path / "sounds").rename(fresh / "sounds")
-    whole = list(Engine().over(Levels(fresh / "cache"), sorted((fresh / "sounds").iterdir())))
+    whole = list(attempted(Levels(fresh / "cache"), sorted((fresh / "sounds").iterdir()), 1))
     assert said.splitlines() == [
         f"{one.name} {one.level.tobytes().hex()} {one.gram.tobytes().hex()}" for one in whole
     ]
@@ -123,7 +122,7 @@ def test_memory_does_not_grow_with_the_number_of_recordings(tmp_path):
         work.folder.mkdir(parents=True)
         tracemalloc.start()
         try:
-            kept = list(Engine().over(work, paths[:n]))
+            kept = list(attempted(work, paths[:n], 1))
             return len(kept), tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()

@@ -70,7 +70,6 @@ from worldstate_lab.report.pages import write_document
 from worldstate_lab.report.table import Cell, Table, Value, plain
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
-from worldstate_lab.trials.engine import Engine
 from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import model_refusal
 from worldstate_lab.trials.takes import Take, TakeList, find_takes
@@ -129,7 +128,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         takes,
         Hearing(arguments.out / "cache", arguments.model),
         classifiers,
-        Engine(arguments.jobs),
+        arguments.jobs,
         track,
         EvaluationSettings(
             seeds,

@@ -32,7 +32,7 @@ from worldstate_lab.degradation.staged_filter import (
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
 from worldstate_lab.trials.classification import Classifiers
-from worldstate_lab.trials.engine import Engine, Failed
+from worldstate_lab.trials.engine import Failed, attempted
 from worldstate_lab.trials.hearing import Hearing, hear, within_hours
 from worldstate_lab.trials.listening import model_refusal
 from worldstate_lab.trials.pass_cache import PassCache, fingerprint
@@ -105,14 +105,14 @@ def evaluate(
     takes: TakeList,
     hearing: Hearing,
     classifiers: Classifiers,
-    engine: Engine,
+    jobs: int,
     track: Progress,
     settings: EvaluationSettings,
 ) -> Evaluation:
     """Hear all recordings, run every protocol that they suffice for and score every method."""
     lacking_data(takes)
     every = (*takes.static, *takes.dynamic)
-    heard, failed = hear(track(engine.over(hearing, every, attrgetter("name")), "listening", len(every)))
+    heard, failed = hear(track(attempted(hearing, every, jobs, attrgetter("name")), "listening", len(every)))
     trials = within_hours(heard, settings.hazard_free_hours)
     left = _left(takes, trials)
     # Again, on what is left: one broken recording of a small data set may be one too many.
@@ -147,12 +147,10 @@ def evaluate(
     # Broken videos may leave a sweep fewer recordings than it needs: no reason to lose all other figures.
     if settings.degradation is not None:
         with _noted(lacking, "degradation sweep"):
-            found = replace(
-                found, degradation=_degradation(left, hearing, engine, track, settings.degradation)
-            )
+            found = replace(found, degradation=_degradation(left, hearing, jobs, track, settings.degradation))
     if settings.stage_streams:
         with _noted(lacking, "staged streams"):
-            found = replace(found, staged=_staged(found, left, hearing, engine, track))
+            found = replace(found, staged=_staged(found, left, hearing, jobs, track))
     return found
 
 
@@ -184,7 +182,7 @@ def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSe
 
 
 def _degradation(
-    takes: TakeList, hearing: Hearing, engine: Engine, track: Progress, settings: DegradationSettings
+    takes: TakeList, hearing: Hearing, jobs: int, track: Progress, settings: DegradationSettings
 ) -> DegradationStudy:
     """Run the sweep; the recordings are worked on as all others are, and what was seen is kept."""
     model, filmed = read_model(settings.model), [take for take in takes.static if take.filmed]
@@ -193,7 +191,7 @@ def _degradation(
             raise InvalidArgumentError(f"needs a model that was made for this sound; {refusal}")
 
     def over(work: Callable[[SweepItem], Tables], items: Sequence[SweepItem]) -> Iterator[Tables | str]:
-        done = track(engine.over(work, items), "degrading the camera", len(items))
+        done = track(attempted(work, items, jobs), "degrading the camera", len(items))
         return (one.problem if isinstance(one, Failed) else one for one in done)
 
     named = partial(fingerprint, memo=hearing.folder / "fingerprints")
@@ -221,16 +219,14 @@ class _StagedStream:
         return PassCache(folder).tables("staged-streams", key, make)["advised"]
 
 
-def _staged(
-    found: Evaluation, takes: TakeList, hearing: Hearing, engine: Engine, track: Progress
-) -> StreamSweep:
+def _staged(found: Evaluation, takes: TakeList, hearing: Hearing, jobs: int, track: Progress) -> StreamSweep:
     """Stage every state of camera and roof on the hazard-free streams."""
     names = {str(t.hops.about["stream"]) for t in found.trials if "stream" in t.hops.about}
     streams = [take for take in takes.static if take.name in names]
     if not streams:
         raise InvalidArgumentError("needs a stream of two minutes or more without hazards, found none")
     seed = found.settings.seeds[0]
-    work = engine.over(_StagedStream(hearing, seed), streams, attrgetter("name"))
+    work = attempted(_StagedStream(hearing, seed), streams, jobs, attrgetter("name"))
     done = []
     for one in track(work, "staging camera and rain on streams", len(streams)):
         if isinstance(one, Failed):

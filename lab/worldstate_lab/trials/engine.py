@@ -21,29 +21,22 @@ class Failed:
     problem: str  # Text of the error
 
 
-@dataclass(frozen=True, slots=True)
-class Engine:
-    """Where the work is done: `jobs` processes of this machine.
+def attempted(
+    work: Callable[[Item], Result], items: Sequence[Item], jobs: int, name: Callable[[Item], str] = str
+) -> Generator[Result | Failed, None, None]:
+    """Yield ``work(item)`` in the order of the items; one that fails is reported and the others go on.
+
+    `work` is sent to other processes with the items: paths and settings, never sound. Errors of programs,
+    which would meet every recording, are raised.
 
     Examples
     --------
     >>> from worldstate.adapters import read_model
-    >>> list(Engine().over(read_model, ["missing.json"]))
+    >>> list(attempted(read_model, ["missing.json"], jobs=1))
     [Failed(name='missing.json', problem='missing.json: ...')]
     """
-
-    jobs: int = 1
-
-    def over(
-        self, work: Callable[[Item], Result], items: Sequence[Item], name: Callable[[Item], str] = str
-    ) -> Generator[Result | Failed, None, None]:
-        """Yield ``work(item)`` in the order of the items; one that fails is reported and the others go on.
-
-        `work` is sent to other processes with the items: paths and settings, never sound. Errors of programs,
-        which would meet every recording, are raised.
-        """
-        named = [(name(item), item) for item in items]
-        return in_processes(partial(_attempt, work), named, self.jobs)
+    named = [(name(item), item) for item in items]
+    return in_processes(partial(_attempt, work), named, jobs)
 
 
 def _attempt(work: Callable[[Item], Result], named: tuple[str, Item]) -> Result | Failed:
