@@ -258,8 +258,10 @@ def comparison(
     drawn = {name: draw_figures(table, mine, samples) for name, mine in chosen.items()}
     rows = {name: _row_figures(table, mine, drawn[name], alpha) for name, mine in chosen.items()}
     others = [name for name in rows if name != row]
+    by_seed = [window_figures(table, one) for one in chosen[row]]
     return {
         **rows[row],
+        "seed_std": {key: np.std(np.array([one[key] for one in by_seed], float)).item() for key in DEVIATING},
         "statistic": "absent" if ROWS[row].miss_rate == ABSENT_MISS_RATE else "published",
         **count_windows(table),
         "per_group": report_groups(table, chosen[row]),
@@ -278,13 +280,12 @@ def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]
 def _row_figures(
     table: FeatureTable, passes: Sequence[Predictions], draws: Mapping[str, FloatArray], alpha: float
 ) -> dict[str, Any]:
-    by_seed = [window_figures(table, one) for one in passes]
-    figures, n = mean_figures(by_seed), int(table.hazard_free.sum())
+    figures = mean_figures([window_figures(table, one) for one in passes])
+    n = int(table.hazard_free.sum())
     # Probability of as many false positives or more, were the true rate the budget.
     p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
     return {
         **figures,
-        "seed_std": {key: np.std(np.array([one[key] for one in by_seed], float)).item() for key in DEVIATING},
         "fpr_p_value": p_value,
         "intervals": {name: middle(one) for name, one in draws.items()},
     }
