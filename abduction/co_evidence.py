@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.ground.checks import in_range
+from worldstate.ground.checks import check_fields, in_range
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +121,9 @@ class Unqueried:
     """
 
     reason: str
+
+    def __post_init__(self) -> None:
+        check_fields(self, reason=str)
 
     def log_likelihoods(self) -> np.ndarray:
         """Zero for every explanation, shape (3,): beta = 1, it moves nothing.

@@ -1,11 +1,17 @@
 """Log-likelihoods of one observation under every explanation, and the vote of a bearing for a side."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.ground import InvalidArgumentError, finite_array
+from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.checks import all_of
+
+# A window of a second differs by tens of nats between explanations; beyond this, sums lose the digits that
+# probabilities consist of.
+MOST_NATS = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +32,11 @@ class SideEvidence:
     visible : float
         Log-likelihood of one in view above that of none, with a source in the open left aside, nats.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If a log-likelihood is not finite or beyond 1,000 nats.
+
     Examples
     --------
     >>> SideEvidence(("left", "right"), (2.5, -1.0), 0.02, 0.01, 0.3).log_ratios[0]
@@ -37,6 +48,10 @@ class SideEvidence:
     both: float
     direct: float
     visible: float
+
+    def __post_init__(self) -> None:
+        _check_each("log_ratios", self.log_ratios, self.directions)
+        _nats(log_ratios=self.log_ratios, visible=(self.visible,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +80,7 @@ class SignatureEvidence:
     Raises
     ------
     InvalidArgumentError
-        If a likelihood is not finite or the numbers do not fit the directions.
+        If a log-likelihood is not finite or beyond 1,000 nats, or the numbers do not fit the directions.
 
     Examples
     --------
@@ -80,12 +95,11 @@ class SignatureEvidence:
     sides: SideEvidence | None = None
 
     def __post_init__(self) -> None:
-        if not self.directions or len(set(self.directions)) != len(self.directions):
-            raise InvalidArgumentError(f"directions: expected different labels, got {self.directions!r}")
-        if np.size(self.hidden) != len(self.directions):
-            raise InvalidArgumentError(f"hidden: expected one of each direction, got {self.hidden!r:.80}")
-        every = (*self.hidden, self.visible, self.none)
-        *hidden, visible, none = finite_array("hidden, visible, none", every, (len(every),)).tolist()
+        labels = all_of("directions", self.directions, str, most=64)
+        if not labels or len(set(labels)) != len(labels):
+            raise InvalidArgumentError(f"directions: expected different labels, got {labels!r}")
+        _check_each("hidden", self.hidden, self.directions)
+        *hidden, visible, none = _nats(hidden=self.hidden, visible=(self.visible,), none=(self.none,))
         # Whole numbers among them would make arrays that no likelihood can be added to.
         object.__setattr__(self, "hidden", tuple(hidden))
         object.__setattr__(self, "visible", visible)
@@ -95,6 +109,20 @@ class SignatureEvidence:
     def log_likelihoods(self) -> np.ndarray:
         """The vector (hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
         return np.array([*self.hidden, self.visible, self.none], dtype=np.float64)
+
+
+def _check_each(name: str, values: object, directions: Sequence[str]) -> None:
+    if not isinstance(values, Sequence | np.ndarray) or len(values) != len(directions):
+        raise InvalidArgumentError(f"{name}: expected one of each direction, got {values!r:.80}")
+
+
+def _nats(**named: Sequence[float]) -> list[float]:
+    """Return log-likelihoods by name in a row; refuse what is none or too large."""
+    return [
+        one if type(one) is float and abs(one) <= MOST_NATS else in_range(name, one, -MOST_NATS, MOST_NATS)
+        for name, values in named.items()
+        for one in values
+    ]
 
 
 # Chance that the peak is an image after all, and the least probability of direct sound that counts.

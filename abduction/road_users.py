@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import freeze_arrays
+from worldstate.ground.checks import all_of, freeze_arrays, in_range, named
 
 UNKNOWN, SIREN = "unknown", "siren"
 # As detectors of COCO's classes call them; a van is a car to some and a truck to others.
@@ -28,6 +28,24 @@ SEEN_AS = {
 }
 ClassShares: TypeAlias = tuple[tuple[str, float], ...]
 """Names of classes with their probabilities, sorted by name."""
+
+
+def class_shares(name: str, value: object) -> ClassShares:
+    """Return classes with their probabilities, sorted; refuse what is none.
+
+    Examples
+    --------
+    >>> class_shares("classes", [("van", 0.25), ("car", 0.75)])
+    (('car', 0.75), ('van', 0.25))
+    """
+    shares = list[tuple[str, float]]()
+    for one in all_of(name, value, tuple, most=64):
+        if len(one) != 2:
+            raise InvalidArgumentError(f"{name}: expected a class and its probability, got {one!r:.40}")
+        label, share = one
+        named(name, label)
+        shares.append((label, in_range(name, share, 0.0, 1.0)))
+    return tuple(sorted(shares))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

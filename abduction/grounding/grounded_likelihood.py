@@ -16,7 +16,7 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.evidence import MOST_NATS, SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
 
 SPEED_OF_SOUND_M_S = 343.0
@@ -427,12 +427,11 @@ def ground(
     )
     per_class = np.logaddexp.reduce(over_speed, axis=1)
     moving = np.logaddexp.reduce(per_class)
-    grounded = SignatureEvidence(
-        evidence.directions,
-        tuple((np.array(evidence.hidden) + moving + np.logaddexp.reduce(hidden_azimuth)).tolist()),
-        float(evidence.visible + moving + np.logaddexp.reduce(visible_azimuth)),
-        evidence.none,
-    )
+    hidden = np.array(evidence.hidden) + moving + np.logaddexp.reduce(hidden_azimuth)
+    visible = evidence.visible + moving + np.logaddexp.reduce(visible_azimuth)
+    # What no descriptor explains is unlikely without bound.
+    *hidden, visible = np.clip([*hidden, visible], -MOST_NATS, MOST_NATS).tolist()
+    grounded = SignatureEvidence(evidence.directions, tuple(hidden), visible, evidence.none)
     best = _best(evidence, descriptors, over_speed, hidden_azimuth)
     return GroundedAnswer(grounded, best, dict(zip(names, np.exp(per_class - moving).tolist(), strict=True)))
 

@@ -56,7 +56,8 @@ def sighting(rng: np.random.Generator) -> Sighting:
 
 
 def measurement(rng: np.random.Generator, stamp_ns: int) -> Measurement:
-    left, right, visible, none = (rng.normal(0.0, 1.0, 4) * rng.choice([1.0, 10.0, 500.0])).tolist()
+    nats = rng.normal(0.0, 1.0, 4) * rng.choice([1.0, 10.0, 500.0])
+    left, right, visible, none = nats.clip(-1000.0, 1000.0).tolist()
     said, azimuth_rad, rate_hz = answer(rng), extreme(rng, -np.pi, np.pi), extreme(rng, -1e3, 1e3)
     bearing = Bearing(azimuth_rad, max(extreme(rng, 0.0, 1e3), TINY), 1.0 + extreme(rng, 0.0, 10.0))
     approach = Approach(rate_hz, max(extreme(rng, 0.0, 1e6), TINY))

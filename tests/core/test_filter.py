@@ -612,22 +612,11 @@ def test_a_damaged_checkpoint_is_refused():
         WorldFilter.from_dict(value)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"stamp_ns": 1.5e9}, "expected integer nanoseconds"),
-        ({"bearing": Bearing(math.nan, 0.1)}, "bearing.azimuth_rad"),
-        ({"bearing": Bearing(0.1, 0.0)}, "bearing.std_rad"),
-        ({"approach": Approach(math.inf, 0.1)}, "inverse_tta_hz"),
-        ({"sightings": (Sighting(0.1, math.nan, "car", 0.9),)}, r"sightings\[0\].std_rad"),
-        ({"signature": SignatureEvidence(("north",), (0.0,), 0.0, 0.0)}, "expected the directions"),
-    ],
-)
-def test_bad_measurements_are_refused_and_change_nothing(change, words):
+def test_a_measurement_of_other_directions_is_refused_and_changes_nothing():
     world = start().update(measured(2.0, LEFT))
-    before = world.state
-    with pytest.raises(InvalidArgumentError, match=words):
-        world.update(replace(measured(2.1, LEFT), **change))
+    before, other = world.state, SignatureEvidence(("north",), (0.0,), 0.0, 0.0)
+    with pytest.raises(InvalidArgumentError, match="expected the directions"):
+        world.update(replace(measured(2.1, LEFT), signature=other))
     assert world.state == before
 
 

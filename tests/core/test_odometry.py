@@ -123,7 +123,7 @@ def test_late_odometry_and_a_checkpoint_change_nothing() -> None:
         ({"yaw_rate_rad_s": 11.0}, "yaw_rate_rad_s"),
         ({"stamp_ns": 0.5}, "stamp_ns: expected integer"),
         ({"source": ""}, "source: expected a name"),
-        ({"pose": (0.0, 0.0)}, "pose: expected an EgoPose"),
+        ({"pose": (0.0, 0.0)}, "pose: expected EgoPose or None"),
     ],
 )
 def test_what_is_no_odometry_is_refused_by_name(wrong: dict[str, object], words: str) -> None:

@@ -358,7 +358,7 @@ def test_the_latency_of_a_scan_puts_it_where_it_was_taken() -> None:
         (lambda: PositionScan("", 0), "source: expected a name"),
         (lambda: PositionScan("radar", 0.5), "stamp_ns: expected integer"),
         (lambda: PositionScan("radar", 0, (crossing(1.0),) * 129), "positions: expected at most 128"),
-        (lambda: PositionScan("radar", 0, (1.0,)), "positions: expected"),
+        (lambda: PositionScan("radar", 0, (1.0,)), r"positions\[0\]: expected Position"),
         (lambda: PositionScan("radar", 0, (), RADAR, -1.0), "latency_s"),
         (lambda: WorldFilter(Context(ego_speed_mps=math.nan)), "ego_speed_mps: expected a finite number"),
     ],

@@ -166,7 +166,7 @@ def test_a_checkpoint_holds_the_looks_of_all_cameras() -> None:
 
 def test_what_a_further_camera_cannot_have_seen_is_refused() -> None:
     front = camera("front", 1.0, FRONT)
-    with pytest.raises(InvalidArgumentError, match=r"further\[0\].sightings\[0\].azimuth_rad: .* got 4.0"):
+    with pytest.raises(InvalidArgumentError, match=r"azimuth_rad: .* got 4\.0"):
         after(measured(1.0, front, camera("left", 1.0, LEFT, car(4.0))))
-    with pytest.raises(InvalidArgumentError, match="further: expected at most 32 CameraLook"):
+    with pytest.raises(InvalidArgumentError, match="further: expected at most 32, got 33"):
         after(measured(1.0, front, *[camera("left", 1.0, LEFT)] * 33))

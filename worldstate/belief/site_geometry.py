@@ -107,7 +107,10 @@ class SiteGeometry:
         share = 0.0 if both is None else both.half_width_rad / sight.half_width_rad
         found = any(one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings)
         miss = share * answer.miss_rate + (1.0 - share)
-        return replace(look, answer=(Present if found else Absent)(miss, answer.clutter_rate))
+        if not found:
+            return replace(look, answer=Absent(miss, answer.clutter_rate))
+        # With a clutter rate of zero a box would rule out everything else.
+        return replace(look, answer=Present(miss, answer.clutter_rate or self.settings.clutter_rate))
 
 
 def normal_share(deviations: float) -> float:

@@ -5,12 +5,15 @@ Every check names the argument, what came and what was expected.
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .errors import InvalidArgumentError
 from .typing import ComplexArray, FloatArray
+
+T = TypeVar("T")
 
 
 def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:
@@ -23,7 +26,7 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Fl
     """
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InvalidArgumentError(f"{name}: expected numbers, got {type(value).__name__}") from error
     if array.shape != shape:
         check_shape(name, array.shape, shape)
@@ -82,8 +85,8 @@ def in_range(
     0.02
     """
     try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
+        number = math.ldexp(value, 0)  # As `float`, which would read text
+    except (TypeError, OverflowError) as error:
         raise InvalidArgumentError(f"{name}: expected a number, got {type(value).__name__}") from error
     if not math.isfinite(number):
         raise InvalidArgumentError(f"{name}: expected a finite number, got {number}")
@@ -93,6 +96,19 @@ def in_range(
         left, right = "(" if open_low else "[", ")" if open_high else "]"
         raise InvalidArgumentError(f"{name}: expected a number in {left}{low}, {high}{right}, got {number}")
     return number
+
+
+def pair(name: str, value: ArrayLike, largest: float) -> tuple[float, float]:
+    """Return two numbers, neither of which exceeds `largest` in size.
+
+    Examples
+    --------
+    >>> pair("position_m", [3, -4.5], largest=1e4)
+    (3.0, -4.5)
+    """
+    first, second = finite_array(name, value, (2,)).tolist()
+    first = in_range(f"{name}[0]", first, -largest, largest)
+    return first, in_range(f"{name}[1]", second, -largest, largest)
 
 
 def one_of(name: str, value: str, expected: Iterable[str]) -> str:
@@ -117,3 +133,57 @@ def named(name: str, value: object) -> None:
     """
     if not isinstance(value, str) or not value:
         raise InvalidArgumentError(f"{name}: expected a name, got {value!r:.40}")
+
+
+def check_fields(instance: object, **expected: Any) -> None:
+    """Refuse a field of a frozen dataclass that is not as expected: a type, or the ends of a number's range.
+
+    Numbers and what numpy has of them become Python's own.
+
+    Examples
+    --------
+    >>> from dataclasses import make_dataclass
+    >>> check_fields(make_dataclass("Box", ["score"], frozen=True)(1.5), score=(0.0, 1.0))
+    Traceback (most recent call last):
+        ...
+    worldstate.ground.errors.InvalidArgumentError: score: expected a number in [0.0, 1.0], got 1.5
+    """
+    for name, wanted in expected.items():
+        value, is_range = getattr(instance, name), type(wanted) is tuple
+        # Nearly all: NaN compares false, and numpy's float64 is a float of another type.
+        if is_range and type(value) is float and wanted[0] <= value <= wanted[1]:
+            continue
+        if isinstance(value, np.generic):
+            value = value.item()
+            object.__setattr__(instance, name, value)
+        if is_range:
+            object.__setattr__(instance, name, in_range(name, value, *wanted))
+        elif not isinstance(value, wanted):
+            raise InvalidArgumentError(f"{name}: expected {_called(wanted)}, got {_shown(value)}")
+
+
+def all_of(name: str, values: object, kind: type[T], most: int) -> tuple[T, ...]:
+    """Return the values as a tuple if they are at most so many, and all of one kind.
+
+    Examples
+    --------
+    >>> all_of("sides", ["left", "right"], str, most=2)
+    ('left', 'right')
+    """
+    if not isinstance(values, list | tuple):
+        raise InvalidArgumentError(f"{name}: expected {kind.__name__}s in a tuple, got {_shown(values)}")
+    if len(values) > most:
+        raise InvalidArgumentError(f"{name}: expected at most {most}, got {len(values)}")
+    for i, one in enumerate(values):
+        if not isinstance(one, kind):
+            raise InvalidArgumentError(f"{name}[{i}]: expected {kind.__name__}, got {_shown(one)}")
+    return tuple(values)
+
+
+def _called(kind: Any) -> str:
+    return " or ".join(one.__name__ for one in get_args(kind) or (kind,)).replace("NoneType", "None")
+
+
+def _shown(value: object) -> str:
+    # A whole number of thousands of digits has no text.
+    return type(value).__name__ if isinstance(value, int) and abs(value) >= 1 << 63 else f"{value!r:.40}"

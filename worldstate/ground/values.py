@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 
+from .checks import check_fields
 from .errors import InvalidArgumentError
 from .typing import FloatArray
 
@@ -17,6 +18,8 @@ AngleT = TypeVar("AngleT", float, FloatArray)
 Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
+# Of signed 64 bits, less an hour: what is derived from a stamp, as the end of an advisory, is written too.
+_MOST_NS = (1 << 63) - 3600 * NANOSECONDS_PER_SECOND
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,9 @@ class NotUsable:
     """
 
     reason: str
+
+    def __post_init__(self) -> None:
+        check_fields(self, reason=str)
 
 
 def significant(values: FloatArray, figures: int) -> FloatArray:
@@ -120,7 +126,7 @@ def nanoseconds(time_s: float) -> int:
 
 
 def integer_ns(name: str, value: object) -> int:
-    """Return a time stamp as a Python integer.
+    """Return a time stamp as a Python integer; it fits signed 64 bits with an hour to spare.
 
     Examples
     --------
@@ -130,4 +136,6 @@ def integer_ns(name: str, value: object) -> int:
     # NaN and infinity would pass comparisons and stay in the belief.
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise InvalidArgumentError(f"{name}: expected integer nanoseconds, got {value!r:.40}")
+    if abs(int(value)) > _MOST_NS:
+        raise InvalidArgumentError(f"{name}: expected integer nanoseconds of 64 bits, got a larger number")
     return int(value)

@@ -1,5 +1,7 @@
 """Measurements: evidence of one modality at one instant, and the protocols of a modality."""
 
+import math
+import sys
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -7,11 +9,25 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.road_users import ClassShares
+from worldstate.abduction.road_users import ClassShares, class_shares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import DomainVerdict
+from worldstate.ground.checks import all_of, check_fields, named, pair
 from worldstate.ground.serialisation import ADDED, Layout
-from worldstate.ground.values import NotUsable
+from worldstate.ground.values import NotUsable, integer_ns
+
+_ABOVE_ZERO, _MOST = math.ulp(0.0), sys.float_info.max
+_AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (_ABOVE_ZERO, 1e3)
+_SIGHTING = {
+    "azimuth_rad": _AZIMUTHS_RAD,
+    "std_rad": _STDS_RAD,
+    "label": str,
+    "score": (0.0, 1.0),
+    "width_rad": (0.0, math.tau),
+    "moving": bool,
+}
+MOST_LOOKS = 32  # Cameras of a car
+_MOST_SIGHTINGS = 100_000  # The filter counts 64 of them
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +43,11 @@ class Bearing:
     prominence : float
         Peak-to-median ratio of the spatial spectrum the bearing was read from, >= 1.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
     Examples
     --------
     >>> Bearing(0.3, 0.06, 1.4).azimuth_rad
@@ -36,6 +57,9 @@ class Bearing:
     azimuth_rad: float
     std_rad: float
     prominence: float = 1.0  # Of a flat spectrum: claims nothing
+
+    def __post_init__(self) -> None:
+        check_fields(self, azimuth_rad=_AZIMUTHS_RAD, std_rad=_STDS_RAD, prominence=(0.0, _MOST))
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +73,11 @@ class Approach:
     std_hz : float
         Standard deviation, 1/s, > 0.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
     Examples
     --------
     >>> Approach(inverse_tta_hz=0.5, std_hz=0.25).inverse_tta_hz
@@ -57,6 +86,9 @@ class Approach:
 
     inverse_tta_hz: float
     std_hz: float
+
+    def __post_init__(self) -> None:
+        check_fields(self, inverse_tta_hz=(-1e3, 1e3), std_hz=(_ABOVE_ZERO, 1e6))
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +110,11 @@ class Sighting:
     moving : bool
         False for an object that has stood still long enough to be parked.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
     Examples
     --------
     >>> Sighting(0.2, 0.02, "car", 0.9).moving
@@ -90,6 +127,9 @@ class Sighting:
     score: float
     width_rad: float = 0.0
     moving: bool = True  # A single image cannot tell
+
+    def __post_init__(self) -> None:
+        check_fields(self, **_SIGHTING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +147,11 @@ class Look:
     sector_rad : (float, float) or None
         Where it looked: from this azimuth to the left until that one. None for the view of the context.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
     Examples
     --------
     >>> from worldstate.abduction import Absent
@@ -118,6 +163,13 @@ class Look:
     stamp_ns: int
     answer: CoEvidence
     sector_rad: tuple[float, float] | None = field(default=None, metadata=ADDED)
+
+    def __post_init__(self) -> None:
+        named("sensor", self.sensor)
+        object.__setattr__(self, "stamp_ns", integer_ns("stamp_ns", self.stamp_ns))
+        check_fields(self, answer=CoEvidence)
+        if self.sector_rad is not None:
+            object.__setattr__(self, "sector_rad", pair("sector_rad", self.sector_rad, math.tau))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +183,11 @@ class CameraLook:
     sightings : tuple of Sighting
         All that the camera reports.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
     Examples
     --------
     >>> from worldstate.abduction import Absent
@@ -141,8 +198,26 @@ class CameraLook:
     look: Look
     sightings: tuple[Sighting, ...] = ()
 
+    def __post_init__(self) -> None:
+        check_fields(self, look=Look)
+        object.__setattr__(self, "sightings", _sightings(self.sightings))
+
+
+def _sightings(values: object) -> tuple[Sighting, ...]:
+    return all_of("sightings", values, Sighting, _MOST_SIGHTINGS)
+
 
 _BY_SENSOR = attrgetter("look.sensor")
+_PARTS = {
+    "signature": SignatureEvidence,
+    "co_evidence": CoEvidence,
+    "bearing": Bearing | NotUsable,
+    "approach": Approach | NotUsable,
+    "look": Look | None,
+    "domain": DomainVerdict | None,
+    "sequence": SequenceReading | NotUsable | None,
+    "fault": str | None,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +253,11 @@ class Measurement:
     fault : str or None
         What is known to be wrong with the sensor, in words; the snapshot says it.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
     Examples
     --------
     >>> from worldstate.abduction import Absent, SignatureEvidence
@@ -206,6 +286,14 @@ class Measurement:
     source: str = "acoustic"
     fault: str | None = None
     further: tuple[CameraLook, ...] = field(default=(), metadata=ADDED)
+
+    def __post_init__(self) -> None:
+        named("source", self.source)
+        check_fields(self, **_PARTS)
+        object.__setattr__(self, "stamp_ns", integer_ns("stamp_ns", self.stamp_ns))
+        object.__setattr__(self, "sightings", _sightings(self.sightings))
+        object.__setattr__(self, "further", all_of("further", self.further, CameraLook, MOST_LOOKS))
+        object.__setattr__(self, "kinds", class_shares("kinds", self.kinds))
 
     @property
     def looks(self) -> tuple[CameraLook, ...]:

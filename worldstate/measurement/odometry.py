@@ -3,10 +3,17 @@
 import math
 from dataclasses import dataclass
 
-from worldstate.ground import InvalidArgumentError, in_range, integer_ns, named
+from worldstate.ground import integer_ns, named
+from worldstate.ground.checks import check_fields, pair
 
 _FARTHEST_M = 1e6
-_MOST = {"speed_mps": 100.0, "yaw_rate_rad_s": 10.0, "speed_std_mps": 100.0, "yaw_rate_std_rad_s": 10.0}
+_ABOVE_ZERO = math.ulp(0.0)
+_RANGES = {
+    "speed_mps": (-100.0, 100.0),
+    "yaw_rate_rad_s": (-10.0, 10.0),
+    "speed_std_mps": (0.0, 100.0),
+    "yaw_rate_std_rad_s": (0.0, 10.0),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +41,9 @@ class EgoPose:
     yaw_std_rad: float = 0.01
 
     def __post_init__(self) -> None:
-        for name, value in zip(("x", "y"), self.position_m, strict=True):
-            in_range(f"position_m {name}", value, -_FARTHEST_M, _FARTHEST_M)
-        in_range("yaw_rad", self.yaw_rad, -math.pi, math.pi)
-        in_range("position_std_m", self.position_std_m, 0.0, 1e3, open_low=True)
-        in_range("yaw_std_rad", self.yaw_std_rad, 0.0, math.pi, open_low=True)
+        object.__setattr__(self, "position_m", pair("position_m", self.position_m, _FARTHEST_M))
+        check_fields(self, yaw_rad=(-math.pi, math.pi))
+        check_fields(self, position_std_m=(_ABOVE_ZERO, 1e3), yaw_std_rad=(_ABOVE_ZERO, math.pi))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +87,5 @@ class Odometry:
 
     def __post_init__(self) -> None:
         named("source", self.source)
-        if not isinstance(self.pose, EgoPose | None):
-            raise InvalidArgumentError(f"pose: expected an EgoPose, got {self.pose!r:.40}")
+        check_fields(self, pose=EgoPose | None, **_RANGES)
         object.__setattr__(self, "stamp_ns", integer_ns("stamp_ns", self.stamp_ns))
-        for name, most in _MOST.items():
-            low = 0.0 if "_std_" in name else -most
-            object.__setattr__(self, name, in_range(name, getattr(self, name), low, most))

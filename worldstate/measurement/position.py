@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.abduction.road_users import ClassShares
+from worldstate.abduction.road_users import ClassShares, class_shares
 from worldstate.ground import InvalidArgumentError, finite_array, in_range, integer_ns, named, nanoseconds
+from worldstate.ground.checks import all_of, check_fields, pair
 
 from .sector import Sector
 
@@ -53,6 +54,9 @@ class Position:
     classes: ClassShares = ()
 
     def __post_init__(self) -> None:
+        if self.velocity_mps is not None:
+            velocity = pair("velocity_mps", self.velocity_mps, _FASTEST_MPS)
+            object.__setattr__(self, "velocity_mps", velocity)
         known = 2 if self.velocity_mps is None else 4
         covariance = finite_array("covariance", self.covariance, (known, known))
         spread = np.linalg.eigvalsh(covariance)
@@ -67,15 +71,11 @@ class Position:
             )
         even = 0.5 * (covariance + covariance.T)
         object.__setattr__(self, "covariance", tuple(tuple(row) for row in even.tolist()))
-        object.__setattr__(self, "position_m", _pair("position_m", self.position_m, _FARTHEST_M))
-        if self.velocity_mps is not None:
-            velocity = _pair("velocity_mps", self.velocity_mps, _FASTEST_MPS)
-            object.__setattr__(self, "velocity_mps", velocity)
+        object.__setattr__(self, "position_m", pair("position_m", self.position_m, _FARTHEST_M))
         exists = self.existence_probability
         exists = in_range("existence_probability", exists, 0.0, 1.0, open_low=True, open_high=True)
         object.__setattr__(self, "existence_probability", exists)
-        classes = [(str(name), in_range("classes", share, 0.0, 1.0)) for name, share in self.classes]
-        object.__setattr__(self, "classes", tuple(sorted(classes)))
+        object.__setattr__(self, "classes", class_shares("classes", self.classes))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +105,7 @@ class SearchedSector:
     clutter_rate: float = 0.01
 
     def __post_init__(self) -> None:
+        check_fields(self, sector=Sector)
         in_range("centre_rad", self.sector.centre_rad, -np.pi, np.pi)
         in_range("half_width_rad", self.sector.half_width_rad, 0.0, np.pi, open_low=True)
         found, clutter = self.detection_probability, self.clutter_rate
@@ -155,22 +156,11 @@ class PositionScan:
 
     def __post_init__(self) -> None:
         named("source", self.source)
-        positions = tuple(self.positions)
-        if len(positions) > MOST_POSITIONS or not all(isinstance(one, Position) for one in positions):
-            got = f"{len(positions)} items"
-            raise InvalidArgumentError(f"positions: expected at most {MOST_POSITIONS} Position, got {got}")
-        if not isinstance(self.searched, SearchedSector | None):
-            raise InvalidArgumentError(f"searched: expected a SearchedSector, got {self.searched!r:.40}")
-        object.__setattr__(self, "positions", positions)
+        check_fields(self, searched=SearchedSector | None, latency_s=(0.0, 1e3))
+        object.__setattr__(self, "positions", all_of("positions", self.positions, Position, MOST_POSITIONS))
         object.__setattr__(self, "stamp_ns", integer_ns("stamp_ns", self.stamp_ns))
-        object.__setattr__(self, "latency_s", in_range("latency_s", self.latency_s, 0.0, 1e3))
 
     @property
     def observed_ns(self) -> int:
         """When the scan was taken."""
         return self.stamp_ns - nanoseconds(self.latency_s)
-
-
-def _pair(name: str, value: tuple[float, float], largest: float) -> tuple[float, float]:
-    x, y = finite_array(name, value, (2,)).tolist()
-    return in_range(f"{name}[0]", x, -largest, largest), in_range(f"{name}[1]", y, -largest, largest)

@@ -1,0 +1,242 @@
+"""What enters a filter is checked once, when it is built; what is inside is trusted."""
+
+import json
+import math
+import re
+import sys
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
+from worldstate.abduction.signature.site_estimate import SiteSignature
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.files.model_file import read_model
+from worldstate.core.filter import WorldFilter
+from worldstate.frontend.array.microphone_array import ovad_array
+from worldstate.ground import checks
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
+from worldstate.measurement import (
+    Approach,
+    Bearing,
+    CameraLook,
+    Look,
+    Measurement,
+    Odometry,
+    Position,
+    PositionScan,
+    SearchedSector,
+    Sector,
+    Sighting,
+)
+from worldstate.measurement.odometry import EgoPose
+from worldstate.state import WorldState
+
+RATE_HZ = 48_000
+CAR = Sighting(0.1, 0.02, "car", 0.9)
+
+
+def measured(hop, hidden=(4.0, 0.0), **changes):
+    heard = SignatureEvidence(("left", "right"), hidden, 2.0, 0.0)
+    look = Measurement(hop * 10**8, heard, Absent(0.04), Bearing(0.3, 0.1), Approach(0.2, 0.1), (CAR,))
+    return replace(look, **changes)
+
+
+def street(rng, seconds):
+    """A source from the left in noise: there is a peak, so the camera is asked about a sector."""
+    noise = rng.standard_normal((seconds * RATE_HZ, 56), dtype=np.float32)
+    return (0.02 * noise + 0.2 * rng.standard_normal((seconds * RATE_HZ, 1), dtype=np.float32)).astype(
+        np.float32
+    )
+
+
+def test_a_hop_of_the_whole_chain_makes_at_most_thirty_checks():
+    boxes = DetectionFrame(np.array([[900.0, 500.0, 1100.0, 650.0]]), np.array([0.9]), ("car",))
+    vision = VisionQuery(PinholeCamera(), DetectionLog.at_rate([boxes] * 60, frame_rate_hz=10.0))
+    signature = SiteSignature(read_model().signature)
+    adapter = AcousticAdapter(ovad_array(), RATE_HZ, signature, vision=vision)
+    calls, hops, world = 0, 0, WorldFilter()
+
+    def count(frame, event, _):
+        nonlocal calls
+        code = frame.f_code
+        calls += event == "call" and code.co_filename == checks.__file__ and code.co_name != "<genexpr>"
+
+    sound = street(np.random.default_rng(0), 3)
+    for measurement in adapter.measure(sound[: 2 * RATE_HZ]):
+        world = world.predict_to(measurement.stamp_ns).update(measurement)
+    sys.setprofile(count)
+    try:
+        for block in np.array_split(sound[2 * RATE_HZ :], 20):
+            for measurement in adapter.measure(block):
+                world = world.predict_to(measurement.stamp_ns).update(measurement)
+                hops += 1
+    finally:
+        sys.setprofile(None)
+    assert hops == 10
+    assert world.state.entities
+    assert calls / hops <= 30  # Every value once, where it is built
+
+
+CAMERA = Look("camera", 10**8, Absent(0.04), (-0.5, 0.5))
+RADAR = SearchedSector(Sector(0.0, 1.0), 50.0, 0.8)
+THERE = Position((10.0, 3.0), ((1.0, 0.0), (0.0, 1.0)), existence_probability=0.9, classes=(("car", 1.0),))
+BUILT = [
+    CAR,
+    Bearing(0.3, 0.1),
+    Approach(0.2, 0.1),
+    CAMERA,
+    CameraLook(CAMERA, (CAR,)),
+    measured(1, look=CAMERA, further=(CameraLook(replace(CAMERA, sensor="left"), (CAR,)),)),
+    SignatureEvidence(("left", "right"), (1.0, 0.0), 0.0, 0.0),
+    THERE,
+    RADAR,
+    PositionScan("radar", 10**8, (THERE,), RADAR),
+    EgoPose((1.0, 2.0)),
+    Odometry("wheels", 10**8, 5.0, pose=EgoPose((0.0, 0.0))),
+]
+WRONG = [
+    *(None, object(), "text", 5, -1.0, 1e300, math.nan, math.inf, 10**400, 2**63, -(2**63), True),
+    *((), [], (None,), ("text", 0.5), (math.nan, 0.0), ((1.0, 2.0), 3.0), {}, np.zeros(2), CAR, RADAR),
+]
+
+
+@pytest.mark.parametrize("whole", BUILT, ids=lambda one: type(one).__name__)
+def test_what_is_built_is_sound_or_its_field_is_named(whole):
+    refused = 0
+    for name in (field.name for field in fields(whole)):
+        for wrong in WRONG:
+            try:
+                built = replace(whole, **{name: wrong})
+            except InvalidArgumentError as error:
+                # With a velocity that is one the covariance is no longer of its size.
+                text = str(error).replace("covariance:", f"{name}:")
+                assert re.match(rf"{name}\b.*: expected .*, got .", text, re.DOTALL), (
+                    name,
+                    wrong,
+                    error,
+                )
+                refused += 1
+            else:
+                if isinstance(built, Measurement | PositionScan | Odometry):
+                    sound(built)
+    assert refused > 10 * len(fields(whole))
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: Bearing(math.nan, 0.1), "azimuth_rad: expected a finite number, got nan"),
+        (lambda: Bearing(0.1, 0.0), "std_rad: expected a number in .*, got 0.0"),
+        (lambda: Approach(math.inf, 0.1), "inverse_tta_hz: expected a finite number, got inf"),
+        (lambda: replace(CAR, score="high"), "score: expected a number, got str"),
+        (lambda: replace(CAR, moving=1), "moving: expected bool, got 1"),
+        (lambda: measured(1, stamp_ns=1.5e9), "stamp_ns: expected integer nanoseconds, got 15"),
+        (
+            lambda: measured(1, co_evidence=None),
+            "co_evidence: expected Absent or Present or Unqueried, got N",
+        ),
+        (lambda: measured(1, sightings=(CAR, None)), r"sightings\[1\]: expected Sighting, got None"),
+        (lambda: measured(1, further=(CameraLook(CAMERA),) * 33), "further: expected at most 32, got 33"),
+    ],
+)
+def test_what_is_refused_is_told(build, words):
+    with pytest.raises(InvalidArgumentError, match=words):
+        build()
+
+
+def sound(built):
+    """Check that a filter which has taken it leaves a state and a checkpoint that read."""
+    try:
+        world = WorldFilter().update(built).update(measured(1))
+    except InvalidArgumentError as error:  # It does not fit the context
+        assert "directions" in str(error)
+        return
+    world.state.to_json()
+    copy = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict(), allow_nan=False)))
+    assert copy.state == world.state
+
+
+def test_what_is_no_measurement_is_refused():
+    world = WorldFilter().update(measured(1))
+    for wrong in (None, 5, world, CAR):
+        with pytest.raises(InvalidArgumentError, match="measurement: expected"):
+            world.update(wrong)
+    other = SignatureEvidence(("one", "two"), (0.0, 0.0), 0.0, 0.0)
+    with pytest.raises(InvalidArgumentError, match="signature: expected the directions"):
+        world.update(measured(2, signature=other))
+
+
+@pytest.mark.parametrize(
+    "bad", [(None, 0.0), ("a", 0.0), (np.nan, 0.0), (0.0,), 1.0, (1e30, 0.0), (0, -1001)]
+)
+def test_likelihoods_that_are_none_are_refused(bad):
+    with pytest.raises(InvalidArgumentError, match="hidden"):
+        SignatureEvidence(("left", "right"), bad, 0.0, 0.0)
+    with pytest.raises(InvalidArgumentError, match="log_ratios"):
+        SideEvidence(("left", "right"), bad, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("nats", [1000.0, -1000.0])
+def test_likelihoods_of_a_thousand_nats_leave_probabilities(nats):
+    world = WorldFilter()
+    for hop, hidden in enumerate([(nats, 0.0), (0.0, -nats), (-nats, nats), (nats, nats)], 1):
+        world = world.update(measured(hop, hidden))
+        priors = world.explanation
+        assert priors.hidden_total + priors.visible + priors.none == pytest.approx(1.0, abs=1e-9)
+        assert WorldFilter.from_dict(world.to_dict()).state == world.state
+
+
+@pytest.mark.parametrize("stamp_ns", [2**63, -(2**63), 10**30])
+def test_a_stamp_fits_signed_64_bits(stamp_ns):
+    for build in (
+        lambda: measured(1, stamp_ns=stamp_ns),
+        lambda: replace(CAMERA, stamp_ns=stamp_ns),
+        lambda: PositionScan("radar", stamp_ns),
+        lambda: Odometry("wheels", stamp_ns, 1.0),
+        lambda: WorldFilter(start_ns=stamp_ns),
+        lambda: WorldFilter().predict_to(stamp_ns),
+    ):
+        with pytest.raises(InvalidArgumentError, match="_ns: expected integer nanoseconds of 64 bits"):
+            build()
+
+
+def test_the_last_stamp_leaves_a_state_that_reads():
+    last_ns = 2**63 - 3600 * 10**9
+    for world in (WorldFilter().update(measured(1, stamp_ns=last_ns)), WorldFilter().predict_to(last_ns)):
+        assert WorldState.from_json(world.state.to_json()) == world.state
+        assert WorldFilter.from_dict(world.to_dict()).state == world.state
+    with pytest.raises(InvalidArgumentError, match="stamp_ns"):
+        WorldFilter(start_ns=last_ns).predict(1.0)
+
+
+def test_whole_numbers_and_numpy_numbers_are_taken_as_what_they_say():
+    plain, other = WorldFilter(), WorldFilter()
+    for hop in range(1, 30):
+        numbers = {
+            "stamp_ns": np.int64(hop * 10**8),
+            "signature": SignatureEvidence(("left", "right"), (4, np.float32(0)), np.int64(2), 0),
+            "co_evidence": Absent(np.float64(0.04)),
+            "sightings": (replace(CAR, score=np.float64(0.9)),) if hop > 20 else (),
+        }
+        plain = plain.update(measured(hop, sightings=(CAR,) if hop > 20 else ()))
+        other = other.update(measured(hop, **numbers))
+    assert other.state.to_json() == plain.state.to_json()
+    assert json.dumps(other.to_dict()) == json.dumps(plain.to_dict())
+
+
+def test_a_filter_that_is_certain_leaves_a_checkpoint_that_reads():
+    world, rng = WorldFilter(), np.random.default_rng(4)
+    for hop in range(1, 200):
+        hidden = (27.7 + rng.normal(), 0.0)
+        heard = SignatureEvidence(("left", "right"), hidden, rng.normal(), -23.2)
+        answer = Absent(10.0 ** -rng.uniform(1, 12))
+        look = Measurement(hop * 10**8, heard, answer, NotUsable("-"), NotUsable("-"))
+        world = world.predict(0.1).update(look)
+        assert WorldFilter.from_dict(world.to_dict()).state == world.state
