@@ -55,6 +55,9 @@ class AcousticFrame:
         What the middle microphone heard in the last two seconds, whatever its level: modulation, what bands
         have in common, tones, harmonics, which a `DomainGuard` reads; and how the level is shared between
         twelve bands, which a `RoadUserModel` reads, too.
+    lost : float
+        Share of the samples of the decision window that are lost: constant or repeated in all channels. STFT
+        frames that hold lost samples are left out of everything here; means are over the others.
 
     Examples
     --------
@@ -84,3 +87,4 @@ class AcousticFrame:
     health: ArrayHealth | NotUsable = _NOT_MONITORED
     tone: ToneReading | NotUsable = TONE_IS_OFF
     character: FloatArray | NotUsable = CHARACTER_IS_OFF
+    lost: float = 0.0

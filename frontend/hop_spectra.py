@@ -15,7 +15,7 @@ from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCancelle
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
-from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array, FloatArray
+from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, Float32Array, FloatArray
 
 from .settings import ELEVATIONS_RAD, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 
@@ -82,7 +82,8 @@ Steered = tuple[Complex64Array, Steering]
 class HopSums:
     """Sums over the STFT frames that end within one hop."""
 
-    n_frames: int
+    heard: BoolArray  # shape (frames,): Frames without lost samples, of which the sums are
+    lost: float  # Share of the samples of the hop that are lost
     centre: float  # Mean of the middles of these frames, samples from the start of the stream
     # shape (elevations * azimuths,): Steered power. Where microphones are left out, power and pairs are
     # scaled to the value for all of them.
@@ -90,6 +91,11 @@ class HopSums:
     pairs: Complex128Array  # shape (30,): Pair sums of the published feature
     energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
     health: ArrayHealth  # Faults of the array, and the microphones used
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames that the sums are of."""
+        return int(np.count_nonzero(self.heard))
 
 
 class HopSpectra:
@@ -115,13 +121,17 @@ class HopSpectra:
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft, self._order = nfft, settings.feature_order
         self._n_frames = 0
+        self._lost_tail = np.zeros(0, bool)
         self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not monitored")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
 
     def push(self, samples: Float32Array) -> HopSums:
-        """Return the sums over the frames that these samples (n, M) complete; at least one."""
+        """Return the sums over the frames that these samples (n, M) complete, lost ones left out."""
+        lost = np.zeros(len(samples), bool) if self.monitor is None else self.monitor.find_lost(samples)
         spectra = self._stft.push(samples)
+        heard = self._heard_frames(lost, len(spectra))
+        centre, spectra = self._centre(heard), spectra if heard.all() else spectra[heard]
         powers = power(spectra)
         whitened = whiten(spectra, powers)
         energies = self._frame_energies(powers)
@@ -132,8 +142,16 @@ class HopSpectra:
         prewhitened = self._whitened(spectra, health.mask)
         health.mask.silence(whitened)
         srp, pairs = self._sums(prewhitened, whitened, matrices, health.mask)
-        centre = self._centre(len(spectra))
-        return HopSums(len(spectra), centre, srp, pairs, energies.mean(axis=0), health)
+        mean_square = energies.sum(axis=0) / max(len(energies), 1)
+        return HopSums(heard, float(lost.mean()), centre, srp, pairs, mean_square, health)
+
+    def _heard_frames(self, lost: BoolArray, n_new: int) -> BoolArray:
+        """Return which new frames hold no lost sample; lost has shape (n,)."""
+        # From the first sample of the first new frame on; neighbouring frames share a half.
+        flags, half = np.concatenate([self._lost_tail, lost]), self._nfft // 2
+        self._lost_tail = flags[n_new * half :]
+        halves = np.asarray(flags[: (n_new + 1) * half].reshape(-1, half).any(axis=1))
+        return np.asarray(~(halves[1:] | halves[:-1]))
 
     def _frame_energies(self, powers: Float32Array) -> FloatArray:
         """Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`."""
@@ -142,7 +160,7 @@ class HopSpectra:
 
     def _whitened(self, spectra: Complex64Array, mask: ChannelMask) -> list[Steered]:
         """Prewhitened spectra, phase transform included, and their beams; none without ego-noise settings."""
-        if self.ego_noise is None:
+        if self.ego_noise is None or not len(spectra):
             return []
         mask.silence(spectra)
         prewhitened = self.ego_noise.process(spectra)
@@ -165,7 +183,7 @@ class HopSpectra:
         else:
             pairs = pair_sum_of(mask.cross(matrices), self._feature_beams, self._order)
         power = np.concatenate([steered_power(*row) for row in rows]) * mask.power_scale
-        if self.ego_noise is not None:
+        if self.ego_noise is not None and len(whitened):
             power = self.ego_noise.levelled(power, len(whitened))
         return power, pairs * mask.pair_scale
 
@@ -194,7 +212,8 @@ class HopSpectra:
         frames_per_s = 2.0 * sample_rate_hz / nfft
         return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, split)
 
-    def _centre(self, n_new: int) -> float:
-        """Middle of the new frames; frame t covers samples t N/2 .. t N/2 + N."""
-        first, self._n_frames = self._n_frames, self._n_frames + n_new
-        return 0.5 * self._nfft * (0.5 * (first + self._n_frames - 1) + 1.0)
+    def _centre(self, heard: BoolArray) -> float:
+        """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""
+        first, self._n_frames = self._n_frames, self._n_frames + len(heard)
+        numbers = np.flatnonzero(heard if heard.any() else ~heard)
+        return 0.5 * self._nfft * (float(numbers.mean()) + first + 1.0)

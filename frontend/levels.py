@@ -82,15 +82,26 @@ class LevelMeter:
         step = -(-n_channels // _MOST_CHANNELS)
         self._channels = slice(None, None, step)
         self._stft = StreamingStft(-(-n_channels // step), settings.nfft, self._bins)
+        self._latest: FloatArray = np.full(_BANDS, np.log(SILENCE))
 
-    def push(self, samples: Float32Array, keep: BoolArray | None = None) -> FloatArray:
-        r"""Return the log-energy (bands,) of the frames that these samples (n, M) complete; at least one.
+    def push(
+        self, samples: Float32Array, keep: BoolArray | None = None, heard: BoolArray | None = None
+    ) -> FloatArray:
+        r"""Return the log-energy (bands,) of the heard frames among those that these samples (n, M) complete.
 
         .. math:: L_b = \ln \sum_{k \in b} \overline{x^2}[k]
+
+        All are heard unless `heard` (frames,) says otherwise; where none is, it is that of the hop before.
         """
         # Only the picked microphones that are kept (M,) are averaged, or all picked ones if none is.
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
+        if heard is not None and not heard.all():
+            powers = powers[heard]
+        if not len(powers):
+            return self._latest
         kept = None if keep is None else keep[self._channels]
         if kept is not None and kept.any() and not kept.all():
             powers = powers[:, :, kept]
-        return log_band_energy(mean_square_per_bin(powers, self._nfft), self._edges, self._bins.start)
+        mean_square = mean_square_per_bin(powers, self._nfft)
+        self._latest = log_band_energy(mean_square, self._edges, self._bins.start)
+        return self._latest

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.approach.looming import EnergyFloor, Looming, looming
+from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of, highest_peaks
@@ -33,6 +33,8 @@ __all__ = ["AcousticFrame", "FrontEnd"]
 _LOUDEST = 1e15
 # Peaks listed; more than two at a time are seldom vehicles.
 _MOST_PEAKS = 4
+# The energy of less than half a hop scatters too much for a point of the looming fit.
+_MOST_LOST = 0.5
 
 
 def _full_scale(dtype: np.dtype[Any]) -> np.float32:
@@ -242,23 +244,24 @@ class FrontEnd:
     def _process_hop(self, hop: Hop) -> AcousticFrame | None:
         with one_blas_thread():
             self._hops.append(self._spectra.push(hop.samples))
-            levels = self._meter.push(hop.samples, self._keep)
+            levels = self._meter.push(hop.samples, self._keep, self._hops[-1].heard)
             self._energy_floor.push(float(self._hops[-1].energies[self._used].mean()))
             if self._tone is not None:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
-            if self._character is not None:
+            if self._character is not None and not self._hops[-1].lost:
                 self._character.push(hop.samples[:, self._middle])
             return self._frame(hop, levels) if hop.index >= WINDOW_HOPS else None
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
-        spectrum, floor = self._srp(BEARING_HOPS), self._least_prominence
+        heard = self._heard(BEARING_HOPS)
+        spectrum, floor = self._srp(heard), self._least_prominence
         peaks = highest_peaks(spectrum, self._azimuths, _MOST_PEAKS)
         bearing = bearing_of(spectrum, peaks, self._azimuths, floor)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
             sample_index=hop.end,
             azimuths_rad=self._azimuths,
-            srp=self._srp(WINDOW_HOPS),
+            srp=self._srp(list(self._hops)),
             bearing_rad=bearing.azimuth_rad,
             bearing_std_rad=bearing.std_rad,
             prominence=bearing.prominence,
@@ -267,10 +270,11 @@ class FrontEnd:
             band_log_energy=levels,
             looming=self._looming(hop.end),
             feature=self._feature(),
-            bearing_age_s=self._age_s(hop.end),
+            bearing_age_s=self._age_s(heard, hop.end),
             health=self._hops[-1].health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
+            lost=sum(hop.lost for hop in self._hops) / WINDOW_HOPS,
         )
 
     def _noise_prominence(self) -> float:
@@ -280,8 +284,10 @@ class FrontEnd:
         n_frames = BEARING_HOPS * 2.0 * self.sample_rate_hz / (HOP_RATE_HZ * nfft)
         return noise_prominence(spectra.beams, self.array, frequencies, n_frames)
 
-    def _last(self, n_hops: int) -> list[HopSums]:
-        return list(self._hops)[-n_hops:]
+    def _heard(self, n_hops: int) -> list[HopSums]:
+        """Return the last hops of the window in which something was heard, the last ones of all if none."""
+        heard = [hop for hop in self._hops if hop.n_frames]
+        return (heard or list(self._hops))[-n_hops:]
 
     @property
     def _keep(self) -> BoolArray:
@@ -299,11 +305,10 @@ class FrontEnd:
         usable = self._nearest[self._keep[self._nearest]]
         return int(usable[0] if len(usable) else self._nearest[0])
 
-    def _srp(self, n_hops: int) -> FloatArray:
-        """SRP-PHAT of the last hops, (A,): the maximum over elevations."""
-        hops = self._last(n_hops)
+    def _srp(self, hops: list[HopSums]) -> FloatArray:
+        """SRP-PHAT of hops, (A,): the maximum over elevations."""
         total = np.sum([hop.power for hop in hops], axis=0)
-        n_frames = sum(hop.n_frames for hop in hops)
+        n_frames = max(sum(hop.n_frames for hop in hops), 1)
         power = normalised(total, n_frames, len(self._spectra.srp_bins), self.array.n_microphones)
         return np.asarray(power.reshape(-1, len(self._azimuths)).max(axis=0))
 
@@ -311,30 +316,33 @@ class FrontEnd:
         band_hz = self.settings.tone_band_hz
         return None if band_hz is None else ToneStage(self.array, self.sample_rate_hz, band_hz)
 
-    def _age_s(self, end: int) -> float:
-        hops = self._last(BEARING_HOPS)
-        centre = sum(hop.n_frames * hop.centre for hop in hops) / sum(hop.n_frames for hop in hops)
+    def _age_s(self, hops: list[HopSums], end: int) -> float:
+        weights = [max(hop.n_frames, 1) for hop in hops]
+        centre = sum(n * hop.centre for n, hop in zip(weights, hops, strict=True)) / sum(weights)
         return (end - centre) / self.sample_rate_hz
 
     def _feature(self) -> FloatArray:
         hops = list(self._hops)
         length = len(hops) // FEATURE_SEGMENTS
-        segments = [hops[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
+        halves = [hops[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
+        return np.concatenate([self._segment(half, hops) for half in halves])
+
+    def _segment(self, half: list[HopSums], hops: list[HopSums]) -> FloatArray:
+        """Return the feature of half a window; of the whole one where nothing was heard in the half."""
         n_bins, n_microphones = len(self._spectra.feature_bins), self.array.n_microphones
-        return np.concatenate(
-            [
-                segment_feature([h.pairs for h in s], sum(h.n_frames for h in s), n_bins, n_microphones)
-                for s in segments
-            ]
-        )
+        used = half if any(hop.n_frames for hop in half) else hops
+        n_frames = max(sum(hop.n_frames for hop in used), 1)
+        return segment_feature([hop.pairs for hop in used], n_frames, n_bins, n_microphones)
 
     def _looming(self, end: int) -> Looming | NotUsable:
+        hops = [hop for hop in self._hops if hop.lost <= _MOST_LOST]
         # The same microphones in the whole window: one that fails within it must not look like a step of
         # level.
-        energies = np.array([hop.energies for hop in self._hops])[:, self._used].mean(axis=1)
-        if energies.min() <= SILENCE:
+        energies = np.reshape([hop.energies for hop in hops], (-1, self.array.n_microphones))
+        energies = energies[:, self._used].mean(axis=1)
+        if len(hops) < MIN_POINTS or energies.min() <= SILENCE:
             return NotUsable("silence within the window")
-        times = (np.array([hop.centre for hop in self._hops]) - end) / self.sample_rate_hz
+        times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz
         low, high = LOOMING_BAND_HZ
         scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
         noise = self._energy_floor.read(float(energies.min()), scatter)

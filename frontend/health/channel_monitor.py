@@ -165,6 +165,9 @@ class ChannelActivity:
 
     def push(self, bad: BoolArray) -> BoolArray:
         """Take one flag per channel, shape (M,), and return it."""
+        if self._n_silent >= _SILENCE_HOPS:
+            # What all of them lost is no fault of any.
+            self._bad[:] = False
         self._n_silent = 0
         return self._remember(bad)
 
@@ -266,6 +269,16 @@ class ChannelMonitor:
         self._dropouts: tuple[Dropout, ...] = ()
         self._n_dropouts = 0
         self._geometry_check = GeometryCheck(array, frequencies_hz)
+        self._extremes: tuple[Float32Array, Float32Array] = (np.zeros(n, np.float32),) * 2
+
+    def find_lost(self, samples: Float32Array) -> BoolArray:
+        """Take the samples (n, M) of a hop; return which of them are lost in all channels, (n,)."""
+        self._extremes = lowest, highest = _extremes(samples)
+        self._clipping.push(samples, lowest, highest)
+        dropouts = self._dropout_finder.push(samples, highest > lowest)
+        self._n_dropouts += len(dropouts)
+        self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
+        return self._dropout_finder.lost
 
     def push(
         self,
@@ -274,7 +287,7 @@ class ChannelMonitor:
         powers: Float32Array,
         matrices: Complex64Array,
     ) -> ArrayHealth:
-        r"""Take one hop; return the channels to keep and the faults.
+        r"""Take the hop that `find_lost` took, its lost frames left out; return channels to keep and faults.
 
         .. math:: \langle E_{tm} / \tilde E_t \rangle_t < 10^{-3}, \qquad
                   \min_t E_{tm} / \tilde E_t < 10^{-5}, \qquad
@@ -285,13 +298,11 @@ class ChannelMonitor:
         # E is the mean square of a frame and channel, E~ that of the median channel, s the peak-to-peak value
         # and s-bar its running mean: a channel is left out of the hop if it is silent, breaks off or crackles
         # in it, or if it has one of `MASKED_FAULTS`.
-        lowest, highest = _extremes(samples)
+        lowest, highest = self._extremes
         span = highest - lowest
         alive = span > 0.0
-        self._clipping.push(samples, lowest, highest)
-        dropouts = self._dropout_finder.push(samples, alive)
-        self._n_dropouts += len(dropouts)
-        self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
+        if not len(energies):
+            return self._report(np.zeros(len(span), bool) if alive.any() else self._activity.all_silent())
         silent = self._silent(energies, alive)
         self._levels.push(powers.mean(axis=0, dtype=np.float64), ~silent)
         bad = self._judge_hop(samples, span, silent)

@@ -55,9 +55,17 @@ class Dropout:
 
 
 class DropoutFinder:
-    """Find dropouts hop by hop."""
+    """Find dropouts hop by hop, and the samples of the newest hop that are lost in them.
+
+    Attributes
+    ----------
+    lost : ndarray of bool, shape (n,)
+        Samples of the newest hop that are constant in all channels, or repeated. A splice loses samples
+        outside the stream and marks none.
+    """
 
     def __init__(self, n_channels: int) -> None:
+        self.lost: BoolArray = np.zeros(0, bool)
         self._n_seen = 0
         self._tail = np.zeros((0, n_channels), np.float32)
         self._still = StillRuns()
@@ -68,6 +76,7 @@ class DropoutFinder:
         start = self._n_seen - len(self._tail)
         sound = self._picked(samples, alive)
         self._tail = samples[-2:].copy()
+        first = self._n_seen
         self._n_seen += len(samples)
         change = sound[:, 1:] - sound[:, :-1]
         still = np.asarray((change == 0.0).all(axis=0))
@@ -75,6 +84,9 @@ class DropoutFinder:
         if len(sound) >= _MIN_SPLICE_CHANNELS:
             dropouts += find_splices(change, start + 1, still)
         dropouts += self._repeats.push(sound[:, -len(samples) :], self._n_seen)
+        self.lost = np.zeros(len(samples), bool)
+        for begin, end in (*self._still.runs, self._repeats.run):
+            self.lost[max(begin - first, 0) : max(end - first, 0)] = True
         return sorted(dropouts, key=lambda dropout: dropout.sample)
 
     def _picked(self, samples: Float32Array, alive: BoolArray) -> Float32Array:
@@ -89,9 +101,16 @@ class DropoutFinder:
 
 
 class StillRuns:
-    """Find runs of samples in which no channel changes, across hops; a run at the start is none."""
+    """Find runs of samples in which no channel changes, across hops; a run at the start is no dropout.
+
+    Attributes
+    ----------
+    runs : list of (int, int)
+        First sample and end of the long runs of the newest hop, that at its end included.
+    """
 
     def __init__(self) -> None:
+        self.runs: list[tuple[int, int]] = []
         self._length = 0
         self._has_changed = False
         self._n_still, self._n_moving = 0, 0
@@ -102,18 +121,23 @@ class StillRuns:
         .. math:: L = \max\big(16,\; \ln 10^{-12} / \ln q\big)
         """
         # L is the length that constant samples by chance, a share q of all, reach once in 1e12.
+        self.runs = []
         if not (still.any() or self._length):
             self._has_changed = True
             self._n_moving += len(still)
             return []
         moving = np.flatnonzero(~still)
+        first = end - len(still)
         if not len(moving):
             self._length += len(still)
+            if self._length >= self._shortest(moving):
+                self.runs = [(end - self._length - 1, end)]
             return []
-        first = end - len(still)
         edges = np.concatenate([[-1 - self._length], moving])
         lengths = np.diff(edges) - 1
-        found = np.flatnonzero(lengths >= self._shortest(lengths))
+        shortest = self._shortest(lengths)
+        found = np.flatnonzero(lengths >= shortest)
+        self.runs = [(int(first + edges[i]), int(first + edges[i] + lengths[i] + 1)) for i in found]
         dropouts = [Dropout("still", int(first + edges[i]), int(lengths[i]) + 1) for i in found]
         if not self._has_changed:
             dropouts = [
@@ -121,13 +145,15 @@ class StillRuns:
             ]
         self._has_changed = True
         self._length = int(len(still) - 1 - moving[-1])
+        if self._length >= shortest:
+            self.runs.append((end - self._length - 1, end))
         return dropouts
 
     def _shortest(self, lengths: IndexArray) -> float:
         """Shortest run that is not explained by the share of constant samples met so far."""
         self._n_still += int(lengths[lengths < _SHORTEST_STILL].sum())
         self._n_moving += len(lengths)
-        share = self._n_still / (self._n_still + self._n_moving)
+        share = self._n_still / max(self._n_still + self._n_moving, 1)
         return max(_SHORTEST_STILL, np.log(_STILL_CHANCE) / np.log(share)) if share else _SHORTEST_STILL
 
 
@@ -171,9 +197,11 @@ class RepeatFinder:
 
     # Sound never repeats to the last bit on eight channels. Only hashes with five zero bits are kept (Manber,
     # "Finding similar files in a large file system", 1994), so that the same samples are kept when they
-    # return. Memory does not grow: two generations of one second each.
+    # return. Memory does not grow: two generations of one second each. `run` is what the newest hop repeats,
+    # from its first sample to its end; a repeat that goes on begins where it ended in the hop before.
 
     def __init__(self) -> None:
+        self.run = (0, 0)
         odd = np.random.default_rng(0).integers(1, 2**62, _PICKED, dtype=np.uint64)
         self._factors = 2 * odd + np.uint64(1)
         self._now: dict[int, int] = {}
@@ -190,6 +218,7 @@ class RepeatFinder:
 
         with the bits b of a sample, odd random factors a, and only those n at which five bits of h are zero.
         """
+        self.run = (0, 0)
         if len(sound) < 2:
             return []
         if self._hops % _GENERATION_HOPS == 0:
@@ -222,5 +251,6 @@ class RepeatFinder:
             return []
         places = [place for found, place in lags if found == lag]
         goes_on = lag == self._lag and places[0] - self._end < 1000
+        self.run = (self._end if goes_on else places[0], places[-1] + 1)
         self._lag, self._end = lag, places[-1]
         return [] if goes_on else [Dropout("repeat", places[0], places[-1] - places[0])]

@@ -277,3 +277,61 @@ def test_running_second_is_the_srp_of_the_frames_that_end_in_it() -> None:
     np.testing.assert_allclose(frame.srp, expected, rtol=1e-5)
     centres = (ends - 256)[(ends > 1.0 * rate) & (ends <= 1.2 * rate)]
     assert frame.bearing_age_s == pytest.approx(1.2 - centres.mean() / rate)
+
+
+def lose(sound: np.ndarray, first: int, length: int, value: float = 0.0) -> np.ndarray:
+    hurt = sound.copy()
+    hurt[first : first + length] = value
+    return hurt
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(1, 6), st.integers(0, 1580), st.integers(32, 8000), st.sampled_from([0.0, 0.3, -1.0]))
+def test_a_window_with_lost_samples_is_the_mean_over_its_other_frames(
+    hop: int, offset: int, length: int, value: float
+) -> None:
+    # The last 16 samples of a hop are no run as yet, which the offset leaves out.
+    rate, sound, first = 16_000, noise_from(SQUARE, 0.5, 16_000, 1.3), 1600 * hop + offset
+    frame = FrontEnd(SQUARE, rate).process(lose(sound, first, length, value))[2]
+    last = min(first + length, round(1.2 * rate))
+    assert frame.lost == pytest.approx(max(last - max(first, round(0.2 * rate)), 0) / rate, abs=1e-3)
+    bins = band_bins((300.0, 1800.0), rate, 512)
+    spectra = StreamingStft(4, 512, bins).push(sound)
+    ends = 512 + 256 * np.arange(len(spectra))
+    within = (ends > 0.2 * rate) & (ends <= 1.2 * rate) & ((ends <= first) | (ends - 512 >= first + length))
+    frequencies = bin_frequencies_hz(bins, rate, 512)
+    rows = [Steering.towards(SQUARE, frequencies, frame.azimuths_rad, el) for el in ELEVATIONS_RAD]
+    expected = np.max([srp_phat(spectra[within], row) for row in rows], axis=0)
+    np.testing.assert_allclose(frame.srp, expected, rtol=1e-5)
+    heard = FrontEnd(SQUARE, rate).process(sound)[2]
+    assert frame.bearing_rad == pytest.approx(0.5, abs=0.02)
+    np.testing.assert_allclose(frame.band_log_energy, heard.band_log_energy, atol=1.0)
+
+
+@pytest.mark.parametrize("kind", ["zeros", "a constant", "repeated"])
+def test_lost_sound_comes_back_as_if_nothing_was_lost(kind: str) -> None:
+    rate, sound = 16_000, noise_from(SQUARE, 0.5, 16_000, 3.0)
+    hurt = lose(sound, 20_000, 4000, {"zeros": 0.0}.get(kind, 0.2))
+    if kind == "repeated":
+        hurt[20_000:24_000] = sound[16_000:20_000]
+    chosen = FrontEndSettings(character=True)
+    ours, theirs = (FrontEnd(SQUARE, rate, chosen).process(one) for one in (hurt, sound))
+    lost = [round(frame.lost * rate) for frame in ours]
+    assert max(lost) == pytest.approx(4000, abs=100)
+    assert lost[:3] == [0, 0, 0] and not any(lost[-5:])
+    assert_same(ours[-5:], theirs[-5:])
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one.feature, other.feature, atol=0.08)
+        assert one.health.faults == ()
+
+
+def test_where_a_whole_window_is_lost_nothing_is_heard_and_the_channels_are_not_to_blame() -> None:
+    rate, sound = 16_000, noise_from(SQUARE, 0.5, 16_000, 4.0)
+    frames = FrontEnd(SQUARE, rate, replace(EVERYTHING, ego_noise=EgoNoiseSettings())).process(
+        lose(sound, 20_000, 20_000)
+    )
+    gone = [frame for frame in frames if frame.lost == 1.0]
+    assert len(gone) == 3
+    assert all(not frame.feature.any() and frame.prominence == 1.0 for frame in gone)
+    assert all(np.isfinite(frame.band_log_energy).all() and frame.bearing_age_s >= 0.0 for frame in frames)
+    assert frames[-1].lost == 0.0
