@@ -21,7 +21,6 @@ from .camera.pinhole import PinholeCamera as PinholeCamera
 from .camera.pinhole import read_camera as read_camera
 from .camera.video import open_video as open_video
 from .camera.vision_query import VisionQuery as VisionQuery
-from .camera.vision_query import VisionSettings as VisionSettings
 from .datasets.feature_extraction import extract_features as extract_features
 from .datasets.feature_table import FeatureTable as FeatureTable
 from .datasets.feature_table import read_features as read_features

@@ -16,7 +16,7 @@ from worldstate.adapters.audio.open_sound import SoundInput, path_of
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
+from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.adapters.files.odometry_file import EngineSpeed
 from worldstate.core.filter import WorldFilter
@@ -239,7 +239,7 @@ class Source:
             self.detections,
             rates.table if rates is not None else None,
             self.degradation,
-            VisionSettings(keep=self.settings.boxes),
+            self.settings.boxes,
             line_of_sight=unoccluded_sector(self.context),
             clutter=rates.clutter_rate if rates is not None else None,
         )

@@ -208,9 +208,9 @@ class HopSpectra:
         learned = bins[part]
         engine = HarmonicCanceller(learned, sample_rate_hz, nfft)
         frequencies = bin_frequencies_hz(learned, sample_rate_hz, nfft)
-        split = ElevationSplit.of(array, frequencies) if chosen.only_below_horizon else None
+        split = ElevationSplit.of(array, frequencies)
         frames_per_s = 2.0 * sample_rate_hz / nfft
-        return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, split)
+        return EgoNoise(frames_per_s, array.n_microphones, beams, engine, split)
 
     def _centre(self, heard: BoolArray) -> float:
         """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""

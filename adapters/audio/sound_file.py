@@ -5,7 +5,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import soundfile
@@ -246,8 +246,8 @@ def _open_file(path: Path) -> Any:
 
 def _check(source: AudioSource, expect_channels: int | None) -> None:
     size = data_size(source.path)
-    if size is not None and size.is_cut:
-        problem = f"cut short: expected {size.declared} bytes of samples by its header, got {size.available}"
+    if size is not None and size[0] > size[1]:
+        problem = f"cut short: expected {size[0]} bytes of samples by its header, got {size[1]}"
         raise InputFileError(source.path, problem)
     if source.frames == 0:
         raise InputFileError(source.path, "expected samples, the recording is empty")
@@ -275,26 +275,8 @@ def check_finite(path: Path, block: Float32Array, start: int) -> None:
         raise InputFileError(path, f"expected finite samples, got {block[sample, channel]} in {where}")
 
 
-class DataSize(NamedTuple):
-    """Bytes of samples: promised by the header, and there in the file.
-
-    Examples
-    --------
-    >>> DataSize(declared=1000, available=400).is_cut
-    True
-    """
-
-    declared: int
-    available: int
-
-    @property
-    def is_cut(self) -> bool:
-        """Whether the header promises more than the file holds."""
-        return self.declared > self.available
-
-
-def data_size(path: Path) -> DataSize | None:
-    """Read the size of the data chunk of a RIFF, RF64 or W64 file."""
+def data_size(path: Path) -> tuple[int, int] | None:
+    """Return the bytes of samples of a RIFF, RF64 or W64 file: promised by its header, and there."""
     with path.open("rb") as file:
         magic = file.read(16)
         if magic[:4] in (b"RIFF", b"RF64") and magic[8:12] == b"WAVE":
@@ -310,7 +292,7 @@ def _remaining(file: BinaryIO) -> int:
     return os.fstat(file.fileno()).st_size - file.tell()
 
 
-def _riff_data(file: BinaryIO) -> DataSize | None:
+def _riff_data(file: BinaryIO) -> tuple[int, int] | None:
     wide_size: int | None = None
     for _ in range(MAX_CHUNKS):
         header = file.read(8)
@@ -319,7 +301,7 @@ def _riff_data(file: BinaryIO) -> DataSize | None:
         name, size = struct.unpack("<4sI", header)
         if name == b"data":
             declared = wide_size if size == UNKNOWN_SIZE else size
-            return None if declared is None else DataSize(declared, _remaining(file))
+            return None if declared is None else (declared, _remaining(file))
         if name == b"ds64":
             ds64 = file.read(16)
             wide_size = struct.unpack("<8xQ", ds64)[0] if len(ds64) == 16 else None
@@ -328,14 +310,14 @@ def _riff_data(file: BinaryIO) -> DataSize | None:
     return None
 
 
-def _w64_data(file: BinaryIO) -> DataSize | None:
+def _w64_data(file: BinaryIO) -> tuple[int, int] | None:
     for _ in range(MAX_CHUNKS):
         header = file.read(24)
         if len(header) < 24:
             return None
         name, size = struct.unpack("<4s12xQ", header)
         if name == b"data":
-            return DataSize(size - 24, _remaining(file))
+            return size - 24, _remaining(file)
         if not 24 <= size <= _remaining(file) + 24:
             return None
         file.seek(size - 24 + -size % 8, os.SEEK_CUR)

@@ -124,34 +124,17 @@ def kept_and_parked(log: DetectionLog, frame: int, keep: DetectionFilter) -> tup
     return kept, parked(log, frame, here.boxes_px[kept])
 
 
-@dataclass(frozen=True, slots=True)
-class BoxCounts:
-    """How many boxes of a log count, and why the others do not: each is put down to the first reason.
-
-    Examples
-    --------
-    >>> str(BoxCounts(frames=10, boxes=6, counted=3, other_class=1, low_score=0, too_small=0, parked=2))
-    '3 of 6 boxes in 10 frames count; 1 of another class, 0 below the score, 0 too small, 2 parked'
-    """
-
-    frames: int
-    boxes: int
-    counted: int
-    other_class: int
-    low_score: int
-    too_small: int
-    parked: int
-
-    def __str__(self) -> str:
-        head = f"{self.counted} of {self.boxes} boxes in {self.frames} frames count"
-        classes = f"{self.other_class} of another class, {self.low_score} below the score"
-        return f"{head}; {classes}, {self.too_small} too small, {self.parked} parked"
+COUNTS_TOLD = (
+    "{counted} of {boxes} boxes in {frames} frames count; {other_class} of another class, "
+    "{low_score} below the score, {too_small} too small, {parked} parked"
+)
 
 
-def count_boxes(log: DetectionLog, keep: DetectionFilter) -> BoxCounts:
-    """Count the boxes of a log by what becomes of them."""
+def count_boxes(log: DetectionLog, keep: DetectionFilter) -> dict[str, int]:
+    """Count the boxes of a log by what becomes of them: each is put down to the first reason."""
     looser = DetectionFilter(keep.labels, 0.0, 0.0), DetectionFilter(keep.labels, keep.min_score, 0.0), keep
     named, scored, high = (sum(len(frame.select(one)) for frame in log.frames) for one in looser)
     boxes = sum(map(len, log.frames))
     still = sum(int(kept_and_parked(log, i, keep)[1].sum()) for i in range(len(log)))
-    return BoxCounts(len(log), boxes, high - still, boxes - named, named - scored, scored - high, still)
+    apart = {"other_class": boxes - named, "low_score": named - scored, "too_small": scored - high}
+    return {"frames": len(log), "boxes": boxes, "counted": high - still, **apart, "parked": still}

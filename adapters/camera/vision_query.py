@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from worldstate.ground import (
     InputFileError,
     InvalidArgumentError,
     NotUsable,
-    in_range,
     nanoseconds,
     seconds,
     wrap_angle,
@@ -33,41 +32,10 @@ SAMPLES = 8
 BORDER_PX = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class VisionSettings:
-    """Settings of the vision query.
-
-    Parameters
-    ----------
-    half_width_rad : float
-        Half the width of the sector around a bearing, radians, in (0, pi/2].
-    clutter_rate : float
-        Probability that a moving object of the class is reported where there is none, in (0, 1).
-    max_frame_age_s : float
-        Largest age, seconds, at which an image is used.
-    keep : DetectionFilter
-        Classes, scores and sizes of the boxes that are used.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
-    Examples
-    --------
-    >>> round(math.degrees(VisionSettings().half_width_rad))
-    10
-    """
-
-    half_width_rad: float = math.radians(10.0)
-    clutter_rate: float = 0.01
-    max_frame_age_s: float = 0.15
-    keep: DetectionFilter = field(default_factory=DetectionFilter)
-
-    def __post_init__(self) -> None:
-        in_range("half_width_rad", self.half_width_rad, 0.0, math.pi / 2, open_low=True)
-        in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
-        in_range("max_frame_age_s", self.max_frame_age_s, 0.0, math.inf)
+# Half the width of the sector around a bearing, and the probability that a moving object of the class is
+# reported where there is none, unless it was measured.
+_HALF_WIDTH_RAD, _CLUTTER_RATE = math.radians(10.0), 0.01
+MAX_IMAGE_AGE_S = 0.15  # At which an image is used: one and a half of OVAD's periods
 
 
 class VisionQuery:
@@ -96,15 +64,14 @@ class VisionQuery:
         beta_c(theta, d); the values of the paper if none was measured.
     degradation : float or callable
         d in [0, 1], or a function from the stamp to d.
-    settings : VisionSettings, optional
-        Sector, clutter and boxes used.
+    keep : DetectionFilter, optional
+        Classes, scores and sizes of the boxes that are used.
     line_of_sight : Sector, optional
         Directions in line of sight, known from the occluders of the context; all if not given. A sound from
         behind an occluder is that of a hidden source or its image in a wall; a visible source is in line of
         sight, so that sector is searched.
     clutter : callable, optional
-        Measured probability of a false detection in the sector as a function of d; that of the settings if
-        not given.
+        Measured probability of a false detection in the sector as a function of d; .01 if not given.
 
     Raises
     ------
@@ -129,19 +96,19 @@ class VisionQuery:
         detections: DetectionLog | None,
         miss_rate: MissRateTable | None = None,
         degradation: float | Callable[[int], float] = 0.0,
-        settings: VisionSettings | None = None,
+        keep: DetectionFilter | None = None,
         line_of_sight: Sector | None = None,
         clutter: Callable[[float], float] | None = None,
     ) -> None:
         self.camera = camera
         self.detections = detections
         self.miss_rate = miss_rate or default_miss_rates()
-        self.settings = settings or VisionSettings()
+        self.keep = keep or DetectionFilter()
         self._degradation = degradation if callable(degradation) else lambda stamp_ns: degradation
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
         self.view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
-        self._clutter = clutter or (lambda d: self.settings.clutter_rate)
+        self._clutter = clutter or (lambda d: _CLUTTER_RATE)
         # As background subtraction does: asked for a truck it would never find one.
         named = () if detections is None else (frame.labels for frame in detections.frames)
         self._calls_all_cars = set().union(*named) == {"car"}
@@ -185,7 +152,7 @@ class VisionQuery:
         if self._frame(stamp_ns) is None:
             return Unqueried(f"no frame at {seconds(stamp_ns):.3f} s")
         labels = self._asked_for(expected_labels)
-        if not any(label in self.settings.keep.labels for label in labels):
+        if not any(label in self.keep.labels for label in labels):
             return Unqueried("the signature predicts no class that a camera would see")
         sector = self.sector(bearing, side)
         d = self._degradation(stamp_ns)
@@ -248,7 +215,7 @@ class VisionQuery:
         if frame is None or self.detections is None:
             return None
         d = self._degradation(stamp_ns)
-        beta = self._expected_miss_rate(self.view, d, self.settings.keep.labels)
+        beta = self._expected_miss_rate(self.view, d, self.keep.labels)
         moving = any(sighting.moving for sighting in self.sightings(stamp_ns))
         answer = (Present if moving else Absent)(1.0 if beta is None else beta, self._clutter(d))
         return Look(SENSOR, int(self.detections.stamps_ns[frame]), answer)
@@ -256,11 +223,11 @@ class VisionQuery:
     def _frame(self, stamp_ns: int) -> int | None:
         if self.detections is None:
             return None
-        return self.detections.latest(stamp_ns, nanoseconds(self.settings.max_frame_age_s))
+        return self.detections.latest(stamp_ns, nanoseconds(MAX_IMAGE_AGE_S))
 
     def _look(self, log: DetectionLog, number: int) -> tuple[Sighting, ...]:
         frame = log.frames[number]
-        kept, still = kept_and_parked(log, number, self.settings.keep)
+        kept, still = kept_and_parked(log, number, self.keep)
         return tuple(
             self.camera.sighting(frame.boxes_px[i], frame.labels[i], float(frame.scores[i]), moving=not stood)
             for i, stood in zip(kept, still.tolist(), strict=True)
@@ -273,7 +240,7 @@ class VisionQuery:
 
     def _asked_for(self, expected: Collection[str] | None) -> Collection[str]:
         if expected is None or (expected and self._calls_all_cars):
-            return self.settings.keep.labels
+            return self.keep.labels
         return expected
 
     def sector(self, bearing: Bearing | NotUsable, side: Side | None) -> Sector:
@@ -281,7 +248,7 @@ class VisionQuery:
         if side is not None or isinstance(bearing, NotUsable):
             sector = WHOLE_SIDES[side]
         else:
-            sector = Sector(bearing.azimuth_rad, self.settings.half_width_rad)
+            sector = Sector(bearing.azimuth_rad, _HALF_WIDTH_RAD)
         if self._line_of_sight is None:
             return sector
         return sector.overlap(self._line_of_sight) or self._line_of_sight
@@ -292,7 +259,7 @@ class VisionQuery:
         if in_view is None:
             return None
         angles = self.camera.off_axis(in_view.midpoints(SAMPLES))
-        kept = self.settings.keep.labels
+        kept = self.keep.labels
         seen = float(
             np.mean([self.miss_rate.over(angles, d, one).mean() if one in kept else 1.0 for one in labels])
         )

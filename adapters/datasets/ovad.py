@@ -57,8 +57,8 @@ class Recording:
     Examples
     --------
     >>> recording = Recording(Path("SA1/left/1_00_0002"), "1_00_0002", "SA1", "left", 70)
-    >>> recording.junction, recording.moving_ego, recording.t0_s
-    ('A1', False, 7.0)
+    >>> recording.moving_ego, recording.t0_s
+    (False, 7.0)
     """
 
     path: Path
@@ -102,11 +102,6 @@ class Recording:
         """Camera detections, None where there are none, as for every moving ego."""
         found = (self.path / name for name in DETECTION_NAMES)
         return next((path for path in found if path.is_file()), None)
-
-    @property
-    def junction(self) -> str | None:
-        """Such as ``"A1"``: the place, the same for a standing and a moving ego."""
-        return self.environment[1:] if self.environment else None
 
     @property
     def moving_ego(self) -> bool | None:
@@ -160,8 +155,8 @@ class OvadDataset:
     >>> with TemporaryDirectory() as folder:
     ...     log = "ID,Environment,Class,T0\n1_00_0002,SA1,left,70\n"
     ...     _ = (Path(folder) / "DataLog.csv").write_text(log)
-    ...     [(r.recording_id, r.junction, r.label, r.t0_s) for r in OvadDataset(folder).recordings]
-    [('1_00_0002', 'A1', 'left', 7.0)]
+    ...     [(r.recording_id, r.environment, r.label, r.t0_s) for r in OvadDataset(folder).recordings]
+    [('1_00_0002', 'SA1', 'left', 7.0)]
     """
 
     def __init__(self, root: str | Path) -> None:

@@ -21,7 +21,7 @@ WAITING_DATAGRAMS = 64
 _LARGEST_BYTES = 1 << 16
 # How soon a socket that is no longer listened to is noticed.
 _POLL_S = 0.2
-# Nothing older than this is used: see VisionSettings.max_frame_age_s and the lag of the filter.
+# Nothing older than this is used: see MAX_IMAGE_AGE_S of the vision query and the lag of the filter.
 _OLDEST_S = 10.0
 
 

@@ -32,7 +32,6 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.stft import whiten
-from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, FloatArray
 
 from .harmonic_cancellation import HarmonicCanceller
@@ -40,6 +39,11 @@ from .harmonic_cancellation import HarmonicCanceller
 _TINY = np.float32(1e-30)
 # Hops of a lower weight are not learned: a likely source must not enter.
 _LEAST_WEIGHT = 0.5
+# Time constant of the covariance in learning time, and delay after which a hop is learned with the minimum
+# weight of the interval.
+_FORGETTING_S, _GUARD_HOPS = 10.0, 5
+# Least shrinkage towards white noise: no direction is amplified by more than its inverse root.
+_MIN_SHRINKAGE = 0.03
 # Period after which the whitening of one bin, in turn, is updated, an M x M eigendecomposition; several bins
 # per hop at first and when the vehicle starts or stops.
 _REFRESH_HOPS = 4
@@ -60,44 +64,21 @@ class EgoNoiseSettings:
 
     .. math:: y = \hat R^{-1/2} x, \qquad \hat R \leftarrow (1 - s)\, \hat R / p + s I
 
-    with the learned noise covariance R, its mean power p, and the shrinkage s.
+    with the learned noise covariance R, as far as it comes from below the horizon, its mean power p, and the
+    shrinkage s.
 
     Parameters
     ----------
-    forgetting_s : float
-        Time constant of the covariance, seconds of learning time.
-    guard_hops : int
-        Delay, hops, after which a hop is learned with the minimum weight of the interval.
-    min_shrinkage : float
-        Least shrinkage s towards white noise, in (0, 1]: no direction is amplified by more than 1 / sqrt(s).
     feature : bool
         Compute the published feature from prewhitened sound, too; its classifier was trained without.
-    only_below_horizon : bool
-        Use the covariance as far as it comes from below the horizon. False: all of it is whitened, including
-        the noise of the street.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
 
     Examples
     --------
-    >>> EgoNoiseSettings(forgetting_s=5.0).guard_hops
-    5
+    >>> EgoNoiseSettings(feature=True).feature
+    True
     """
 
-    forgetting_s: float = 10.0
-    guard_hops: int = 5
-    min_shrinkage: float = 0.03
     feature: bool = False
-    only_below_horizon: bool = True
-
-    def __post_init__(self) -> None:
-        in_range("forgetting_s", self.forgetting_s, 0.1, 1e5)
-        in_range("min_shrinkage", self.min_shrinkage, 1e-4, 1.0)
-        if self.guard_hops != int(in_range("guard_hops", self.guard_hops, 0, 100)):
-            raise InvalidArgumentError(f"guard_hops: expected a whole number, got {self.guard_hops}")
 
 
 class EgoNoise:
@@ -108,7 +89,6 @@ class EgoNoise:
 
     def __init__(
         self,
-        settings: EgoNoiseSettings,
         frames_per_s: float,
         n_microphones: int,
         beams: Sequence[tuple[Steering, slice]],
@@ -123,11 +103,10 @@ class EgoNoise:
         self._bins = spanned(bins for _, bins in beams)
         first, n_bins = self._bins.start, self._bins.stop - self._bins.start
         self._slices = [slice(bins.start - first, bins.stop - first) for _, bins in beams]
-        self._settings = settings
-        self._covariance = NoiseCovariance(n_bins, n_microphones, 0.5 * settings.forgetting_s * frames_per_s)
+        self._covariance = NoiseCovariance(n_bins, n_microphones, 0.5 * _FORGETTING_S * frames_per_s)
         self._roots = np.tile(np.eye(n_microphones, dtype=np.complex64), (n_bins, 1, 1))
-        self._guard: GuardDelay[tuple[Complex64Array | None, int]] = GuardDelay(settings.guard_hops)
-        self._level = NoiseLevel(settings.guard_hops)
+        self._guard: GuardDelay[tuple[Complex64Array | None, int]] = GuardDelay(_GUARD_HOPS)
+        self._level = NoiseLevel()
         self._recent = np.zeros(2)
         self._is_odd = False
         self._next_bin = 0
@@ -236,7 +215,7 @@ class EgoNoise:
 
     def _update(self, index: int) -> None:
         R = self._covariance.mean(index)
-        least = max(self._settings.min_shrinkage, 1.0 - self.ego_share)
+        least = max(_MIN_SHRINKAGE, 1.0 - self.ego_share)
         self._roots[index] = shrunk_inverse_root(R, max(least, white_share(R, self.learned_frames)))
         for beams, bins in zip(self._beams, self._slices, strict=True):
             if bins.start <= index < bins.stop:
@@ -326,8 +305,8 @@ class NoiseCovariance:
 class NoiseLevel:
     """Level of whitened noise relative to white noise, learned like the covariance."""
 
-    def __init__(self, guard_hops: int) -> None:
-        self._guard: GuardDelay[float] = GuardDelay(guard_hops)
+    def __init__(self) -> None:
+        self._guard: GuardDelay[float] = GuardDelay(_GUARD_HOPS)
         self._sum = self._weights = 0.0
 
     def push(self, level: float, weight: float) -> float:

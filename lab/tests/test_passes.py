@@ -17,7 +17,7 @@ from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, Seque
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
+from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.site_geometry import SideGeometry
 from worldstate.commissioning.heard_stream import HeardStream
@@ -63,7 +63,7 @@ def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
     share = np.full(len(GROUPS), 0.02)
     share[GROUPS.index("none")] = 1.0 - 0.02 * (len(GROUPS) - 1)
     detections = stream_detections(made_up, np.random.default_rng(1))
-    vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=EVERYBODY))
+    vision = VisionQuery(PinholeCamera(), detections, keep=EVERYBODY)
     silent, unasked = NotUsable("not scripted"), Unqueried("no camera")
     measured = []
     for time_s, sides in zip(made_up.hops.time_s.tolist(), said, strict=True):

@@ -14,7 +14,7 @@ from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
 from worldstate.adapters.acoustic import AcousticAdapter, asked_again, expected_labels, heard_kinds
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
+from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.belief.track import heard_as
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -121,7 +121,7 @@ def query(*boxes: str, keep: frozenset[str] = frozenset({"car", "truck"})) -> Vi
     frames = [DetectionFrame(box, np.array([0.9]), (name,)) for name in boxes]
     empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     log = DetectionLog.at_rate([*frames, empty], frame_rate_hz=10.0)
-    return VisionQuery(PinholeCamera(), log, settings=VisionSettings(keep=DetectionFilter(keep)))
+    return VisionQuery(PinholeCamera(), log, keep=DetectionFilter(keep))
 
 
 def test_a_class_that_the_filter_drops_is_always_missed_and_alone_was_not_asked_for() -> None:

@@ -36,11 +36,11 @@ def write_detections(folder: Path, name: str) -> None:
 def test_lists_what_the_log_lists(tmp_path: Path) -> None:
     left, none, right = OvadDataset(write_log(tmp_path, *ROWS)).recordings
     assert (left.recording_id, left.label) == ("1_00_0002", "left")
-    assert (left.junction, left.moving_ego) == ("A1", False)
+    assert left.moving_ego is False
     assert (left.t0_frame, left.t0_s) == (70, 7.0)
     assert left.audio_path == tmp_path / "SA1" / "left" / "1_00_0002" / "out_multi.wav"
     assert (none.label, none.t0_frame, none.t0_s) == ("none", None, None)
-    assert (right.junction, right.moving_ego, right.t0_s) == ("B2", True, 5.8)
+    assert (right.moving_ego, right.t0_s) == (True, 5.8)
 
 
 def test_opens_sound_and_detections(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_bare_folder_tells_what_its_name_tells(tmp_path: Path) -> None:
     folder = write_sound(tmp_path / "SA2" / "right" / "mine")
     assert Recording.open(folder) == Recording(folder, "mine", "SA2", "right", None)
     alone = Recording.open(write_sound(tmp_path / "street" / "today" / "run"))
-    assert (alone.environment, alone.label, alone.junction, alone.moving_ego, alone.t0_s) == (None,) * 5
+    assert (alone.environment, alone.label, alone.moving_ego, alone.t0_s) == (None,) * 4
 
 
 def test_a_folder_that_contradicts_its_log(tmp_path: Path) -> None:

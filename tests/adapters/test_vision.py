@@ -12,8 +12,8 @@ from worldstate.abduction.absence import MissRateTable
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.ground.errors import InputFileError
 from worldstate.ground.values import NotUsable, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CoEvidenceChannel
 from worldstate.measurement.sector import Sector
@@ -38,8 +38,8 @@ def bearing(azimuth_rad: float) -> Bearing:
     return Bearing(azimuth_rad, 0.05)
 
 
-def query(log: DetectionLog | None, **settings: object) -> VisionQuery:
-    return VisionQuery(CENTRED, log, TABLE, settings=VisionSettings(**settings))  # type: ignore[arg-type]
+def query(log: DetectionLog | None, keep: DetectionFilter | None = None) -> VisionQuery:
+    return VisionQuery(CENTRED, log, TABLE, keep=keep)
 
 
 EMPTY = DetectionLog.at_rate([frame()] * 40, 10.0)
@@ -194,14 +194,6 @@ def test_a_sector_between_two_edges(right: float, width: float) -> None:
 def test_refuses_detections_of_another_camera() -> None:
     with pytest.raises(InputFileError, match=r"detections: frame 19: expected boxes within .* 1936 x 1216"):
         query(crossing(1700.0, 2.0))
-
-
-@pytest.mark.parametrize(
-    "setting", [{"half_width_rad": 0.0}, {"clutter_rate": 0.0}, {"max_frame_age_s": -1.0}]
-)
-def test_refuses_settings_without_meaning(setting: dict[str, float]) -> None:
-    with pytest.raises(InvalidArgumentError, match=next(iter(setting))):
-        VisionSettings(**setting)
 
 
 def test_what_sounds_from_behind_an_occluder_is_sought_in_line_of_sight() -> None:

@@ -19,7 +19,7 @@ from worldstate.adapters.camera.camera_health import DegradationLog
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
+from worldstate.adapters.camera.vision_query import MAX_IMAGE_AGE_S, VisionQuery
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listen import measure_steps
 from worldstate.adapters.source import Source, unoccluded_sector
@@ -58,7 +58,7 @@ class Camera:
             detections_in(self.boxes, images),
             self.rates.table,
             d,
-            VisionSettings(keep=self.detector.keep),
+            self.detector.keep,
             unoccluded_sector(source.context),
             self.rates.clutter_rate,
         )
@@ -148,7 +148,7 @@ def _reference(source: Source, stamps_ns: Sequence[int]) -> list[FloatArray]:
 
 def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFilter) -> list[FloatArray]:
     """Return the moving boxes that count, shape (boxes, 4), of the frame at each stamp."""
-    longest_ns, found = nanoseconds(VisionSettings().max_frame_age_s), []
+    longest_ns, found = nanoseconds(MAX_IMAGE_AGE_S), []
     for number in (log.latest(stamp_ns, longest_ns) for stamp_ns in stamps_ns):
         boxes_px = np.empty((0, 4))
         if number is not None:
@@ -160,7 +160,7 @@ def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFi
 
 def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Sequence[int]) -> BoolArray:
     """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
-    detected = _moving_boxes(query.detections, stamps_ns, query.settings.keep) if query.detections else []
+    detected = _moving_boxes(query.detections, stamps_ns, query.keep) if query.detections else []
     found = [
         (overlaps(there, boxes) >= MIN_OVERLAP).any()
         for there, boxes in zip(reference, detected, strict=True)
@@ -287,7 +287,7 @@ def _query(source: Source, state: Condition, seed: int) -> VisionQuery | None:
         missed(source.detections, source.camera, table, degradation, rng),
         table,
         degradation,
-        VisionSettings(keep=source.settings.boxes),
+        source.settings.boxes,
         unoccluded_sector(source.context),
     )
 

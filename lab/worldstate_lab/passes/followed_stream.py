@@ -18,7 +18,7 @@ from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.acoustic_sequence import learn_passes, street_listener
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
+from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
@@ -166,6 +166,6 @@ def stream_measurements(
         detections = stream_detections(heard, np.random.default_rng(seed))
         if camera == "dies":
             detections = without_passes(detections, heard)
-        vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
+        vision = VisionQuery(PinholeCamera(), detections, keep=boxes)
     evidence = stream_evidence(windows, heard)
     return heard, measurements(heard, windows, sequence, evidence, vision, street)

@@ -126,7 +126,7 @@ def test_a_model_trained_without_ego_noise_hears_none_and_no_other_model_does(
 
 
 def test_settings_of_one_s_own(recording: Path) -> None:
-    chosen = EgoNoiseSettings(forgetting_s=3.0)
+    chosen = EgoNoiseSettings(feature=True)
     for given, expected in ((False, None), (True, EgoNoiseSettings()), (chosen, chosen)):
         assert ListenSettings(ego_noise=given).front_end(ARRAY, 48_000.0).ego_noise == expected
 

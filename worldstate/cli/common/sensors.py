@@ -188,14 +188,12 @@ def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[
 
 def box_counts(source: "Source", *, as_json: bool) -> object:
     """Say how many boxes count and why the others do not; None without a camera."""
-    from dataclasses import asdict
-
-    from worldstate.adapters.camera.box_linking import count_boxes
+    from worldstate.adapters.camera.box_linking import COUNTS_TOLD, count_boxes
 
     if source.detections is None:
         return None
     counts = count_boxes(source.detections, source.settings.boxes)
-    return asdict(counts) if as_json else str(counts)
+    return counts if as_json else COUNTS_TOLD.format(**counts)
 
 
 def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetector":

@@ -16,7 +16,7 @@ import numpy as np
 from worldstate.cli.common.output import CommandResult
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings, ElevationSplit
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, whiten
 from worldstate.ground.blas_threads import one_blas_thread
@@ -65,7 +65,7 @@ def _ego_noise(engine: bool) -> EgoNoise:
     if engine:
         canceller.follow(50.0)
     judge = ElevationSplit.of(array, frequencies)
-    ego = EgoNoise(EgoNoiseSettings(), 2.0 * RATE / NFFT, 56, [(beams, SRP)], canceller, judge)
+    ego = EgoNoise(2.0 * RATE / NFFT, 56, [(beams, SRP)], canceller, judge)
     ego.weight = 1.0
     return ego
 
