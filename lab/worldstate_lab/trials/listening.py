@@ -234,11 +234,11 @@ def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
 
 
 def _boxes(source: Source, vision: VisionQuery) -> HopTable:
-    log, settings = source.detections, vision.settings
+    log = source.detections
     rows: list[tuple[Any, ...]] = []
     for number, frame in enumerate(() if log is None else log.frames):
         assert log is not None
-        kept, still = kept_and_parked(log, number, settings.keep)
+        kept, still = kept_and_parked(log, number, vision.keep)
         moving = set(kept[~still].tolist())
         for i, box in enumerate(frame.boxes_px):
             sighting = source.camera.sighting(box, frame.labels[i], float(frame.scores[i]))
