@@ -25,6 +25,5 @@ from .ego_noise.ego_noise import EgoNoiseSettings as EgoNoiseSettings
 from .frame import AcousticFrame as AcousticFrame
 from .health.channel_health import ArrayHealth as ArrayHealth
 from .health.channel_health import ChannelFault as ChannelFault
-from .health.sample_clock import SampleClock as SampleClock
 from .settings import FrontEndSettings as FrontEndSettings
 from .stream import FrontEnd as FrontEnd

@@ -193,7 +193,7 @@ class HopSpectra:
         if not settings.watch_channels:
             return None
         frequencies = bin_frequencies_hz(self.feature_bins, sample_rate_hz, settings.nfft)
-        return ChannelMonitor(array, frequencies, sample_rate_hz)
+        return ChannelMonitor(array, frequencies)
 
     def _ego_noise(
         self, array: MicrophoneArray, sample_rate_hz: float, bins: range, settings: FrontEndSettings

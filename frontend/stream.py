@@ -106,7 +106,6 @@ class FrontEnd:
                 "sound of a higher rate (6 kHz will do), or shorter frames"
             )
         self._start_ns = start_ns
-        self._n_taken = 0
         self._azimuths = settings.azimuths_rad()
         self._azimuths.flags.writeable = False
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz)
@@ -120,7 +119,7 @@ class FrontEnd:
         self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
         self._hops: deque[HopSums] = deque(maxlen=WINDOW_HOPS)
 
-    def process(self, block: ArrayLike, captured_ns: int | None = None) -> list[AcousticFrame]:
+    def process(self, block: ArrayLike) -> list[AcousticFrame]:
         """Take the next samples; return one result for every hop that they complete after the first window.
 
         Parameters
@@ -128,9 +127,6 @@ class FrontEnd:
         block : array_like, shape (n, M)
             Samples, any n from one sample to a whole file: floats of full scale 1, or int16 and int32 as a
             converter gives them, which are scaled to that.
-        captured_ns : int, optional
-            Capture time of the last of these samples by the caller's clock, nanoseconds. It measures the
-            sample rate (`AcousticFrame.health`) and has no other effect.
 
         Returns
         -------
@@ -152,9 +148,6 @@ class FrontEnd:
         [0, 0, 0, 1, 2]
         """
         samples = self._checked(block)
-        self._n_taken += len(samples)
-        if captured_ns is not None and self._spectra.monitor is not None:
-            self._spectra.monitor.clock.read(self._n_taken, captured_ns)
         frames = (self._process_hop(hop) for hop in self._cutter.cut(samples))
         return [frame for frame in frames if frame is not None]
 

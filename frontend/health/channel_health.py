@@ -9,7 +9,6 @@ from worldstate.frontend.array.microphone_array import ChannelMask
 from worldstate.ground import BoolArray, FloatArray, NotUsable
 
 from .dropouts import Dropout
-from .sample_clock import RateEstimate
 
 
 class Fault(StrEnum):
@@ -105,8 +104,6 @@ class ArrayHealth:
     coherence : float or NotUsable
         Median over the channels of the coherence with the prediction from the others. Not usable in the
         first second and without a coherent sound; swapped, inverted and noisy channels are then not found.
-    sample_rate : RateEstimate or NotUsable
-        Sample rate measured against the caller's clock.
 
     Examples
     --------
@@ -120,7 +117,6 @@ class ArrayHealth:
     dropouts: tuple[Dropout, ...]
     n_dropouts: int
     coherence: float | NotUsable
-    sample_rate: RateEstimate | NotUsable
 
     @classmethod
     def unknown(cls, n_channels: int, reason: str = "no hop so far") -> "ArrayHealth":
@@ -131,7 +127,7 @@ class ArrayHealth:
         n_channels : int
             Number of microphones M.
         reason : str
-            Why there is no estimate of the sample rate and of the coherence.
+            Why there is no estimate of the coherence.
 
         Returns
         -------
@@ -143,14 +139,12 @@ class ArrayHealth:
         >>> ArrayHealth.unknown(3).mask.keep
         array([ True,  True,  True])
         """
-        nothing = NotUsable(reason)
-        return cls(ChannelMask.all_of(n_channels), (), (), 0, nothing, nothing)
+        return cls(ChannelMask.all_of(n_channels), (), (), 0, NotUsable(reason))
 
     @property
     def is_healthy(self) -> bool:
-        """Whether there is no fault, no dropout and no wrong sample rate."""
-        rate_is_wrong = isinstance(self.sample_rate, RateEstimate) and self.sample_rate.is_wrong
-        return not (self.faults or self.n_dropouts or rate_is_wrong)
+        """Whether there is no fault and no dropout."""
+        return not (self.faults or self.n_dropouts)
 
 
 def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:

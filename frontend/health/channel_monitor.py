@@ -10,7 +10,6 @@ from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, Fl
 from .channel_health import MASKED_FAULTS, ArrayHealth, ChannelFault, Fault, faults_where
 from .dropouts import Dropout, DropoutFinder
 from .geometry_check import GeometryCheck
-from .sample_clock import SampleClock
 
 # Width of the interval below an extreme, in halves of the span: an unclipped sound has more samples there
 # than at the extreme itself.
@@ -256,9 +255,8 @@ _EVERY_HOPS = 10
 class ChannelMonitor:
     """Collect the statistics of all channels and report their faults; memory does not grow."""
 
-    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray, sample_rate_hz: float) -> None:
+    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         n = array.n_microphones
-        self.clock = SampleClock(sample_rate_hz)
         self._activity = ChannelActivity(n)
         self._means = RunningMean((2, n))
         self._levels = ChannelLevels(n)
@@ -341,14 +339,12 @@ class ChannelMonitor:
         keep = ~bad
         for fault in faults:
             keep[fault.channel] &= fault.fault not in MASKED_FAULTS
-        rate = self.clock.estimate()
         return ArrayHealth(
             ChannelMask(keep),
             tuple(faults),
             self._dropouts,
             self._n_dropouts,
             self._geometry_check.coherence,
-            rate,
         )
 
     def _single_channel_faults(self) -> list[ChannelFault]:

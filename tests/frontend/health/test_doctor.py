@@ -12,7 +12,8 @@ from worldstate.adapters.audio.sound_file import SilentChannelsError, open_audio
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import roof_array_56
-from worldstate.ground.errors import InputFileError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.operations.recordings.channel_report import rate_from_duration
 from worldstate.simulation import draw_settings, simulate_recording
 
 RATE = 47_998
@@ -133,3 +134,10 @@ def test_open_audio_tells_silent_channels(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "b.wav", samples, 8000)
     with pytest.raises(InputFileError, match=r"b\.wav: expected sound on at least half of 4 channels"):
         open_audio(tmp_path / "b.wav", strict=False)
+
+
+def test_a_duration_is_a_clock() -> None:
+    assert rate_from_duration(28_798_800, 600.0, 0.001, 48_000.0).is_wrong
+    assert not rate_from_duration(28_798_800, 600.0, 0.02, 48_000.0).is_wrong
+    with pytest.raises(InvalidArgumentError, match="duration_s"):
+        rate_from_duration(48_000, 0.0, 0.1, 48_000.0)

@@ -42,8 +42,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from dataclasses import replace
 
-    from worldstate.frontend.health.sample_clock import rate_from_duration
-    from worldstate.operations.recordings.channel_report import write_array_figure
+    from worldstate.operations.recordings.channel_report import rate_from_duration, write_array_figure
 
     from .check_report import as_json, as_text
 

@@ -6,7 +6,6 @@ from worldstate.adapters.audio.sound_file import Audio
 from worldstate.cli.common.inputs import stance
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import Fault
-from worldstate.frontend.health.sample_clock import RateEstimate
 from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable
 from worldstate.operations.recordings.channel_report import ChannelVerdict, RecordingHealth
@@ -14,7 +13,7 @@ from worldstate.operations.recordings.channel_report import ChannelVerdict, Reco
 
 def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray) -> dict[str, object]:
     """Return the report as JSON-able values; channels are counted from 1, unknown is None."""
-    rate = health.sample_rate if isinstance(health.sample_rate, RateEstimate) else None
+    rate = health.sample_rate
     return {
         "path": str(audio.path),
         "healthy": health.is_healthy,
@@ -106,8 +105,7 @@ def _other_lines(health: RecordingHealth) -> Iterator[str]:
         more = ", ..." if health.n_dropouts > 5 else ""
         count = "1 dropout" if health.n_dropouts == 1 else f"{health.n_dropouts} dropouts"
         yield f"{count} ({shown}{more}): check the recorder's buffers"
-    if isinstance(health.sample_rate, RateEstimate):
-        rate = health.sample_rate
+    if (rate := health.sample_rate) is not None:
         ppm = f"{rate.rate_hz:.2f} +- {rate.std_hz:.2f} Hz, {1e6 * rate.error:+.0f} millionths off"
         wrong = ": the header is wrong, or samples are missing" if rate.is_wrong else ""
         yield f"sample rate by the other clock: {ppm}{wrong}"

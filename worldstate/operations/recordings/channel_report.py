@@ -1,5 +1,6 @@
 """What was wrong with the microphones of a recording, over all of its hops, and where they are."""
 
+import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Fault
 from worldstate.frontend.health.dropouts import Dropout
-from worldstate.frontend.health.sample_clock import RateEstimate
+from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import Via
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.operations.figure_style import (
@@ -25,6 +26,10 @@ from worldstate.operations.figure_style import (
     legend_beside,
 )
 
+# Of a rate by another clock: an error of four standard deviations is significant, one false report in 16,000.
+_SIGNIFICANT = 4.0
+# Crystals themselves are off by about as much; less changes neither bearing nor level.
+_TOLERATED = 1e-5
 # What a fault also looks like, before it is known or now and then.
 _EXPLAINS = {
     Fault.GUSTS: {Fault.NOISY, Fault.INTERMITTENT, Fault.DEAD, Fault.DELAY, Fault.DRIFT},
@@ -82,6 +87,45 @@ class ChannelVerdict:
 
 
 @dataclass(frozen=True, slots=True)
+class RateEstimate:
+    """A measured sample rate.
+
+    Examples
+    --------
+    >>> RateEstimate(47_998.0, 0.1, 48_000.0).is_wrong, RateEstimate(47_999.8, 0.1, 48_000.0).is_wrong
+    (True, False)
+    """
+
+    rate_hz: float  # Estimate and standard deviation
+    std_hz: float
+    nominal_hz: float  # Rate in the header of the stream
+
+    @property
+    def error(self) -> float:
+        """Relative error of the nominal rate."""
+        return self.rate_hz / self.nominal_hz - 1.0
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the nominal rate is off by more than 10 ppm and four standard deviations."""
+        limit = max(_SIGNIFICANT * self.std_hz / self.nominal_hz, _TOLERATED)
+        return abs(self.error) > limit
+
+
+def rate_from_duration(
+    n_samples: int, duration_s: float, duration_std_s: float, nominal_hz: float
+) -> RateEstimate:
+    r"""Estimate the sample rate from the duration of a recording by another clock, such as a camera's.
+
+    .. math:: \hat f_s = n / T, \qquad \sigma_{\hat f} = \hat f_s\, \sigma_T / T
+    """
+    in_range("duration_s", duration_s, 0.0, math.inf, open_low=True, open_high=True)
+    in_range("duration_std_s", duration_std_s, 0.0, math.inf, open_low=True, open_high=True)
+    rate = n_samples / duration_s
+    return RateEstimate(rate, rate * duration_std_s / duration_s, nominal_hz)
+
+
+@dataclass(frozen=True, slots=True)
 class RecordingHealth:
     """Everything that was wrong with a recording.
 
@@ -96,12 +140,12 @@ class RecordingHealth:
     n_dropouts: int  # All of them
     n_hops: int  # Hops processed
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
-    sample_rate: RateEstimate | NotUsable  # By another clock
+    sample_rate: RateEstimate | None = None  # By another clock
 
     @property
     def is_healthy(self) -> bool:
         """Whether nothing was wrong."""
-        rate_is_wrong = isinstance(self.sample_rate, RateEstimate) and self.sample_rate.is_wrong
+        rate_is_wrong = self.sample_rate is not None and self.sample_rate.is_wrong
         return not (self.verdicts or self.n_dropouts or rate_is_wrong)
 
     @property
@@ -161,14 +205,12 @@ class HealthLog:
     def summary(self) -> RecordingHealth:
         """Return the verdicts so far."""
         latest = self._latest
-        unknown = NotUsable("nothing heard")
         return RecordingHealth(
             verdicts=self._verdicts(),
             dropouts=tuple(self._dropouts[:_LISTED_DROPOUTS]),
             n_dropouts=latest.n_dropouts if latest else 0,
             n_hops=self._n_hops,
-            coherence=latest.coherence if latest else unknown,
-            sample_rate=latest.sample_rate if latest else unknown,
+            coherence=latest.coherence if latest else NotUsable("nothing heard"),
         )
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
