@@ -30,13 +30,12 @@ from typing import TYPE_CHECKING
 
 from worldstate.cli.common import exports, inputs, listening, sensors
 from worldstate.cli.common.command import stopped_by_signals
-from worldstate.cli.common.early_checks import check_call
 from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import can_draw
-from worldstate.ground.extras import check_extra
 from worldstate.ground.values import seconds
 
 if TYPE_CHECKING:
+    from worldstate.adapters.live.datagram_socket import DetectionSocket, OdometrySocket
     from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
     from worldstate.adapters.source import Source
@@ -64,22 +63,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     inputs.add_array_options(parser)
     sensors.add_car_option(parser)
-    _add_sound_options(parser)
-    inputs.add_search_options(parser)
-    listening.add_listen_options(parser)
-    listening.add_memory_options(parser, "the end of STATE")
-    told = "listen there to how the car moves"
-    parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
-    _add_camera_options(parser)
-    add = parser.add_argument_group("output").add_argument
-    add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
-    view = "show bearing, risk and entities (default: where standard error is a terminal)"
-    add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
-    exports.add_export_options(parser)
-
-
-def _add_sound_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("sound").add_argument
     add("--device", metavar="NAME", help="number or name of the input device (default: the system's)")
     add("--rate", type=int, default=48_000, metavar="HZ", help="samples a second (default: %(default)s)")
@@ -87,15 +70,21 @@ def _add_sound_options(parser: argparse.ArgumentParser) -> None:
     add("--speed", type=float, default=1.0, metavar="X", help="play so many times as fast (default: 1)")
     ends = "end after so many seconds of sound; a shorter recording is played again"
     add("--duration", type=float, metavar="S", help=ends)
-
-
-def _add_camera_options(parser: argparse.ArgumentParser) -> None:
+    inputs.add_search_options(parser)
+    listening.add_listen_options(parser)
+    listening.add_memory_options(parser, "the end of STATE")
+    told = "listen there to how the car moves"
+    parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
     group = parser.add_argument_group("camera")
     which = group.add_mutually_exclusive_group()
     which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
     which.add_argument("--detections", metavar="HOST:PORT", help="listen there to a detector of your own")
     sensors.add_lens_options(parser, group)
     sensors.add_detector_option(parser)
+    add = exports.add_output_options(parser).add_argument
+    add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
+    view = "show bearing, risk and entities (default: where standard error is a terminal)"
+    add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -103,9 +92,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
     check_outputs(arguments, "out", "keep_sound", "save_state", exported=exports.exported_files(arguments))
-    given = sensors.given_sensors(arguments)
-    check_extra(*(["rich"] if arguments.view else []))
-    check_call(given, [] if arguments.play is None else [arguments.play])
+    given = listening.checked_sensors(arguments, [] if arguments.play is None else [arguments.play])
     with ExitStack() as opened:
         recorded = None if arguments.play is None else _source(arguments, given, arguments.play)
         feed = _microphones(arguments, given) if recorded is None else _played(arguments, recorded)
@@ -123,24 +110,17 @@ def _source(
     arguments: argparse.Namespace, given: sensors.GivenSensors, sound: "LiveSound | Path"
 ) -> "Source":
     from worldstate.adapters.files.checkpoint_file import read_checkpoint
-    from worldstate.adapters.source_files import open_source
 
     before = None if arguments.resume is None else read_checkpoint(arguments.resume)
     ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
-    boxes = given.setup.boxes if arguments.camera_device is None else given.boxes()
-    context, sides = listening.given_place(arguments)
-    return open_source(
+    return listening.open_given(
+        given,
         sound,
+        boxes=given.setup.boxes if arguments.camera_device is None else given.boxes(),
+        mask_dead=True,  # a channel that is silent is told by the front-end, which leaves it out
         array=given.car.array,
-        camera=given.camera,
-        miss_rates=given.miss_rates,
-        model=given.model,
-        context=context,
-        sides=sides,
         resume=before,
         start_s=ended_s if arguments.start is None else arguments.start,
-        # A channel that is silent is told by the front-end, which leaves it out.
-        settings=replace(listening.listen_settings(arguments), mask_dead=True, boxes=boxes),
     )
 
 
@@ -171,36 +151,19 @@ def _with_camera(
     given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
 ) -> "tuple[Source, Losses]":
     """Return the source with the camera that was asked for, and what tells what was lost of its looks."""
-    if given.arguments.detections is not None:
-        return _with_detections(given.arguments.detections, source, sound, opened)
-    if given.arguments.camera_device is not None:
-        return _with_device(given, source, sound, opened)
-    return source, dict
-
-
-def _with_detections(
-    address: str, source: "Source", sound: "LiveSound", opened: ExitStack
-) -> "tuple[Source, Losses]":
     from worldstate.adapters.live.datagram_socket import DetectionSocket
-    from worldstate.adapters.live.live_camera import LiveCamera
-
-    looks = opened.enter_context(DetectionSocket(address, sound.stamp_ns))
-    return replace(source, co_evidence=LiveCamera(source, looks)), lambda: {
-        "detections_dropped": looks.dropped,
-        "detections_refused": looks.refused,
-        "last_refusal": looks.problem or None,
-    }
-
-
-def _with_device(
-    given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
-) -> "tuple[Source, Losses]":
     from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, LiveCamera, image_channel
 
-    images, detector = image_channel(), sensors.detector_maker(given.arguments.detector, given.setup.labels)()
+    arguments = given.arguments
+    if arguments.detections is not None:
+        told = opened.enter_context(DetectionSocket(arguments.detections, sound.stamp_ns))
+        return replace(source, co_evidence=LiveCamera(source, told)), _losses(told, "detections")
+    if arguments.camera_device is None:
+        return source, dict
+    images, detector = image_channel(), sensors.detector_maker(arguments.detector, given.setup.labels)()
     size = source.camera.width_px, source.camera.height_px
     looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
-    opened.enter_context(CameraFeed(given.arguments.camera_device, images))
+    opened.enter_context(CameraFeed(arguments.camera_device, images))
     camera = LiveCamera(source, looks, looks.degradation)
     return replace(source, co_evidence=camera), lambda: {"images_dropped": images.dropped}
 
@@ -214,10 +177,14 @@ def _with_odometry(
     if arguments.odometry is None:
         return source, dict
     told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns))
-    return replace(source, told=told.until), lambda: {
-        "odometry_dropped": told.dropped,
-        "odometry_refused": told.refused,
-        "last_odometry_refusal": told.problem or None,
+    return replace(source, told=told.until), _losses(told, "odometry", "odometry_")
+
+
+def _losses(told: "DetectionSocket | OdometrySocket", name: str, last: str = "") -> "Losses":
+    return lambda: {
+        f"{name}_dropped": told.dropped,
+        f"{name}_refused": told.refused,
+        f"last_{last}refusal": told.problem or None,
     }
 
 

@@ -20,15 +20,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common import exports, inputs, listening, sensors
-from worldstate.cli.common.early_checks import check_call
 from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.ground.errors import InputFileError
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionLog
-    from worldstate.adapters.files.odometry_file import EngineSpeed, OdometryLog
-    from worldstate.adapters.own_parts import OtherModality
+    from worldstate.adapters.files.odometry_file import OdometryLog
     from worldstate.adapters.source import Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
@@ -55,13 +53,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_search_options(parser)
     listening.add_listen_options(parser)
     listening.add_memory_options(parser, "0")
-    _add_recording_options(parser)
-    sensors.add_detector_option(parser, default=None)
-    _add_output_options(parser)
-    exports.add_export_options(parser)
-
-
-def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
@@ -70,20 +61,16 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--odometry", type=Path, metavar="CSV", help=moves)
     other = "what another sensor recorded, by a reader that an installed package brings; may be repeated"
     add("--measurements", action="append", default=[], metavar="NAME=FILE", help=other)
-
-
-def _add_output_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("output").add_argument
-    add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    add("--figure", type=Path, metavar="PNG", help="draw the timeline")
+    sensors.add_detector_option(parser, default=None)
+    output = exports.add_output_options(parser)
+    output.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     files = exports.exported_files(arguments)
     check_outputs(arguments, "out", "save_state", figures=("figure",), exported=files)
-    given = sensors.given_sensors(arguments)
-    check_call(given, arguments.input if inputs.bag_of(arguments) is None else [])
+    given = listening.checked_sensors(arguments, arguments.input if inputs.bag_of(arguments) is None else [])
     return _heard(arguments, given)
 
 
@@ -115,33 +102,28 @@ def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> Comman
 
 
 def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "Source":
-    from dataclasses import replace
-
-    from worldstate.adapters.source_files import open_source
+    from worldstate.adapters.files.odometry_file import read_engine
+    from worldstate.adapters.own_parts import other_modality
     from worldstate.operations.recordings.car_cameras import with_cameras
 
-    several, detector = given.several(), given.detector()
+    several, detector, car = given.several(), given.detector(), given.car
     sound, array, detections, ego = _input(arguments, given, None if several else given.detections())
-    context, sides = listening.given_place(arguments)
-    settings = listening.listen_settings(arguments)
-    source = open_source(
+    measured = [f"{name}={path}" for name, path in car.measurements.items()] + arguments.measurements
+    source = listening.open_given(
+        given,
         sound,
+        boxes=given.boxes(),
+        mask_dead=arguments.mask_dead,
         array=array,
         detections=detections,
         ego=ego,
-        camera=given.camera,
-        miss_rates=given.miss_rates,
-        model=given.model,
-        context=context,
-        sides=sides,
         resume=arguments.resume,
         start_s=arguments.start or 0.0,
         detector=None if detector is None else detector(),
-        others=_others(arguments, given),
-        engine=_engine(given),
-        settings=replace(settings, mask_dead=arguments.mask_dead, boxes=given.boxes()),
+        others=[other_modality("--measurements", text) for text in measured],
+        engine=None if car.engine_rpm is None else read_engine(car.engine_rpm, car.firings_per_turn),
     )
-    return with_cameras(source, given.car, several) if several else source
+    return with_cameras(source, car, several) if several else source
 
 
 def _input(
@@ -161,18 +143,3 @@ def _input(
     held = read_bag(bag, inputs.topics_of(arguments))
     seen = held.detections if seen is None else seen
     return held.sound, needed_array(bag, given.car.array or held.array), seen, held.ego
-
-
-def _others(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "list[OtherModality]":
-    """Return what other sensors measured, by option and in the car file."""
-    from worldstate.adapters.own_parts import other_modality
-
-    known = [f"{name}={path}" for name, path in given.car.measurements.items()]
-    return [other_modality("--measurements", text) for text in (*known, *arguments.measurements)]
-
-
-def _engine(given: sensors.GivenSensors) -> "EngineSpeed | None":
-    from worldstate.adapters.files.odometry_file import read_engine
-
-    rpm = given.car.engine_rpm
-    return None if rpm is None else read_engine(rpm, given.car.firings_per_turn)

@@ -11,14 +11,10 @@ the way of the sound (3 ms a metre).
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from worldstate.cli.common.inputs import add_search_options, search_of
 from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.sensors import add_sensor_options, given_sensors
-
-if TYPE_CHECKING:
-    from worldstate.adapters.source import Source
+from worldstate.cli.common.sensors import add_sensor_options, recorded
 
 EXAMPLE = """\
 examples:
@@ -38,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from dataclasses import asdict
+    from dataclasses import asdict, replace
 
     from worldstate.adapters.vehicle.car_file import write_aligned
     from worldstate.cli.common.progress import track
@@ -52,29 +48,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     inputs = [found for path in arguments.input for found in find_inputs(path)]
     if arguments.detections and len(inputs) > 1:
         raise InvalidArgumentError("--detections: expected one recording with it, folders bring their own")
+    settings = replace(search_of(arguments), mask_dead=True)
     passes = [
         one
         for path in track(inputs, "listening", len(inputs))
-        for one in heard_passes(_source(arguments, path), LARGEST_OFFSET_S)
+        for one in heard_passes(recorded(arguments, path, settings), LARGEST_OFFSET_S)
     ]
     found = align(passes)
     if arguments.out is not None:
         name = None if arguments.camera is None else str(arguments.camera)
         write_aligned(arguments.car, arguments.out, name, found.offset_s, found.yaw_deg)
     return CommandResult({"recordings": len(inputs)} | asdict(found))
-
-
-def _source(arguments: argparse.Namespace, path: Path) -> "Source":
-    from dataclasses import replace
-
-    from worldstate.adapters.source_files import open_source
-
-    # Only its sound, boxes and camera are used: no model has to fit the array.
-    given = given_sensors(arguments)
-    return open_source(
-        path,
-        array=given.car.array,
-        camera=given.camera,
-        detections=given.detections(),
-        settings=replace(search_of(arguments), boxes=given.setup.boxes, uncalibrated=True, mask_dead=True),
-    )

@@ -8,7 +8,7 @@ import sys
 import textwrap
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
@@ -152,7 +152,8 @@ def run_program(
     `current` replaces former words of a call, `prepare` adds options to the parser of every command.
     """
     try:
-        with _orderly_termination():
+        # SIGTERM is an exception, so that unfinished files are removed on the way out; exit code 143.
+        with _handled((signal.SIGTERM,), _terminate):
             code = _execute(program, current(words), prepare)
             sys.stdout.flush()
             return code
@@ -204,41 +205,35 @@ def _without_command(program: Program, words: Sequence[str]) -> int:
 
 
 @contextmanager
-def _orderly_termination() -> Iterator[None]:
-    """Turn SIGTERM into an exception, so that unfinished files are removed on the way out; exit code 143."""
+def _handled(
+    numbers: Sequence[int], handler: Callable[[int, object], None], *, once: bool = False
+) -> Iterator[None]:
+    """Handle signals by a function while the block runs; `once`, from the second on as before."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextmanager
-def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` at the first SIGINT or SIGTERM; the second one does what it did before."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = signal.SIGINT, signal.SIGTERM
     before = {number: signal.getsignal(number) for number in numbers}
 
     def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)
 
-    def on_signal(number: int, frame: object) -> None:
-        restore()
-        stop()
+    def handle(number: int, frame: object) -> None:
+        if once:
+            restore()
+        handler(number, frame)
 
     for number in numbers:
-        signal.signal(number, on_signal)
+        signal.signal(number, handle)
     try:
         yield
     finally:
         restore()
+
+
+def stopped_by_signals(stop: Callable[[], None]) -> AbstractContextManager[None]:
+    """Call `stop` at the first SIGINT or SIGTERM; the second one does what it did before."""
+    return _handled((signal.SIGINT, signal.SIGTERM), lambda number, frame: stop(), once=True)
 
 
 def _terminate(number: int, frame: object) -> None:

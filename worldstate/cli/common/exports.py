@@ -37,11 +37,14 @@ EXPORTERS = {
 _FILES = "mcap", "rerun", "osi", "autoware"
 
 
-def add_export_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --export."""
+def add_output_options(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Declare --out and --export, where states go; return their group."""
     parser.description = f"{parser.description}\n\n{HELP}"
+    group = parser.add_argument_group("output")
+    group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     told = "send states to a viewer, a log or another stack; repeated"
-    parser.add_argument("--export", action="append", default=[], metavar="NAME=TARGET", help=told)
+    group.add_argument("--export", action="append", default=[], metavar="NAME=TARGET", help=told)
+    return group
 
 
 def exported_files(arguments: argparse.Namespace) -> dict[str, Path]:

@@ -6,8 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from .command import add_choice
-
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import Encoding, SoundInput
     from worldstate.adapters.audio.sound_file import Audio
@@ -62,11 +60,6 @@ def add_search_options(parser: argparse.ArgumentParser) -> None:
     add("--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help=band)
     span = "sector ahead that is searched, 360 for all round (default: %(default)g)"
     add("--azimuth-span", type=float, default=180.0, metavar="DEG", help=span)
-
-
-def add_storage_option(parser: argparse.ArgumentParser) -> None:
-    """Declare --ros-storage."""
-    add_choice(parser, "--ros-storage", "storage of the bag that is written", "mcap", "sqlite3")
 
 
 def topics_of(arguments: argparse.Namespace) -> "BagTopics":

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
     from worldstate.adapters.camera.onnx_detector import OnnxDetector
     from worldstate.adapters.camera.pinhole import PinholeCamera
-    from worldstate.adapters.source import Source
+    from worldstate.adapters.source import ListenSettings, Source
     from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 
@@ -160,8 +160,24 @@ def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
     return GivenSensors(arguments, car, None if name is None else car.camera(name), setup)
 
 
+def recorded(arguments: argparse.Namespace, sound: "SoundInput", settings: "ListenSettings") -> "Source":
+    """Return a recording of which sound, boxes and camera are used, and no model has to fit the array."""
+    from dataclasses import replace
+
+    from worldstate.adapters.source_files import open_source
+
+    given = given_sensors(arguments)
+    return open_source(
+        sound,
+        array=given.car.array,
+        detections=given.detections(),
+        camera=given.camera,
+        settings=replace(settings, boxes=given.setup.boxes, uncalibrated=True),
+    )
+
+
 def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[Source, DetectionLog]":
-    """Return a recording of which boxes and camera are used, and no model has to fit the array; the boxes.
+    """Return a recording, and the boxes of its camera.
 
     Raises
     ------
@@ -169,17 +185,9 @@ def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[
         If there are no boxes of a camera.
     """
     from worldstate.adapters.source import ListenSettings
-    from worldstate.adapters.source_files import open_source
     from worldstate.ground.errors import InputFileError
 
-    given = given_sensors(arguments)
-    source = open_source(
-        sound,
-        array=given.car.array,
-        detections=given.detections(),
-        camera=given.camera,
-        settings=ListenSettings(boxes=given.setup.boxes, uncalibrated=True),
-    )
+    source = recorded(arguments, sound, ListenSettings())
     if source.detections is None:
         problem = "expected boxes of a camera beside it, or --detections with what a detector reported"
         raise InputFileError(source.audio_path, problem)

@@ -7,7 +7,7 @@ an MCAP file or a bag that `worldstate run` wrote holds the same bytes as the --
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.exports import CROSSING_M, add_export_options, exported_files, open_exports
+from worldstate.cli.common.exports import CROSSING_M, add_output_options, exported_files, open_exports
 from worldstate.cli.common.output import CommandResult, check_outputs
 
 EXAMPLE = """\
@@ -23,8 +23,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --export mcap, rosbag or --out")
-    add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    add_export_options(parser)
+    add_output_options(parser)
     crossing = "metres ahead of the lane in which other stacks find what is only heard (default: 9)"
     add("--crossing", type=float, default=CROSSING_M, metavar="M", help=crossing)
 

@@ -7,7 +7,8 @@ has to look like for `worldstate run BAG`, and which topics; the definitions are
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.inputs import add_array_options, add_storage_option, given_array
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.inputs import add_array_options, given_array
 from worldstate.cli.common.output import CommandResult
 
 EXAMPLE = """\
@@ -23,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("out", type=Path, metavar="BAG", help="folder to write, which must not exist")
     start = "time of the first sample, seconds since 1970 in a real bag (default: %(default)g)"
     add("--start", type=float, default=0.0, metavar="S", help=start)
-    add_storage_option(parser)
+    add_choice(parser, "--ros-storage", "storage of the bag that is written", "mcap", "sqlite3")
     add_array_options(parser)
 
 
