@@ -38,10 +38,9 @@ from worldstate.operations.recordings.stream_statistic import (
     log_joint,
     stream_statistic,
 )
+from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS
 from worldstate_lab.metrics.intervals import deal_folds
 from worldstate_lab.report.table import figure_lines
-
-LOOMING_WEIGHTS = (0.0, 0.1, 0.2, 0.4, 0.8)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ ambience or louder, from 250 to 2600 Hz over one second.
 
 import argparse
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
+from worldstate_lab.report.table import Table
 
 # What a listener would take for one another: each left out as a whole.
 FAMILIES: Mapping[str, tuple[str, ...]] = {
@@ -152,11 +153,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     rows = guard_rows(ovad_array(), streams, np.random.default_rng(arguments.seed), arguments.sounds)
     with progress_bar("training guards", len(EXAMS)) as bar:
         found = guard_exam(rows, bar.advance)
-    lines = [f"{'kind':14}{'guard without':16}{'hops':>7}{'foreign':>9}{'signal':>8}{'worst site':>12}"]
-    lines += [
-        f"{one.kind:14}{one.without:16}{one.hops:7d}{one.foreign:9.3f}{one.signal:8.3f}{one.worst_site:12.3f}"
-        for one in found
-    ]
+    heads = ("guard without", "kind", "hops", "foreign", "signal", "worst site")
+    lines = Table("guards", "", heads, [astuple(one) for one in found]).lines()[1:]
     report = {"sites": sites, "seed": arguments.seed, "rows": [asdict(one) for one in found]}
     if arguments.out is not None:
         write_report(arguments.out / NAMES[0], report)

@@ -16,7 +16,7 @@ import numpy as np
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.parallel import in_processes
 from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.progress import track
 from worldstate.ground.checks import in_range
 from worldstate_lab.planner.encounters import FROM_STANDING, BelievedStream, EgoVehicle, believed_stream
 from worldstate_lab.planner.planner_exam import (
@@ -83,9 +83,4 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 def _believed(arguments: argparse.Namespace, paths: list[Path]) -> list[BelievedStream]:
     follow = partial(believed_stream, model=read_model(arguments.model), cache=arguments.cache)
-    found = []
-    with progress_bar("following", len(paths)) as bar:
-        for one in in_processes(follow, paths, arguments.jobs):
-            found.append(one)
-            bar.advance()
-    return found
+    return list(track(in_processes(follow, paths, arguments.jobs), "following", len(paths)))

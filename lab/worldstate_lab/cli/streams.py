@@ -15,7 +15,7 @@ from pathlib import Path
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.parallel import in_processes
 from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.progress import track
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import pass_figures
 from worldstate_lab.report.table import figure_lines
@@ -47,10 +47,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     given = {"camera": arguments.camera, "seed": arguments.seed, "learns": arguments.sides}
     follow = partial(passed_stream, model=model, **given)
     streams: dict[str, list[PassedStream]] = {}
-    with progress_bar("following", len(arguments.streams)) as bar:
-        for one in in_processes(follow, arguments.streams, arguments.jobs):
-            streams.setdefault(one.heard.site, []).append(one)
-            bar.advance()
+    passed = in_processes(follow, arguments.streams, arguments.jobs)
+    for one in track(passed, "following", len(arguments.streams)):
+        streams.setdefault(one.heard.site, []).append(one)
     figures = {site: pass_figures(streams[site]) for site in sorted(streams)}
     figures["all"] = pass_figures([one for every in streams.values() for one in every])
     report = {**given, "junctions": figures}

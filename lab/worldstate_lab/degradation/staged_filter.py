@@ -32,7 +32,7 @@ from worldstate.measurement.measurement import Measurement
 from worldstate.operations.detectors.miss_rate_measurement import MIN_OVERLAP
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rising_edges
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream, joined
-from worldstate_lab.metrics.intervals import DRAWS, middle, poisson_upper, stratified_draws
+from worldstate_lab.metrics.intervals import middle, poisson_upper, stratified_draws
 
 from .awareness import Estimate
 from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions, level_rms, rained
@@ -228,12 +228,12 @@ def staged_advisories(path: Path, model: Path | None, seed: int) -> HopTable:
         return joined(_advised(source, seed))
 
 
-def stream_sweep(streams: Iterable[HopTable], seed: int, draws: int = DRAWS) -> StreamSweep:
+def stream_sweep(streams: Iterable[HopTable], seed: int) -> StreamSweep:
     """Count the onsets of every state, and hold them against those of the clean camera minute by minute."""
     parts = [[one.advised[one.condition == state.name] for state in STATES] for one in streams]
     hours = sum(flags[0].size for flags in parts) * HOP_S / SECONDS_PER_HOUR
     onsets = np.concatenate([np.stack([_by_minute(one) for one in flags], axis=1) for flags in parts])
-    chosen = stratified_draws([0] * len(onsets), np.random.default_rng(seed), draws)
+    chosen = stratified_draws([0] * len(onsets), np.random.default_rng(seed))
     drawn = onsets[chosen].sum(axis=1)
     return StreamSweep(hours, tuple(_row(at, onsets.sum(axis=0), drawn, hours) for at in range(len(STATES))))
 

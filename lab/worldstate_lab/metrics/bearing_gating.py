@@ -1,7 +1,6 @@
 """Prominence gating: the accuracy of bearings that a camera could check against the share that is kept."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,15 +11,9 @@ from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.operations.recordings.hop_table import HopTable
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 # The paper's second point: 2.4 degrees at 16 % coverage, after 3.4 degrees on all.
 PUBLISHED = ((1.0, 3.4), (0.16, 2.4))
 PUBLISHED_COVERAGE = PUBLISHED[1][0]
-# A median of fewer bearings is not drawn.
-FEWEST = 10
 # Thresholds of a curve, evenly spread over the coverage.
 _MOST_POINTS = 200
 
@@ -144,16 +137,3 @@ def gated_median_deg(checks: HopTable) -> float:
     """Return the median error of the most prominent 16 %; NaN where no bearing could be checked."""
     curve = bearing_curve(checks)
     return np.nan if isinstance(curve, NotUsable) else np.degrees(curve.at_coverage(PUBLISHED_COVERAGE)[1])
-
-
-def draw_gating(axes: "Axes", checks: HopTable) -> None:
-    """Draw the median error against the share of bearings kept, the paper's two points beside it."""
-    curve = bearing_curve(checks)
-    if not isinstance(curve, NotUsable):
-        n = int(np.isfinite(checks.error_rad).sum())
-        enough = curve.coverage * n >= min(FEWEST, n)
-        axes.plot(curve.coverage[enough], np.degrees(curve.median_error_rad[enough]), label=f"{n} bearings")
-    axes.plot(*np.transpose(PUBLISHED), "o", color="black", fillstyle="none", label="paper")
-    axes.set(xlabel="share kept by prominence", ylabel="median bearing error (deg)", xlim=(1.03, 0.0))
-    axes.set_ylim(bottom=0.0)
-    axes.legend(fontsize="small")

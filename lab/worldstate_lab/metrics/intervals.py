@@ -26,7 +26,7 @@ from worldstate.operations.training.folds import recording_labels
 
 # Twelve draws lie beyond each end of the interval.
 DRAWS = 500
-COVERAGE = 0.95
+_TAIL = (1.0 - 0.95) / 2.0
 
 # By recording, as in the paper.
 FOLDS = 5
@@ -71,20 +71,19 @@ def pooled_draws(
         yield np.concatenate([parts[i] for i in one])
 
 
-def middle(values: FloatArray, coverage: float = COVERAGE) -> Interval:
-    """Return the interval that leaves equal shares of the draws below and above, NaN where there are none.
+def middle(values: FloatArray) -> Interval:
+    """Return the middle 95 % of the draws, NaN where there are none.
 
     Examples
     --------
-    >>> middle(np.array([np.nan, 0.0, 1.0, 2.0]), coverage=0.5)
-    (0.5, 1.5)
+    >>> [round(end, 6) for end in middle(np.array([np.nan, *range(41)]))]
+    [1.0, 39.0]
     """
     # A figure that a draw does not have, such as a bearing without anything in view, is left out of it.
     known = values[~np.isnan(values)]
     if not known.size:
         return float("nan"), float("nan")
-    tail = (1.0 - coverage) / 2.0
-    low, high = np.quantile(known, [tail, 1.0 - tail]).tolist()
+    low, high = np.quantile(known, [_TAIL, 1.0 - _TAIL]).tolist()
     return low, high
 
 
@@ -109,8 +108,8 @@ def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = 
     return list(pooled_draws(rows, strata, rng, draws))
 
 
-def poisson_upper(count: int, exposure: float, confidence: float = 0.9) -> float:
-    """Return the rate that is not exceeded with such confidence: the one-sided exact bound.
+def poisson_upper(count: int, exposure: float) -> float:
+    """Return the rate that is not exceeded with a confidence of .9: the one-sided exact bound.
 
     Examples
     --------
@@ -118,7 +117,7 @@ def poisson_upper(count: int, exposure: float, confidence: float = 0.9) -> float
     2.3
     """
     # The upper end of a two-sided interval leaves as much beyond it on either side.
-    return poisson_interval(count, exposure, 2.0 * confidence - 1.0)[1]
+    return poisson_interval(count, exposure, 2.0 * 0.9 - 1.0)[1]
 
 
 def random_detection(

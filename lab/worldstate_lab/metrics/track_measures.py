@@ -76,7 +76,6 @@ _MISS, _HOLD = 1e3, 1e6
 # Two tracks to one side of two sources cost the same either way round, and round-off would swap their names
 # at random: a touch of the squared error decides for the order of the sources.
 _TIE = 1e-6
-_NO_ROWS: IndexArray = np.zeros(0, dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +110,7 @@ class TruthRows:
     hop: IntArray  # shape (n,): Number of the hop
     source: IntArray  # shape (n,): Identity
     azimuth_rad: FloatArray  # shape (n,)
-    active: BoolArray  # shape (n,): Whether a track is asked for; one at an inactive source is not false
+    active: BoolArray  # shape (n,): Whether a track is asked for
 
     def __post_init__(self) -> None:
         finite_array("azimuth_rad", self.azimuth_rad, (len(self.hop),))
@@ -138,13 +137,12 @@ class TrackMeasures:
     fragmentation_rate_hz: float  # These, and returns of a track that was lost within the period
     azimuth_error_rad: float  # Mean absolute error within the gate
     detection: float  # Share of the hops of a period with a track
-    false_rate_hz: float  # Tracks of no source, of hops with an active one
     identity_switches: int  # CLEAR-MOT: what was matched stays matched while it lies within the gate
     fragmentations: int
     active_s: float  # Length of all periods together
 
 
-_NOTHING_ACTIVE = TrackMeasures(math.nan, math.nan, math.nan, math.nan, math.nan, math.nan, 0, 0, 0.0)
+_NOTHING_ACTIVE = TrackMeasures(math.nan, math.nan, math.nan, math.nan, math.nan, 0, 0, 0.0)
 
 
 def track_measures(
@@ -166,7 +164,7 @@ def track_measures(
     period_s = in_range("hop_s", hop_s, 0.0, math.inf, open_low=True)
     gate = in_range("gate_rad", gate_rad, 0.0, math.pi)
     free, kept = (_match(estimates, truths, gate, keep=keep) for keep in (False, True))
-    if not free.hops:
+    if not free.source.size:
         return _NOTHING_ACTIVE
     swaps, returns = free.swaps(), free.returns(free.period)
     return TrackMeasures(
@@ -175,7 +173,6 @@ def track_measures(
         fragmentation_rate_hz=free.rate(swaps, returns) / period_s,
         azimuth_error_rad=free.azimuth_error_rad(),
         detection=free.rate(np.flatnonzero(free.matched)),
-        false_rate_hz=free.false / (free.hops * period_s),
         identity_switches=kept.swaps().size,
         fragmentations=kept.returns(kept.source).size,
         active_s=free.matched.size * period_s,
@@ -192,8 +189,6 @@ class _Matched:
     matched: BoolArray
     track: IntArray  # Where matched
     error_rad: FloatArray
-    false: int  # Estimates of no source
-    hops: int  # In which any source is active
 
     def swaps(self) -> IndexArray:
         """Return the rows at which a source has another track than when it was matched last."""
@@ -231,7 +226,7 @@ class _Matched:
 
 
 def _match(estimates: TrackRows, truths: TruthRows, gate: float, *, keep: bool) -> _Matched:
-    track, error, false = _match_hops(estimates, truths, gate, keep)
+    track, error = _match_hops(estimates, truths, gate, keep)
     order = np.lexsort((truths.hop, truths.source))
     order = order[truths.active[order]]
     hop, source = truths.hop[order], truths.source[order]
@@ -244,20 +239,17 @@ def _match(estimates: TrackRows, truths: TruthRows, gate: float, *, keep: bool) 
         matched=np.isfinite(error[order]),
         track=track[order],
         error_rad=error[order],
-        false=false,
-        hops=np.unique(hop).size,
     )
 
 
 def _match_hops(
     estimates: TrackRows, truths: TruthRows, gate: float, keep: bool
-) -> tuple[IntArray, FloatArray, int]:
-    """Return track and error of every truth, NaN where it has none, and the number of false estimates."""
+) -> tuple[IntArray, FloatArray]:
+    """Return track and error of every truth, NaN where it has none."""
     track, error = np.zeros(truths.hop.size, np.int64), np.full(truths.hop.size, np.nan)
-    there = _rows_by_hop(estimates.hop)
-    active, idle = (_rows_by_hop(truths.hop, flags) for flags in (truths.active, ~truths.active))
+    there = _rows_by_hop(np.arange(estimates.hop.size), estimates.hop)
+    active = _rows_by_hop(np.flatnonzero(truths.active), truths.hop)
     last: set[tuple[int, int, int]] = set()
-    false = 0
     for hop in sorted(active.keys() & there.keys()):
         rows, said = active[hop], there[hop]
         sources, names = truths.source[rows].tolist(), estimates.track[said].tolist()
@@ -270,15 +262,10 @@ def _match_hops(
         ours, theirs = rows[pairs[:, 0]], said[pairs[:, 1]]
         track[ours], error[ours] = estimates.track[theirs], cost[pairs[:, 0], pairs[:, 1]]
         last = {(hop, sources[i], names[j]) for i, j in pairs.tolist()}
-        rest = estimates.azimuth_rad[np.delete(said, pairs[:, 1])]
-        if rest.size:
-            beside = _bearing_errors(truths.azimuth_rad[idle.get(hop, _NO_ROWS)], rest)
-            false += rest.size - len(gated_pairs(beside, beside <= gate, _MISS))
-    return track, error, false
+    return track, error
 
 
-def _rows_by_hop(hop: IntArray, used: BoolArray | None = None) -> dict[int, IndexArray]:
-    rows = np.arange(hop.size) if used is None else np.flatnonzero(used)
+def _rows_by_hop(rows: IndexArray, hop: IntArray) -> dict[int, IndexArray]:
     rows = rows[np.argsort(hop[rows], kind="stable")]
     values, starts = np.unique(hop[rows], return_index=True)
     # The piece before the first start is empty, and the only one where there are no rows.

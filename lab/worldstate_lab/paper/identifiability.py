@@ -19,6 +19,7 @@ from worldstate_lab.metrics.intervals import pooled_draws
 
 # Estimators count in nats, the paper and the report in bits.
 _BITS = 1.0 / math.log(2.0)
+_NEIGHBOURS = 3
 # One posterior of exactly zero at the true state would make the mean of all windows infinite.
 _SMALLEST = 1e-12
 
@@ -129,7 +130,7 @@ def state_entropy_bits(states: ArrayLike, count: int) -> float:
     return min(entropy_bits(shares) + float(bias), math.log2(max(count, 1)))
 
 
-def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike, neighbours: int = 3) -> float:
+def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike) -> float:
     r"""Estimate I(z; x) from distances alone, without a classifier.
 
     .. math:: \hat I = \psi(n) + \psi(k) - \overline{\psi(n_{z_i})} - \overline{\psi(m_i)},
@@ -143,9 +144,7 @@ def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike, n
     features : array_like, shape (n, d)
         Continuous values.
     states : array_like of int, shape (n,)
-        True states; those with no more than `neighbours` windows are left out.
-    neighbours : int
-        k >= 1.
+        True states; those with no more than k = 3 windows are left out.
 
     Returns
     -------
@@ -174,7 +173,7 @@ def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike, n
     x = finite_array("features", features, (None, None))
     z = np.asarray(states)
     check_shape("states", z.shape, (len(x),))
-    k = int(in_range("neighbours", neighbours, 1, 1000))
+    k = _NEIGHBOURS
     names, counts = np.unique(z, return_counts=True)
     kept = np.isin(z, names[counts > k])
     x, z = x[kept], z[kept]

@@ -9,7 +9,7 @@ from worldstate.ground.typing import FloatArray, IntArray
 from worldstate.ground.values import NotUsable
 from worldstate.operations.figure_style import BLUE, RED
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.bearing_gating import bearing_curve, draw_gating
+from worldstate_lab.metrics.bearing_gating import PUBLISHED, bearing_curve
 from worldstate_lab.metrics.by_group import worst_group
 from worldstate_lab.report.table import Figure, Value
 
@@ -18,6 +18,9 @@ from .panels import COLOURS, GREY, MARKS, legend_below
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
+
+# A median of fewer bearings is not drawn.
+FEWEST = 10
 
 
 def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float]) -> Figure:
@@ -102,19 +105,19 @@ def junction_figure(
 
 def bearing_gating_figure(checks: HopTable) -> Figure:
     """Draw the median bearing error over the share of bearings kept by prominence."""
-    curve = bearing_curve(checks)
-    points = (
-        ()
-        if isinstance(curve, NotUsable)
-        else (curve.coverage, np.degrees(curve.median_error_rad), curve.threshold)
-    )
+    curve, n = bearing_curve(checks), int(np.isfinite(checks.error_rad).sum())
+    points: tuple[FloatArray, ...] = ()
+    if not isinstance(curve, NotUsable):
+        points = curve.coverage, np.degrees(curve.median_error_rad), curve.threshold
 
     def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
-        draw_gating(axes, checks)
-        legend = axes.get_legend()
-        if legend is not None:
-            legend.remove()
+        if points:
+            enough = points[0] * n >= min(FEWEST, n)
+            axes.plot(points[0][enough], points[1][enough], label=f"{n} bearings")
+        axes.plot(*np.transpose(PUBLISHED), "o", color="black", fillstyle="none", label="paper")
+        axes.set(xlabel="share kept by prominence", ylabel="median bearing error (deg)", xlim=(1.03, 0.0))
+        axes.set_ylim(bottom=0.0)
         legend_below(canvas)
 
     return Figure(
