@@ -1,6 +1,7 @@
 """Fault campaign: measurements of the whole accepted range, late, repeated, reordered; clocks that jump."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,8 +19,9 @@ from worldstate import (
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.measurement import Look, Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement import CameraLook, Look, Position, PositionScan, SearchedSector, Sector
 from worldstate.measurement.odometry import EgoPose, Odometry
+from worldstate.state import Delivery
 from worldstate.state.context import corner_at
 
 SILENT, TINY = NotUsable("not scripted"), 5e-324
@@ -153,12 +155,63 @@ def sound(world: WorldFilter) -> None:
     chances += [chance for cue in state.cues for chance in (cue.within or {}).values()]
     chances += [one.probability for one in state.relations]
     assert all(0.0 <= chance <= 1.0 for chance in chances)
-    assert len(state.entities) < 140  # One scan may hold 128
+    assert len(state.entities) <= 128
 
 
 def test_what_is_accepted_leaves_a_sound_state_and_a_checkpoint_that_reads() -> None:
     world = campaign(np.random.default_rng(1), 700)
     assert world.state.delivery.replayed > 20 and world.state.delivery.repeated > 10
+
+
+def crowd(rng: np.random.Generator, n: int) -> tuple[Sighting, ...]:
+    """Return boxes all over an image, a third of them parked."""
+    azimuths_rad, scores = rng.uniform(-0.55, 0.55, n).tolist(), rng.uniform(0.3, 1.0, n).tolist()
+    drawn = zip(azimuths_rad, scores, rng.random(n) < 0.67, strict=True)
+    return tuple(Sighting(at, 0.01, "car", score, moving=bool(moves)) for at, score, moves in drawn)
+
+
+def crowded(hop: int, boxes: tuple[Sighting, ...], hidden: float = 0.0) -> Measurement:
+    heard = SignatureEvidence(("left", "right"), (hidden, 0.0), 0.0, 0.0)
+    answer = (Present if boxes else Absent)(0.04, 0.01)
+    return Measurement(hop * 10**8, heard, answer, SILENT, SILENT, boxes)
+
+
+def test_of_600_boxes_an_image_64_count() -> None:
+    rng = np.random.default_rng(5)
+    boxes = crowd(rng, 600)
+    counting = sorted(boxes, key=lambda one: (not one.moving, -one.score))[:64]
+    order = rng.permutation(600).tolist()
+    world = WorldFilter().update(crowded(1, tuple(boxes[i] for i in order)))
+    few = WorldFilter().update(crowded(1, tuple(counting)))
+    assert few.state.delivery == Delivery()
+    assert world.state == replace(few.state, delivery=Delivery(boxes_left_out=536))
+    again = world.update(crowded(1, boxes))  # Delivered twice, it is left out once
+    assert again.state.delivery == Delivery(boxes_left_out=536, repeated=1)
+    # Of each image of its own
+    camera = CameraLook(Look("left", 10**8, Present(0.04, 0.01), (0.5, 1.5)), crowd(rng, 70))
+    both = WorldFilter().update(replace(crowded(1, boxes[:66]), further=(camera,)))
+    assert both.state.delivery.boxes_left_out == 2 + 6
+
+
+def test_the_128_likeliest_are_kept_and_what_is_only_heard() -> None:
+    rng, world = np.random.default_rng(6), WorldFilter()
+    for hop in range(1, 12):
+        world = world.update(crowded(hop, (), hidden=4.0))
+    (hidden,) = world.state.entities
+    for hop in range(12, 16):
+        # As claims of a radio, which need no corner to appear at.
+        claims = tuple(
+            Position(tuple(rng.uniform(5.0, 90.0, 2).tolist()), ((0.2, 0.0), (0.0, 0.2)), None, chance)
+            for chance in rng.uniform(0.1, 0.9, 100).tolist()
+        )
+        world = world.update(PositionScan(f"radio {hop}", hop * 10**8, claims))
+        copy = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict())))
+        assert copy.state == world.state
+    state = world.state
+    assert len(state.entities) <= 128 and hidden.id in [one.id for one in state.entities]
+    assert state.delivery.tracks_left_out > 50
+    chances = [one.existence_probability for one in state.entities if one.id != hidden.id]
+    assert min(chances) > 0.25  # Claims begin at .1
 
 
 @pytest.mark.slow

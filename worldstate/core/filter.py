@@ -23,10 +23,12 @@ from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import NEWS_HOLDS_NS, Memory, first_memory, priors_of
 from .relations import relations_at
 from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
-from .vision_update import vision_update
+from .vision_update import counting_boxes, vision_update
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
+# All that two cameras and a radio find at a crowded crossing; a step costs with their square.
+MOST_TRACKS = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,7 @@ class WorldFilter:
             bearing=memory.bearing,
             domain=memory.domain,
             no_sequence=memory.no_sequence,
-            delivery=self._lag.delivery,
+            delivery=replace(self._lag.delivery, tracks_left_out=memory.tracks_left_out),
             valid_until_ns=max((one.stamp_ns + NEWS_HOLDS_NS for one in sensors), default=None),
             sensors=sensors,
             searched=searched_views(memory, context),
@@ -164,7 +166,9 @@ class WorldFilter:
 
         A measurement that is up to two seconds late is put where it belongs, as if it had come in time. One
         that was delivered before is dropped, and one that is later still; `WorldState.delivery` counts them.
-        Where everything comes too late for a second, clocks were changed: the belief begins anew.
+        Where everything comes too late for a second, clocks were changed: the belief begins anew. One that is
+        ahead of all others, and of the belief, by more than two seconds waits until a second one is, too. Of
+        an image 64 boxes count.
 
         Raises
         ------
@@ -173,10 +177,14 @@ class WorldFilter:
             is built.
         """
         # Before anything is computed: a measurement that is refused leaves the filter as it was.
-        measurement = _fitting(measurement, self.context)
+        measurement, left_out = _fitting(measurement, self.context), 0
+        if isinstance(measurement, Measurement):
+            measurement, left_out = counting_boxes(measurement)
         lag = self._lag.add(measurement, self.stamp_ns, self._step)
         if lag is None:
             return self._begun_anew(measurement)
+        if left_out and lag.latest is not self._lag.latest:
+            lag = lag.counted(boxes_left_out=left_out)
         world = replace(self, memory=lag.latest, lag=lag)
         return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)
 
@@ -195,7 +203,7 @@ class WorldFilter:
             memory = step.update_positions(memory, measurement, model)
         else:
             memory = self._perceived(memory, measurement, model)
-        return step.chronicled(before, carried, memory, model)
+        return step.chronicled(before, carried, _with_likeliest(memory), model)
 
     def _perceived(self, memory: Memory, measurement: Measurement, model: step.FilterModel) -> Memory:
         """Return the memory after a measurement with its signature, its looks and its sequence."""
@@ -313,6 +321,16 @@ class FilterRecord:
             raise InvalidArgumentError("memory.rules: expected known sides")
         if any(track.side >= k for track in memory.tracks):
             raise InvalidArgumentError("memory.tracks: expected known sides")
+
+
+def _with_likeliest(memory: Memory) -> Memory:
+    """Return the memory with the likeliest tracks; boxes and claims do not push out what is only heard."""
+    tracks, left_out = memory.tracks, max(len(memory.tracks) - MOST_TRACKS, 0)
+    if not left_out:
+        return memory
+    order = sorted(range(len(tracks)), key=lambda i: (tracks[i].detected, -tracks[i].existence))
+    kept = tuple(tracks[i] for i in sorted(order[:MOST_TRACKS]))
+    return replace(memory, tracks=kept, tracks_left_out=memory.tracks_left_out + left_out)
 
 
 def _fitting(measurement: object, context: Context) -> Timed:

@@ -65,18 +65,18 @@ class FixedLag:
         stamp_ns, held, latest_ns = measurement.stamp_ns, self.held, self.latest.stamp_ns
         key = (stamp_ns, measurement.source)
         if any(key == one.key for one in self.arrivals) or (held and key == (held.stamp_ns, held.source)):
-            return self._counted(repeated=1)
+            return self.counted(repeated=1)
         if stamp_ns < max(latest_ns - LAG_NS, self.base.stamp_ns):
             return self._too_late(stamp_ns)
         if not self._is_ahead(stamp_ns, now_ns):
             refuted = held is not None and held.source == measurement.source
             return replace(self, held=None if refuted else held)._taken(measurement, step)
         if held is None or not self._is_ahead(held.stamp_ns, now_ns):
-            return replace(self._counted(held_back=1), held=measurement)
+            return replace(self.counted(held_back=1), held=measurement)
         if not -LAG_NS <= stamp_ns - held.stamp_ns <= max(LAG_NS, held.stamp_ns - latest_ns):
-            return replace(self._counted(held_back=1), held=measurement)
+            return replace(self.counted(held_back=1), held=measurement)
         first, second = sorted((held, measurement), key=attrgetter("stamp_ns"))
-        return replace(self._counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
+        return replace(self.counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
 
     def _is_ahead(self, stamp_ns: int, now_ns: int) -> bool:
         """Tell whether a stamp is ahead of all others, and of the belief, by more than a delay explains."""
@@ -98,13 +98,14 @@ class FixedLag:
             memory = step(memory, one)
         oldest_ns = memory.stamp_ns - LAG_NS
         return replace(
-            self._counted(replayed=stamp_ns < self.latest.stamp_ns),
+            self.counted(replayed=stamp_ns < self.latest.stamp_ns),
             latest=memory,
             arrivals=tuple(one for one in kept if one.measurement.stamp_ns >= oldest_ns),
             late_since_ns=None,
         )
 
-    def _counted(self, **more: int) -> "FixedLag":
+    def counted(self, **more: int) -> "FixedLag":
+        """Return the buffer with some counts of its delivery raised."""
         counts = {name: getattr(self.delivery, name) + number for name, number in more.items()}
         return replace(self, delivery=replace(self.delivery, **counts))
 
@@ -112,7 +113,7 @@ class FixedLag:
         since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
         if stamp_ns - since_ns >= REANCHOR_NS:
             return None
-        return replace(self._counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
+        return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
 
 
 @dataclass(frozen=True, slots=True)

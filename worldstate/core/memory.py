@@ -110,6 +110,7 @@ class Memory:
     events: tuple[Event, ...] = field(default=(), metadata=ADDED)  # Of the last measurement
     # Then, with the intervals in which they have held.
     relations: tuple[Relation, ...] = field(default=(), metadata=ADDED)
+    tracks_left_out: Count = field(default=0, metadata=ADDED)  # So far, each beyond the most that are kept
     ego: EgoBelief | None = field(default=None, metadata=ADDED)  # By odometry; None without
 
     def __post_init__(self) -> None:

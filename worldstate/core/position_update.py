@@ -48,8 +48,6 @@ _SHARP_RAD = 1e-3
 # No statement is certain, and a refuted claim that is repeated can still turn out to be true: what was taken
 # to be in view stood behind something that the context does not name.
 _MOST_EXISTENCE, _LEAST_EXISTENCE = 0.999, 1e-3
-# A bus of forged messages must not slow the step down: beyond these no new one is taken.
-_MOST_ENTITIES = 128
 _BY_ALL = attrgetter("position_m", "covariance", "velocity_mps", "existence_probability", "classes")
 
 
@@ -71,7 +69,7 @@ def position_update(memory: Memory, scan: PositionScan, weight: float, site: Sit
             after.append(_missed(track, existence, scan.searched))
     births, sighted = list(memory.births), memory.sighted
     unknown = [one for j, one in enumerate(positions) if j not in found.values()]
-    for position in unknown[: max(_MOST_ENTITIES - len(tracks), 0)]:
+    for position in unknown:
         track = _born(position, scan, births, sighted, site)
         births[track.side] += track.was_hidden
         sighted += not track.was_hidden

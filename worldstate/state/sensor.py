@@ -110,6 +110,10 @@ class Delivery:
         Times that everything came too late for a second, by clocks that changed, and the belief began anew.
     held_back : int
         Ahead of all others by more than the filter's lag, and not confirmed by another one.
+    boxes_left_out : int
+        Boxes beyond the 64 of an image that count, of which moving ones and high scores go first.
+    tracks_left_out : int
+        Entities given up beyond the 128 likeliest.
 
     Examples
     --------
@@ -122,3 +126,5 @@ class Delivery:
     too_late: Count = 0
     reanchored: Count = 0
     held_back: Count = field(default=0, metadata=ADDED)
+    boxes_left_out: Count = field(default=0, metadata=ADDED)
+    tracks_left_out: Count = field(default=0, metadata=ADDED)
