@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.bearing import bearing_of, highest_peaks
+from worldstate.frontend.direction.bearing import bearing_of, find_peaks
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
 from worldstate.frontend.direction.srp import noise_prominence, normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
@@ -31,8 +31,6 @@ __all__ = ["AcousticFrame", "FrontEnd"]
 
 # Far above full scale of any converter; the power of an STFT frame still fits single precision.
 _LOUDEST = 1e15
-# Peaks listed; more than two at a time are seldom vehicles.
-_MOST_PEAKS = 4
 # The energy of less than half a hop scatters too much for a point of the looming fit.
 _MOST_LOST = 0.5
 
@@ -248,7 +246,7 @@ class FrontEnd:
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
         heard = self._heard(BEARING_HOPS)
         spectrum, floor = self._srp(heard), self._least_prominence
-        peaks = highest_peaks(spectrum, self._azimuths, _MOST_PEAKS)
+        peaks = find_peaks(spectrum, self._azimuths)
         bearing = bearing_of(spectrum, peaks, self._azimuths, floor)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),

@@ -125,7 +125,8 @@ class EnsembleModel:
     @property
     def reference_prior(self) -> tuple[float, ...]:
         """Training prior in the order of the explanations (left, right, visible, none)."""
-        return tuple(self._explained_prior[list(EXPLANATION_COLUMNS)].tolist())
+        prior = explained(self.class_prior[None], self.classes, self.class_prior)[0]
+        return tuple(prior[list(EXPLANATION_COLUMNS)].tolist())
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of the model's classes at the training prior, shape (n, classes).
@@ -197,10 +198,6 @@ class EnsembleModel:
     def answer(self, levels: FloatArray, reference: FloatArray) -> SignatureEvidence:
         """Return what `evidence` does for log-levels, shape (1, features), and the row of a reference."""
         return window_evidence(self.posteriors(levels, reference), self.classes, self.class_prior)
-
-    @property
-    def _explained_prior(self) -> FloatArray:
-        return np.asarray(explained(self.class_prior[None], self.classes, self.class_prior)[0])
 
     def _split(self, X: ArrayLike) -> tuple[FloatArray, FloatArray]:
         n_features = self.n_features

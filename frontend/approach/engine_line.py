@@ -28,25 +28,8 @@ _PARTIAL_PRICE = 1.0
 _FLOOR_WIDTH_HZ = 250.0  # Width of the running median that estimates the noise floor
 
 
-@dataclass(frozen=True, slots=True)
-class HarmonicSettings:
-    """Range of the fundamental and number of partials of the harmonic sum.
-
-    Examples
-    --------
-    >>> HarmonicSettings(low_hz=40.0).low_hz
-    40.0
-    """
-
-    low_hz: float = 25.0  # Range of the fundamental; a firing frequency is 20 to 200 Hz
-    high_hz: float = 200.0
-    max_harmonics: int = 20  # Largest number of partials used; 1 tracks a single tone
-
-    def __post_init__(self) -> None:
-        # The fundamental must be resolved.
-        in_range("low_hz", self.low_hz, 4.0 / WINDOW_S, np.inf)
-        in_range("high_hz", self.high_hz, self.low_hz, BAND_HIGH_HZ, open_low=True)
-        in_range("max_harmonics", self.max_harmonics, 1, 1000)
+# Range of the fundamental, which the window resolves: a firing frequency is 20 to 200 Hz. Most partials used.
+LOW_HZ, HIGH_HZ, MOST_HARMONICS = 25.0, 200.0, 20
 
 
 def spectrum_and_floor(frames: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
@@ -70,7 +53,7 @@ def spectrum_and_floor(frames: FloatArray, rate: float) -> tuple[FloatArray, Flo
     return power, np.maximum(spread / MEDIAN_OF_EXPONENTIAL, least)
 
 
-def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> FloatArray:
+def best_path(ratio: FloatArray, bin_hz: float) -> FloatArray:
     r"""Return the most evident track of the fundamental on a logarithmic grid, shape (K,), Hz.
 
     A candidate f in window k is scored by the power P of its partials over the noise floor,
@@ -92,19 +75,17 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
     """
     # Half a resolution at the highest partial, so that no partial falls between two candidates.
     step = 0.5 / (WINDOW_S * BAND_HIGH_HZ)
-    count = int(np.log(settings.high_hz / settings.low_hz) / step) + 2
-    grid = np.geomspace(settings.low_hz, settings.high_hz, count)
-    evidence = _harmonic_evidence(ratio, grid, bin_hz, settings)
+    count = int(np.log(HIGH_HZ / LOW_HZ) / step) + 2
+    grid = np.geomspace(LOW_HZ, HIGH_HZ, count)
+    evidence = _harmonic_evidence(ratio, grid, bin_hz)
     reach = max(1, int(np.ceil(_MOST_RATE_HZ * STEP_S / step)))
     return np.asarray(grid[_viterbi(evidence, reach)])
 
 
-def _harmonic_evidence(
-    ratio: FloatArray, grid: FloatArray, bin_hz: float, settings: HarmonicSettings
-) -> FloatArray:
+def _harmonic_evidence(ratio: FloatArray, grid: FloatArray, bin_hz: float) -> FloatArray:
     gain = np.log1p(ratio) - _PARTIAL_PRICE
     evidence = np.zeros((len(ratio), len(grid)))
-    for h in range(1, settings.max_harmonics + 1):
+    for h in range(1, MOST_HARMONICS + 1):
         inside = h * grid <= BAND_HIGH_HZ
         evidence[:, inside] += gain[:, np.round(h * grid[inside] / bin_hz).astype(np.intp)]
     return evidence
@@ -177,9 +158,7 @@ class Windows:
         return np.asarray(np.arange(len(self.shape)) - 0.5 * (len(self.shape) - 1), dtype=np.float64)
 
 
-def measure_fundamental(
-    windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray, max_harmonics: int
-) -> Fundamental:
+def measure_fundamental(windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray) -> Fundamental:
     r"""Refine a track of the fundamental by all its partials.
 
     .. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
@@ -187,7 +166,7 @@ def measure_fundamental(
 
     Shapes: fundamental_hz, slope_hz_s (K,).
     """
-    most = min(max_harmonics, int(BAND_HIGH_HZ / fundamental_hz.min()))
+    most = min(MOST_HARMONICS, int(BAND_HIGH_HZ / fundamental_hz.min()))
     partials = np.arange(1, most + 1)
     n, rate = windows.n, windows.rate_hz
     turn = np.outer(fundamental_hz, n / rate) + 0.5 * np.outer(slope_hz_s, (n / rate) ** 2)
@@ -253,8 +232,6 @@ def _combined(
     return Fundamental(fundamental, np.maximum(misfit, 1.0) / information, count, misfit, power.sum(axis=1))
 
 
-__all__ = ["HarmonicSettings", "HarmonicTrack", "track_fundamental"]
-
 # Each pass measures along the track and the slope of the one before.
 PASSES = 3
 # Longest signal at one call: an hour at 48 kHz is 1.7e8 samples.
@@ -277,9 +254,7 @@ class HarmonicTrack:
     windows: int  # Number of windows analysed, K of them usable
 
 
-def track_fundamental(
-    samples: ArrayLike, sample_rate_hz: float, settings: HarmonicSettings | None = None
-) -> HarmonicTrack:
+def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrack:
     r"""Track the fundamental of the strongest harmonic series in one channel.
 
     .. math:: f^{(0)} = \arg\max_{f_1 .. f_K} \sum_k Q_k(f_k), \qquad
@@ -295,8 +270,6 @@ def track_fundamental(
         One microphone or one beam, at least one window long.
     sample_rate_hz : float
         Samples per second, at least three times the highest partial.
-    settings : HarmonicSettings, optional
-        Range of the fundamental and number of partials; the defaults suit a car's engine.
 
     Returns
     -------
@@ -323,18 +296,17 @@ def track_fundamental(
     >>> bool(np.abs(track.frequency_hz - 60.5).max() < 0.3)
     True
     """
-    chosen = settings or HarmonicSettings()
     x, rate = _decimated(*_checked(samples, sample_rate_hz))
     size, step = round(WINDOW_S * rate), STEP_S * rate
     starts = np.round(np.arange(0, len(x) - size + 1, step)).astype(np.intp)
     frames = x[starts[:, None] + np.arange(size)]
     shape = np.asarray(np.hanning(size + 2)[1:-1], dtype=np.float64)
     power, floor = spectrum_and_floor(frames * shape, rate)
-    fundamental = best_path(power / floor, rate / (ZERO_PADDING * size), chosen)
+    fundamental = best_path(power / floor, rate / (ZERO_PADDING * size))
     time = np.asarray((starts + 0.5 * (size - 1)) / rate, dtype=np.float64)
     windows = Windows(frames, shape, floor, rate)
     for _ in range(PASSES):
-        found = measure_fundamental(windows, fundamental, _slope(time, fundamental), chosen.max_harmonics)
+        found = measure_fundamental(windows, fundamental, _slope(time, fundamental))
         fundamental = np.where(found.n_partials > 0, found.frequency_hz, fundamental)
     return _track(time, found, shape)
 

@@ -23,9 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.typing import FloatArray, IndexArray
 
 
@@ -55,7 +53,7 @@ class Peak:
     prominence: float
 
 
-def find_peaks(spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int = 4) -> tuple[Peak, ...]:
+def find_peaks(values: FloatArray, azimuths_rad: FloatArray, max_peaks: int = 4) -> tuple[Peak, ...]:
     r"""Find the highest local maxima, interpolated by a parabola through three grid points.
 
     With P at the grid point i of a maximum and at its neighbours,
@@ -68,10 +66,10 @@ def find_peaks(spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int =
 
     Parameters
     ----------
-    spectrum : array_like, shape (A,)
-        Non-negative, any unit.
-    azimuths_rad : array_like, shape (A,)
-        Ascending, evenly spaced, radians; A >= 3.
+    values : ndarray, shape (A,)
+        The spectrum, non-negative, any unit; it is not checked.
+    azimuths_rad : ndarray, shape (A,)
+        Ascending, evenly spaced, radians; A >= 2.
     max_peaks : int
         Largest number of peaks.
 
@@ -79,11 +77,6 @@ def find_peaks(spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int =
     -------
     tuple of Peak
         Highest first; empty in silence.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On another shape, fewer than three points, NaN or infinity.
 
     References
     ----------
@@ -97,24 +90,12 @@ def find_peaks(spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int =
     >>> [(round(p.azimuth_rad, 3), round(p.value, 3)) for p in find_peaks(beam, grid)]
     [(0.3, 1.1), (-0.6, 0.6)]
     """
-    azimuths = finite_array("azimuths_rad", azimuths_rad, (None,))
-    values = finite_array("spectrum", spectrum, azimuths.shape)
-    if len(values) < 3:
-        raise InvalidArgumentError(f"azimuths_rad: expected at least three points, got {len(values)}")
-    return highest_peaks(values, azimuths, max_peaks)
-
-
-def highest_peaks(values: FloatArray, azimuths: FloatArray, max_peaks: int) -> tuple[Peak, ...]:
-    """Return what `find_peaks` finds in arrays that are finite and fit each other.
-
-    Shapes: values (A,), azimuths (A,).
-    """
     if values.max() <= 0.0:
         return ()
     median = max(float(np.median(values)), np.finfo(np.float64).tiny)
     candidates = _local_maxima(values)
     highest = candidates[np.argsort(-values[candidates], kind="stable")][:max_peaks]
-    peaks = (_interpolate(values, azimuths, int(index), median) for index in highest)
+    peaks = (_interpolate(values, azimuths_rad, int(index), median) for index in highest)
     return tuple(peak for peak in peaks if peak.prominence >= 1.0)
 
 

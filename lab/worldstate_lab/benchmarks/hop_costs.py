@@ -46,7 +46,7 @@ FRONT_END: Stages = {
     "phat": ((hop_spectra, "power"), (hop_spectra, "whiten")),
     "srp181": ((hop_spectra, "steered_power"), (FrontEnd, "_srp")),
     "feature": ((hop_spectra, "cross_spectra"), (hop_spectra, "pair_sum_of"), (FrontEnd, "_feature")),
-    "peaks": ((stream, "highest_peaks"),),
+    "peaks": ((stream, "find_peaks"),),
     "bands": ((LevelMeter, "push"),),
     "looming": ((FrontEnd, "_looming"),),
     "tone": ((ToneStage, "push"), (ToneStage, "read")),
