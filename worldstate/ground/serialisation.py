@@ -336,18 +336,12 @@ def _check_schema(stamp: object, layout: Layout) -> None:
     major = layout.version.split(".")[0]
     if name != layout.schema or not isinstance(version, str) or version.split(".")[0] != major:
         got = f"{name} {version}"[:80] if isinstance(stamp, dict) else _shown(stamp)
-        advice = _advice(version, int(major)) if name == layout.schema else ""
+        found, advice = str(version).split(".")[0], ""
+        if name == layout.schema and found.isdecimal():
+            advice = ": an earlier worldstate wrote it, write it anew with this one or read it with that one"
+            if int(found) > int(major):
+                advice = ": a later worldstate wrote it, install that one to read it"
         raise _RefusedError(f"expected schema {layout.schema} {major}.x, got {got}{advice}", schema=True)
-
-
-def _advice(version: object, major: int) -> str:
-    """Return what to do with a value of another major version."""
-    found = str(version).split(".")[0]
-    if not found.isdecimal():
-        return ""
-    if int(found) > major:
-        return ": a later worldstate wrote it, install that one to read it"
-    return ": an earlier worldstate wrote it, write it anew with this one or read it with that one"
 
 
 def _union(hints: tuple[Hint, ...]) -> Plan:

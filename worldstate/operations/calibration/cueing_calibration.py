@@ -246,15 +246,16 @@ def _by_miss_rate(
     budgets: list[BudgetReport] = []
     policies: list[CueingPolicy] = []
     for beta in sorted(MISS_RATES):
-        calm, hazards = _statistics(free, prior, beta), _hazards(approaches, prior, beta)
-        risk = _risk_map(calm, hazards, correlation_time_hops(calm), _risk_of(kept, beta))
+        calm, scored = _statistics(free, prior, beta), _statistics(approaches, prior, beta)
+        hazards = [s[stream.before_sight()] for s, stream in zip(scored, approaches, strict=True)]
+        nearest = min(kept.policies, key=lambda policy: abs(policy.miss_rate - beta))
+        risk = _risk_map(calm, hazards) if hazards else nearest.risk_map
         adaptive = _adaptive(hazards, settings)
-        reports = [_budget(calm, alpha, beta, settings) for alpha in settings.alphas]
-        budgets += reports
-        policies += [
-            CueingPolicy(one.gamma, settings.sustain_hops, one.alpha, prior, risk, beta, adaptive)
-            for one in reports
-        ]
+        for alpha in settings.alphas:
+            gamma, held_out = settings.threshold(calm, alpha), _held_out(calm, alpha, settings)
+            counted = _counted(calm, gamma, settings)
+            budgets.append(BudgetReport(alpha, beta, gamma, counted, *held_out))
+            policies.append(CueingPolicy(gamma, settings.sustain_hops, alpha, prior, risk, beta, adaptive))
     return budgets, policies
 
 
@@ -273,17 +274,6 @@ def cut(stream: FloatArray, block_hops: int) -> list[FloatArray]:
 def _statistics(streams: Sequence[HopTable], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
     switches = StatisticSwitches(fixed_miss_rate=beta)
     return [stream_statistic(stream, prior, switches) for stream in streams]
-
-
-def _hazards(approaches: Sequence[HopTable], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
-    scored = _statistics(approaches, prior, beta)
-    return [s[stream.before_sight()] for s, stream in zip(scored, approaches, strict=True)]
-
-
-def _budget(calm: list[FloatArray], alpha: float, beta: float, settings: CueingSettings) -> BudgetReport:
-    gamma = settings.threshold(calm, alpha)
-    rate, per_hour = _held_out(calm, alpha, settings)
-    return BudgetReport(alpha, beta, gamma, _counted(calm, gamma, settings), rate, per_hour)
 
 
 def _counted(calm: Sequence[FloatArray], gamma: float, settings: CueingSettings) -> ApproachTable:
@@ -307,12 +297,10 @@ def _held_out(
     return share, sum(one.onsets for one in found) / hours
 
 
-def _risk_map(calm: list[FloatArray], hazards: list[FloatArray], time_hops: float, kept: RiskMap) -> RiskMap:
-    if not hazards:
-        return kept
+def _risk_map(calm: list[FloatArray], hazards: list[FloatArray]) -> RiskMap:
     scores = np.concatenate([*calm, *hazards])
     labels = np.arange(scores.size) >= sum(s.size for s in calm)
-    return fit_risk_map(scores, labels, independent=scores.size / time_hops)
+    return fit_risk_map(scores, labels, independent=scores.size / correlation_time_hops(calm))
 
 
 def _adaptive(hazards: list[FloatArray], settings: CueingSettings) -> AdaptiveBudget | None:
@@ -324,10 +312,6 @@ def _adaptive(hazards: list[FloatArray], settings: CueingSettings) -> AdaptiveBu
     if not 0.0 < reached < 1.0:
         return AdaptiveBudget(settings.keep_per_hour)
     return AdaptiveBudget(settings.keep_per_hour, highest=reached)
-
-
-def _risk_of(policies: CueingPolicies, beta: float) -> RiskMap:
-    return min(policies.policies, key=lambda policy: abs(policy.miss_rate - beta)).risk_map
 
 
 def _warnings(

@@ -111,19 +111,15 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
     for state in states:
         for one in state.entities:
             if one.moving and one.existence_probability >= _LIKELY:
-                row = seconds(state.stamp_ns), *_nine_of_ten_deg(one)
-                tracks.setdefault((one.id, _hidden(one)), []).append(row)
+                sector = sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)
+                row = seconds(state.stamp_ns), *np.degrees([one.azimuth_rad, *sector]).tolist()
+                tracks.setdefault((one.id, one.status == "hidden"), []).append(row)
     for (_, hidden), rows in tracks.items():
         color, label = (RED, "hidden") if hidden else (BLUE, "in view")
         time_s, azimuth, low, high = with_gaps(np.array(rows), _GAP_S).T
         axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
         axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
     axes.set(ylabel="azimuth (deg)\nleft positive", ylim=(-95, 95), yticks=range(-90, 91, 45))
-
-
-def _nine_of_ten_deg(entity: Entity) -> tuple[float, ...]:
-    low, high = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
-    return tuple(np.degrees([entity.azimuth_rad, low, high]).tolist())
 
 
 def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
@@ -149,9 +145,7 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
 
 
 def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
-    rows = [
-        (seconds(s.stamp_ns), *(_existence(s, side) for side in _sides(states)), _in_view(s)) for s in states
-    ]
+    rows = [(seconds(state.stamp_ns), *_existence(state, _sides(states))) for state in states]
     time_s, *columns = with_gaps(np.array(rows), _GAP_S).T
     for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
         axes.plot(time_s, column, color=color, label=f"somebody hidden, {side}")
@@ -159,20 +153,25 @@ def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
     axes.set(ylabel="existence\nprobability", ylim=(-0.02, 1.02))
 
 
+def _existence(state: WorldState, sides: Sequence[str]) -> list[float]:
+    """Return the likeliest hidden entity of each side, and the likeliest that moves in view."""
+    likeliest = dict.fromkeys((*sides, "in view"), 0.0)
+    for one in state.entities:
+        at = one.direction if one.status == "hidden" else "in view" if one.moving else None
+        if at in likeliest:
+            likeliest[at] = max(likeliest[at], one.existence_probability)
+    return list(likeliest.values())
+
+
 def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
     for row, side in enumerate(_sides(states)):
-        told = [(seconds(state.stamp_ns), *_risks(state, side)) for state in states]
-        time_s, risk, within = with_gaps(np.array(told), _GAP_S).T
+        cues = [next((one for one in state.cues if one.direction == side), None) for state in states]
+        told = [(np.nan, np.nan) if c is None else (c.risk, (c.within or {}).get("3", np.nan)) for c in cues]
+        time_s, risk, within = with_gaps(np.column_stack([_times(states), told]), _GAP_S).T
         axes.plot(time_s, risk, color=_SIDE_COLORS[row], label=f"risk, {side}")
         if np.isfinite(within).any():
             axes.plot(time_s, within, color=_SIDE_COLORS[row], ls="--", label=f"in view within 3 s, {side}")
     axes.set(ylabel="risk,\nprobability", ylim=(-0.02, 1.02))
-
-
-def _risks(state: WorldState, side: str) -> tuple[float, float]:
-    """Return a side's risk, and its chance to come into view within 3 s; NaN where there is none."""
-    cue = next((one for one in state.cues if one.direction == side), None)
-    return (np.nan, np.nan) if cue is None else (cue.risk, (cue.within or {}).get("3", np.nan))
 
 
 def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
@@ -181,20 +180,6 @@ def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
 
 def _times(states: Sequence[WorldState]) -> list[float]:
     return [seconds(state.stamp_ns) for state in states]
-
-
-def _existence(state: WorldState, side: str) -> float:
-    found = [e.existence_probability for e in state.entities if _hidden(e) and e.direction == side]
-    return max(found, default=0.0)
-
-
-def _in_view(state: WorldState) -> float:
-    found = [e.existence_probability for e in state.entities if e.moving and not _hidden(e)]
-    return max(found, default=0.0)
-
-
-def _hidden(entity: Entity) -> bool:
-    return entity.status == "hidden"
 
 
 def write_birds_eye(state: WorldState, path: Path, *, title: str = "") -> None:
