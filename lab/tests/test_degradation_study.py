@@ -46,7 +46,7 @@ from worldstate_lab.evaluation.report.degradation_section import (
     stream_table,
     sweep_tables,
 )
-from worldstate_lab.trials.engine import Failed, attempted
+from worldstate_lab.trials.attempts import Failed, attempted
 from worldstate_lab.trials.pass_cache import PassCache
 
 from worldstate.abduction.absence import default_miss_rates

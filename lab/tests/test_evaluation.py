@@ -19,6 +19,7 @@ from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
 from worldstate_lab.metrics.bearing_gating import bearing_curve
 from worldstate_lab.streets.simulated_windows import simulated_window_pair
+from worldstate_lab.trials.attempts import Failed
 from worldstate_lab.trials.classification import (
     Classifiers,
     classified,
@@ -27,7 +28,6 @@ from worldstate_lab.trials.classification import (
     windows_from_simulation,
     windows_from_table,
 )
-from worldstate_lab.trials.engine import Failed
 from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import pass_time_s
 from worldstate_lab.trials.takes import Take, TakeList

@@ -31,8 +31,8 @@ from worldstate_lab.degradation.staged_filter import (
 )
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
+from worldstate_lab.trials.attempts import Failed, attempted
 from worldstate_lab.trials.classification import Classifiers
-from worldstate_lab.trials.engine import Failed, attempted
 from worldstate_lab.trials.hearing import Hearing, hear, within_hours
 from worldstate_lab.trials.listening import model_refusal
 from worldstate_lab.trials.pass_cache import PassCache, fingerprint

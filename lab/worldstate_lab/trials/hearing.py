@@ -14,7 +14,7 @@ from worldstate.ground.serialisation import encode
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.trials.pass_cache import origin_of
 
-from .engine import Failed
+from .attempts import Failed
 from .listening import (
     VERSION,
     chain_tables,

@@ -9,8 +9,8 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
-from engine_work import Levels, end_at_one, write_sounds
-from worldstate_lab.trials.engine import Failed, attempted
+from attempt_work import Levels, end_at_one, write_sounds
+from worldstate_lab.trials.attempts import Failed, attempted
 
 from worldstate.ground.errors import WorldstateError
 
@@ -54,8 +54,8 @@ def test_a_process_that_is_lost_is_an_error_not_an_endless_wait():
 RUN = """
 import signal, sys
 from pathlib import Path
-from engine_work import Levels
-from worldstate_lab.trials.engine import attempted
+from attempt_work import Levels
+from worldstate_lab.trials.attempts import attempted
 def end(number, frame): raise SystemExit(128 + number)
 signal.signal(signal.SIGTERM, end)
 folder, pause_s = Path(sys.argv[1]), float(sys.argv[2])
