@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.ndimage import convolve, gaussian_filter, sobel
@@ -10,7 +10,7 @@ from scipy.ndimage import convolve, gaussian_filter, sobel
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
 
-from .degradation import LEVELS, degrade, level_of
+from .degradation import LEVELS, darkness_of, degrade
 
 # While an image is clean, every d at most `_CLEAN`, the brightness and sharpness of reference follow it with
 # a time constant, but never by more than a factor from the learned values: slow soiling must not become the
@@ -92,23 +92,13 @@ class Health:
 
     Examples
     --------
-    >>> Health(blur=0.1, darkness=0.5, noise=0.0).worst
+    >>> max(astuple(Health(blur=0.1, darkness=0.5, noise=0.0)))
     0.5
     """
 
     blur: float
     darkness: float
     noise: float
-
-    @property
-    def worst(self) -> float:
-        """The largest of the three."""
-        return max(self.blur, self.darkness, self.noise)
-
-    @property
-    def by_family(self) -> dict[str, float]:
-        """The three by name."""
-        return {"blur": self.blur, "darkness": self.darkness, "noise": self.noise}
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +124,7 @@ class CameraHealth:
         blur = 0.0
         if quality.sharpness is not None:
             blur = float(np.interp(-quality.sharpness, -np.array(self.sharpness), LEVELS))
-        darkness = level_of("darkness", min(quality.brightness / self.brightness, 1.0))
+        darkness = darkness_of(min(quality.brightness / self.brightness, 1.0))
         noise = float(np.interp(quality.noise, self.noise, LEVELS))
         return Health(blur, darkness, noise)
 
@@ -176,7 +166,7 @@ class HealthMonitor:
         seen = self.reference.estimate(quality)
         elapsed_s = 0.0 if self._stamp_ns is None else max(stamp_ns - self._stamp_ns, 0) / 1e9
         self._stamp_ns = stamp_ns
-        if seen.worst <= _CLEAN:
+        if max(astuple(seen)) <= _CLEAN:
             self._follow(quality, 1.0 - math.exp(-elapsed_s / _FOLLOW_S))
         return seen
 

@@ -40,20 +40,15 @@ def strength(family: str, degradation: float) -> float:
     """Return the strength of one of the three families at a degradation d in [0, 1]."""
     # Linear between the levels, darkness in the logarithm.
     level = in_range("degradation", degradation, 0.0, 1.0)
-    if family not in STRENGTHS:
-        raise InvalidArgumentError(f"family: expected {', '.join(STRENGTHS)}, got {family!r:.40}")
     knots = np.array(STRENGTHS[family])
     if family == "darkness":
         return float(np.exp(np.interp(level, LEVELS, np.log(knots))))
     return float(np.interp(level, LEVELS, knots))
 
 
-def level_of(family: str, staged: float) -> float:
-    """Return the d in [0, 1] of a strength, the inverse of `strength`; beyond the last level it is 1."""
-    knots = np.array(STRENGTHS[family])
-    if family == "darkness":
-        return float(np.interp(-np.log(max(staged, 1e-6)), -np.log(knots), LEVELS))
-    return float(np.interp(staged, knots, LEVELS))
+def darkness_of(factor: float) -> float:
+    """Return the d in [0, 1] of a factor on the brightness; beyond the last level it is 1."""
+    return float(np.interp(-np.log(max(factor, 1e-6)), -np.log(STRENGTHS["darkness"]), LEVELS))
 
 
 def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.random.Generator) -> ImageArray:
@@ -70,12 +65,11 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
     if family not in FAMILIES:
         raise InvalidArgumentError(f"family: expected {', '.join(FAMILIES)}, got {family!r:.40}")
-    level = in_range("degradation", degradation, 0.0, 1.0)
-    if level == 0.0:
+    if degradation == 0.0:
         return frame
     staged = tuple(STRENGTHS) if family == "all" else (family,)
     for name in staged:
-        frame = _STAGES[name](frame, strength(name, level), rng)
+        frame = _STAGES[name](frame, strength(name, degradation), rng)
     return frame
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -158,7 +158,7 @@ class MissRates:
         float
             d in [0, 1].
         """
-        rates = [self.tables.get(name, self.table)(0.0, d) for name, d in health.by_family.items()]
+        rates = [self.tables.get(name, self.table)(0.0, d) for name, d in asdict(health).items()]
         at_boresight = np.array([self.table(0.0, d) for d in LEVELS])
         # Of several levels with the same rate the lowest: np.interp needs increasing abscissae.
         rising = np.concatenate([[True], np.diff(at_boresight) > 0.0])

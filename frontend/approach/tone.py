@@ -235,15 +235,13 @@ class ToneReading:
 
     Examples
     --------
-    >>> ToneReading(61.2, 0.02, 0.5, 1e-4, 0.5).frequency_hz
+    >>> ToneReading(61.2, 0.02, 0.5).frequency_hz
     61.2
     """
 
     frequency_hz: float  # Mean over the window, by the stream's own sample rate
     frequency_std_hz: float  # Of that mean
     snr: float  # eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from what is around and beside the line
-    mean_square: float  # A^2 / 2 of the averaged microphones, squared units of the samples
-    age_s: float  # From the middle of the window to the end of the hop, seconds
 
 
 class ToneStage:
@@ -271,10 +269,8 @@ class ToneStage:
         in_range("tone_band_hz: upper end", high, low, 0.5 * sample_rate_hz, open_high=True)
         self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
         self._weights, self._keep = self._mean_of(np.ones(array.n_microphones, bool))
-        self._sample_rate_hz = sample_rate_hz
         self._decimator = Decimator(sample_rate_hz, high)
         self._rate = self._decimator.rate_hz
-        self._n_pushed = 0
         self._n_out = 0
         self._band_samples: FloatArray = np.zeros(_window(_WINDOW_S * sample_rate_hz, self._decimator))
         self._spectrum = _Spectrum(len(self._band_samples), self._rate, band_hz)
@@ -289,7 +285,6 @@ class ToneStage:
         if not np.array_equal(mask.keep, self._keep):
             self._weights, self._keep = self._mean_of(mask.keep)
         new = self._decimator.push(samples @ self._weights)
-        self._n_pushed += len(samples)
         self._n_out += len(new)
         self._band_samples = np.concatenate([self._band_samples, new])[len(new) :]
 
@@ -318,7 +313,7 @@ class ToneStage:
         noise = around + _WANDER * max(beside - _CHANCE * around, 0.0)
         std = float(np.sqrt(tone_crb_hz2(0.5 * abs(amplitude) ** 2 / noise, len(sound), self._rate)))
         frequency = omega * self._rate / (2.0 * np.pi)
-        return ToneReading(frequency, std, snr, 0.5 * abs(amplitude) ** 2, self._age_s())
+        return ToneReading(frequency, std, snr)
 
     def _mean_of(self, keep: BoolArray) -> tuple[Float32Array, BoolArray]:
         """Return weights of the usable microphones nearest to the centre, and their mask."""
@@ -327,12 +322,6 @@ class ToneStage:
         weights = np.zeros(len(keep), np.float32)
         weights[chosen] = 1.0 / len(chosen)
         return weights, keep.copy()
-
-    def _age_s(self) -> float:
-        """Return the time from the middle of the window to the last sample pushed."""
-        middle = self._n_out - 0.5 * (len(self._band_samples) + 1)
-        centre = middle * self._decimator.factor + 0.5 * self._decimator.n_taps
-        return float((self._n_pushed - centre) / self._sample_rate_hz)
 
 
 def _window(n_samples: float, decimator: Decimator) -> int:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, finite_complex
+from worldstate.ground.checks import finite_array, finite_complex, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray, IndexArray
 
@@ -61,7 +61,7 @@ def all_pairs(microphones: int) -> IndexArray:
 def gcc_delays(
     spectra: ArrayLike,
     frequencies_hz: ArrayLike,
-    max_delay_s: ArrayLike,
+    max_delay_s: float,
 ) -> PairDelays:
     r"""Estimate the delay of every pair, between samples, by generalised cross-correlation.
 
@@ -77,7 +77,7 @@ def gcc_delays(
         STFT of the microphones, convention e^{-j 2 pi f t}.
     frequencies_hz : array_like, shape (bins,)
         Centre of each bin, Hz, ascending.
-    max_delay_s : float or array_like, shape (P,)
+    max_delay_s : float
         Largest delay to search, seconds; for microphones at distance d this is d / c.
 
     Returns
@@ -107,7 +107,7 @@ def gcc_delays(
     X = finite_complex("spectra", spectra, (None, None, None))
     frequencies = _checked_frequencies(frequencies_hz, X.shape[1])
     index = all_pairs(X.shape[2])
-    limit = _checked_limit(max_delay_s, len(index), frequencies)
+    limit = _checked_limit(max_delay_s, frequencies)
     cross = _whitened(X, index)
     delay, height = _peaks(cross, frequencies, limit)
     return PairDelays(index, delay, height)
@@ -121,14 +121,14 @@ def _whitened(X: ComplexArray, pairs: IndexArray) -> ComplexArray:
     return np.asarray(np.divide(cross, magnitude, out=np.zeros_like(cross), where=magnitude > 0))
 
 
-def _peaks(cross: ComplexArray, frequencies: FloatArray, limit: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _peaks(cross: ComplexArray, frequencies: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
     """Coarse search on a lag grid, then Newton steps held within one grid step of it."""
     omega = 2.0 * np.pi * frequencies
     step = 1.0 / (LAGS_PER_PERIOD * frequencies[-1])
-    half = int(np.ceil(limit.max() / step))
+    half = int(np.ceil(limit / step))
     lags = np.arange(-half, half + 1) * step
     correlation = (cross @ np.exp(1j * np.outer(omega, lags))).real
-    correlation[np.abs(lags) > limit[:, None] + 0.5 * step] = -np.inf
+    correlation[:, np.abs(lags) > limit + 0.5 * step] = -np.inf
     coarse = lags[np.argmax(correlation, axis=1)]
     delay = np.clip(coarse, -limit, limit)
     for _ in range(NEWTON_STEPS):
@@ -156,16 +156,10 @@ def _checked_frequencies(frequencies_hz: ArrayLike, bins: int) -> FloatArray:
     return frequencies
 
 
-def _checked_limit(max_delay_s: ArrayLike, pairs: int, frequencies: FloatArray) -> FloatArray:
-    scalar = np.ndim(max_delay_s) == 0
-    limit = np.broadcast_to(finite_array("max_delay_s", max_delay_s, () if scalar else (pairs,)), (pairs,))
-    if limit.min() <= 0:
-        raise InvalidArgumentError(f"max_delay_s: expected positive delays, got {limit.min()}")
-    if len(frequencies) > 1:
-        period = 1.0 / np.diff(frequencies).min()
-        if limit.max() >= 0.5 * period:
-            raise InvalidArgumentError(
-                f"max_delay_s: expected less than {0.5 * period:.3g} s, half the period of these bins, "
-                f"got {limit.max():.3g}"
-            )
+def _checked_limit(max_delay_s: float, frequencies: FloatArray) -> float:
+    limit = in_range("max_delay_s", max_delay_s, 0.0, np.inf, open_low=True)
+    half_period = 0.5 / np.diff(frequencies).min() if len(frequencies) > 1 else np.inf
+    if limit >= half_period:
+        expected = f"less than {half_period:.3g} s, half the period of these bins"
+        raise InvalidArgumentError(f"max_delay_s: expected {expected}, got {limit:.3g}")
     return limit

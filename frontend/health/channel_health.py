@@ -44,12 +44,7 @@ class Fault(StrEnum):
     """Later and later, or earlier and earlier: a card with a clock of its own."""
 
 
-MASKED_FAULTS = frozenset(
-    {
-        *(Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.SWAPPED),
-        *(Fault.DELAY, Fault.DRIFT),
-    }
-)
+MASKED_FAULTS = frozenset(Fault) - {Fault.CLIPPED, Fault.OFFSET, Fault.LEVEL, Fault.GUSTS}
 """Faults for which a channel is left out. The others leave its phase intact, which is all that PHAT uses."""
 
 

@@ -115,7 +115,7 @@ def test_what_is_stated_of_a_wandering_line_is_its_error(wander: float) -> None:
     z = []
     for hop, one in enumerate(each_hop(10.0 * np.sin(phase) + rng.standard_normal(n))):
         if isinstance(one, ToneReading):
-            middle = (hop + 1) * SLOW // 10 - round(one.age_s * SLOW)
+            middle = (hop + 1) * SLOW // 10 - SLOW // 2
             truth = frequency[max(middle - 47 * SLOW // 100, 0) : middle + 47 * SLOW // 100].mean()
             z.append((one.frequency_hz - truth) / one.frequency_std_hz)
     assert len(z) > 300
@@ -136,8 +136,8 @@ def test_coloured_noise_and_rumble_hide_no_line() -> None:
     assert abs(reading.frequency_hz - 151.7) < 4 * reading.frequency_std_hz < 0.2
 
 
-def test_the_stream_says_it_every_hop_with_its_age() -> None:
-    """A gliding line: the frequency is that of the middle of the window, `age_s` before the stamp."""
+def test_the_stream_says_it_every_hop() -> None:
+    """A gliding line: the frequency is that of the middle of the window, half a second before the stamp."""
     rate, n = 16_000, 32_000
     t = np.arange(n) / rate
     glide = np.cos(2 * np.pi * (100.0 * t + 0.5 * 0.4 * t**2))
@@ -146,8 +146,7 @@ def test_the_stream_says_it_every_hop_with_its_age() -> None:
     assert len(frames) == 11
     for frame in frames:
         assert isinstance(frame.tone, ToneReading)
-        middle_s = frame.sample_index / rate - frame.tone.age_s
-        assert frame.tone.age_s == pytest.approx(0.5, abs=0.02)
+        middle_s = frame.sample_index / rate - 0.5
         assert frame.tone.frequency_hz == pytest.approx(100.0 + 0.4 * middle_s, abs=0.01)
 
 
@@ -161,7 +160,6 @@ def test_a_line_adds_up_from_wherever_it_comes(azimuth_deg: float) -> None:
     reading = stage.read()
     assert isinstance(reading, ToneReading)
     assert reading.frequency_hz == pytest.approx(f, abs=1e-4)
-    assert reading.mean_square > 0.5 * 0.7
 
 
 def test_microphones_left_out_are_not_heard() -> None:
@@ -172,7 +170,6 @@ def test_microphones_left_out_are_not_heard() -> None:
     reading = stage.read()
     assert isinstance(reading, ToneReading)
     assert reading.frequency_hz == pytest.approx(90.0, abs=1e-3)
-    assert reading.mean_square == pytest.approx(0.5, rel=1e-3)
 
 
 def test_not_usable_says_why() -> None:
