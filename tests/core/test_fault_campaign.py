@@ -214,6 +214,48 @@ def test_the_128_likeliest_are_kept_and_what_is_only_heard() -> None:
     assert min(chances) > 0.25  # Claims begin at .1
 
 
+def test_sources_and_sensors_unheard_for_an_hour_are_forgotten() -> None:
+    def told(hop: int, name: str, world: WorldFilter) -> WorldFilter:
+        look = Look(f"camera {name}", hop * 10**8, Absent(0.04, 0.01))
+        world = world.update(replace(crowded(hop, ()), source=f"sound {name}", look=look))
+        world = world.update(PositionScan(f"radar {name}", hop * 10**8))
+        return world.update(Odometry(f"wheels {name}", hop * 10**8, 5.0))
+
+    def named(world: WorldFilter) -> list[str]:
+        text = json.dumps(world.to_dict())
+        return [kind for kind in ("sound", "camera", "radar", "wheels") if f'"{kind} old' in text]
+
+    once = world = told(1, "new", WorldFilter())
+    for number in range(100):
+        world = told(1, f"old {number}", world)
+    for hop in (12_000, 24_000, 36_001, 36_002, 36_030):
+        if hop == 36_002:
+            assert len(named(world)) == 4 and len(world.state.sensors) == 4 * 101
+        once, world = (told(hop, "new", one.predict_to(hop * 10**8)) for one in (once, world))
+    assert len(world.state.sensors) == 4
+    assert named(world) == []
+    assert len(json.dumps(world.to_dict())) < 1.1 * len(json.dumps(once.to_dict()))
+
+
+@pytest.mark.parametrize("off_ns", [-HOUR_NS, 3 * SECOND_NS, HOUR_NS])
+def test_a_look_of_another_time_says_nothing_and_hides_no_later_one(off_ns: int) -> None:
+    """Of a camera that stands still, or of one stray stamp."""
+    rng, stamp_ns = np.random.default_rng(7), 2 * HOUR_NS
+    quiet, world = WorldFilter(start_ns=stamp_ns), WorldFilter(start_ns=stamp_ns)
+    for hop in range(1, 5):
+        now_ns, boxes = stamp_ns + hop * 10**8, crowd(rng, 3)
+        heard = replace(crowded(1, ()), stamp_ns=now_ns, co_evidence=Unqueried("-"))
+        look = Look("camera", now_ns, Present(0.04, 0.01))
+        stray = replace(look, stamp_ns=now_ns + off_ns)
+        if hop < 3:
+            world = world.update(replace(heard, look=stray, sightings=boxes))
+            quiet = quiet.update(replace(heard, look=replace(look, answer=Unqueried("-"))))
+        else:
+            world, quiet = (one.update(replace(heard, look=look, sightings=boxes)) for one in (world, quiet))
+        assert len(world.state.entities) == len(quiet.state.entities)
+    assert world.state.entities
+
+
 @pytest.mark.slow
 def test_a_hundred_thousand_faults() -> None:
     world = campaign(np.random.default_rng(2), 100_000)

@@ -23,6 +23,8 @@ from .sequence_memory import SequenceMemory
 
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
 NEWS_HOLDS_NS = nanoseconds(1.0)
+# Names come and go; without this, a checkpoint holds every one that was ever told.
+FORGOTTEN_NS = nanoseconds(3600.0)
 StampNs: TypeAlias = Annotated[int | None, Keys("stamp_ns")]
 
 
@@ -147,6 +149,21 @@ def first_memory(context: Context, start_ns: int) -> Memory:
         lag=BeliefLag(((start_ns, explanation),)),
         births=(0,) * k,
         handover_ns=(None,) * k,
+    )
+
+
+def without_forgotten(memory: Memory) -> Memory:
+    """Return the memory without sources and sensors that have been unheard for an hour."""
+    since_ns = memory.stamp_ns - FORGOTTEN_NS
+    stamps_ns = [one.stamp_ns for one in memory.rules] + [one.stamp_ns for one in memory.looks]
+    if min(stamps_ns, default=since_ns) >= since_ns:  # Nearly always: what else is kept has their names
+        return memory
+    return replace(
+        memory,
+        rules=tuple(one for one in memory.rules if one.stamp_ns >= since_ns),
+        looks=tuple(one for one in memory.looks if one.stamp_ns >= since_ns),
+        last_ns=tuple(one for one in memory.last_ns if one[1] >= since_ns),
+        lag=replace(memory.lag, heard=tuple(one for one in memory.lag.heard if one.stamp_ns >= since_ns)),
     )
 
 

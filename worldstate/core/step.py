@@ -37,7 +37,17 @@ from .birth_death import (
     published,
     surviving,
 )
-from .memory import NEWS_HOLDS_NS, CountedLook, Instant, Memory, SourceRule, priors_of
+from .fixed_lag import LAG_NS
+from .memory import (
+    FORGOTTEN_NS,
+    NEWS_HOLDS_NS,
+    CountedLook,
+    Instant,
+    Memory,
+    SourceRule,
+    priors_of,
+    without_forgotten,
+)
 from .position_update import position_update
 from .relations import relations_at
 from .sequence_memory import carried, informed
@@ -141,15 +151,18 @@ def new_looks(
     new = []
     for one in measurement.looks:
         look, last = one.look, _last_look(memory, one.look.sensor)
-        if last is None or look.stamp_ns > last.stamp_ns:
+        # One stray stamp must not hide the looks after it, nor an image of long ago be new for ever.
+        in_time = -FORGOTTEN_NS < look.stamp_ns - measurement.stamp_ns <= LAG_NS
+        if in_time and (last is None or look.stamp_ns > last.stamp_ns):
             since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
             new.append((one, min(max(since_s, 0.0) / settings.look_interval_s, 1.0)))
             counted = CountedLook(
                 look.sensor, look.stamp_ns, measurement.source, look.answer, look.sector_rad
             )
             memory = replace(memory, looks=_with_look(memory, counted))
-        elif last.source != measurement.source:
-            said = Unqueried(f"this look of {look.sensor} was counted before")
+        elif not in_time or (last is not None and last.source != measurement.source):
+            when = "was counted before" if in_time else "is of another time"
+            said = Unqueried(f"this look of {look.sensor} {when}")
             measurement = replace(measurement, co_evidence=said)
     return memory, measurement, new
 
@@ -170,8 +183,7 @@ def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     shares = [hidden_share(track, sides) for track in memory.tracks]
     tracks = predict_tracks(memory.tracks, shares, seconds(step_ns), model.site)
     predicted = replace(
-        memory,
-        stamp_ns=stamp_ns,
+        without_forgotten(replace(memory, stamp_ns=stamp_ns)),
         explanation=explanation.predict(model.context.rates.values_hz, step_ns),
         tracks=surviving(tracks, model.site.settings),
         sequence=memory.sequence and carried(memory.sequence, stamp_ns, step_ns, model.context),
