@@ -4,7 +4,6 @@ from .acoustic import Grounding as Grounding
 from .audio.open_sound import RawPcm as RawPcm
 from .audio.sound_file import AudioSource as AudioSource
 from .audio.sound_file import open_audio as open_audio
-from .camera.camera_channel import Watcher as Watcher
 from .camera.detections import DetectionFilter as DetectionFilter
 from .camera.detections import DetectionFrame as DetectionFrame
 from .camera.detections import DetectionLog as DetectionLog

@@ -7,11 +7,11 @@ from typing import TypedDict, TypeVar
 
 from worldstate.abduction.sequence.street_sides import SidePatterns
 from worldstate.adapters.audio.open_sound import SoundInput, SoundStream, as_sound, path_of
-from worldstate.adapters.camera.camera_channel import Watched, Watcher, video_degradation
+from worldstate.adapters.camera.camera_channel import video_degradation, watched
 from worldstate.adapters.camera.detections import DetectionLog, Detector, read_any_detections
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
-from worldstate.adapters.camera.video import VIDEO_NAME, Video, open_video
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.acoustic_domain import array_of, states_budget
@@ -210,18 +210,9 @@ def _with_camera(
     elif detections is not None or recording is None:
         raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
     else:
-        watched = _watched(open_video(recording.path / VIDEO_NAME), detector, source.miss_rates)
-        log, degradation = watched.detections, watched.degradation
+        log, degradation = watched(open_video(recording.path / VIDEO_NAME), detector, source.miss_rates)
     log = None if log is None else log.shifted(source.camera.stamp_offset_s)
     return replace(source, detections=log, degradation=degradation)
-
-
-def _watched(video: Video, detector: Detector, rates: MissRates | None) -> Watched:
-    """Return what a detector finds in a video; each image is decoded once, for its boxes and its quality."""
-    watcher = Watcher(detector, rates, str(video.path))
-    for number, image in enumerate(video.frames()):
-        watcher.look(nanoseconds(number / video.frame_rate_hz), image)
-    return watcher.watched()
 
 
 def _detections(

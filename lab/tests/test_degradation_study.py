@@ -52,7 +52,7 @@ from worldstate_lab.trials.pass_cache import PassCache
 from worldstate.abduction.absence import default_miss_rates
 from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.audio.open_sound import open_sound
-from worldstate.adapters.camera.camera_channel import Watcher
+from worldstate.adapters.camera.camera_channel import watched
 from worldstate.adapters.camera.camera_health import learn_health
 from worldstate.adapters.camera.degradation import degrade
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
@@ -148,16 +148,13 @@ def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
 
 
 def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
-    watcher = Watcher(MotionDetector(), rates)
-    for number, image in enumerate(islice(video.frames(), 90)):
-        watcher.look(100_000_000 * number, image)
-    watched, kept = watcher.watched(), detections_in(looks["mog2"], CLEAN)
-    assert [len(frame) for frame in watched.detections.frames] == [len(frame) for frame in kept.frames[:90]]
+    first = SimpleNamespace(frames=lambda: islice(video.frames(), 90), frame_rate_hz=10.0, path="first")
+    found, d = watched(first, MotionDetector(), rates)
+    kept = detections_in(looks["mog2"], CLEAN)
+    assert [len(frame) for frame in found.frames] == [len(frame) for frame in kept.frames[:90]]
     read = degradation_in(looks[READINGS], CLEAN, rates)
-    assert np.median(watched.degradation.degradation) == pytest.approx(np.median(read.degradation), abs=0.05)
-    without_scale = Watcher(MotionDetector(), replace(rates, health=None))
-    without_scale.look(0, image)
-    assert without_scale.watched().degradation(0) == 0.0
+    assert np.median(d.degradation) == pytest.approx(np.median(read.degradation), abs=0.05)
+    assert watched(first, MotionDetector(), replace(rates, health=None))[1](0) == 0.0
 
 
 def test_d_is_read_from_the_images_alone(looks, rates):
