@@ -26,6 +26,7 @@ from worldstate.abduction.road_users import (
     likeliest,
     with_siren,
 )
+from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.signature.domain_guard import (
     DomainGuard,
@@ -50,6 +51,7 @@ from worldstate.measurement.measurement import (
     Approach,
     Bearing,
     CoEvidenceChannel,
+    Heard,
     Measurement,
     MeasurementAdapter,
     Side,
@@ -61,6 +63,8 @@ from .acoustic_sequence import LEVEL_BAND_HZ, read_hop
 # would take a wrong guess of the ear for a look at the right thing.
 _ASKED = 0.95
 LINE_SPACING = "line_spacing_hz"
+LEAST_HEARD = 0.2
+"""Share that could be heard below which a hop is not read: `Measurement.heard`."""
 
 
 class Signature(Protocol):
@@ -249,6 +253,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self._guard = guard
         self._road_users = road_users
         self._sequence = sequence
+        self._directions: tuple[str, ...] = SIDES
 
     def measure(self, block: Float32Array, /) -> list[Measurement]:
         """Take the next samples; return a measurement for each hop that ends in them.
@@ -296,7 +301,11 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         half of the street the peak is in, not where the vehicle is: then the side is the signature's.
         """
         self.last_frame = frame
+        heard_well = heard_of(frame)
+        if heard_well.share < LEAST_HEARD:
+            return asked_again(self._unheard(frame, heard_well), self._vision, self._settings)
         heard = signature = self._model.evidence(frame.feature)
+        self._directions = signature.directions
         bearing, looming = _bearing(frame, self._settings), frame.looming
         approach = (
             looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
@@ -324,8 +333,26 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             sequence=sequence,
             source=self.source,
             fault=_array_fault(frame.health),
+            heard=heard_well,
         )
         return asked_again(measured, self._vision, self._settings)
+
+    def _unheard(self, frame: AcousticFrame, heard: Heard) -> Measurement:
+        """Return the measurement of a hop that could not be heard, with even likelihoods."""
+        refused = NotUsable(heard.reason or "not heard")
+        if isinstance(self._sequence, SequenceReader):
+            self._sequence.miss()
+        return Measurement(
+            stamp_ns=frame.stamp_ns,
+            signature=SignatureEvidence(self._directions, (0.0,) * len(self._directions), 0.0, 0.0),
+            co_evidence=Unqueried("no camera"),
+            bearing=refused,
+            approach=refused,
+            sequence=refused if isinstance(self._sequence, SequenceReader) else self._sequence,
+            source=self.source,
+            fault=_array_fault(frame.health),
+            heard=heard,
+        )
 
     def _judged(self, frame: AcousticFrame) -> DomainVerdict | None:
         if self._guard is None or isinstance(frame.character, NotUsable):
@@ -336,6 +363,14 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if self._road_users is None or isinstance(frame.character, NotUsable):
             return ()
         return heard_kinds(self._road_users, frame.character, domain)
+
+
+def heard_of(frame: AcousticFrame) -> Heard:
+    """Return how likely a hidden vehicle would have been noticed in the sound of a hop."""
+    if (frame.feature <= 0.0).any():
+        # No two microphones that are trusted.
+        return Heard(0.0, frame.unheard or "dead channels")
+    return Heard(frame.heard, frame.unheard)
 
 
 def asked_again(

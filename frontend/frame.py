@@ -58,6 +58,11 @@ class AcousticFrame:
     lost : float
         Share of the samples of the decision window that are lost: constant or repeated in all channels. STFT
         frames that hold lost samples are left out of everything here; means are over the others.
+    heard : float
+        Share that could be heard, of the newest hop or of the window, whichever is less; 0 where less than .4
+        of the window is left.
+    unheard : str or None
+        Why the rest could not.
 
     Examples
     --------
@@ -88,3 +93,5 @@ class AcousticFrame:
     tone: ToneReading | NotUsable = TONE_IS_OFF
     character: FloatArray | NotUsable = CHARACTER_IS_OFF
     lost: float = 0.0
+    heard: float = 1.0
+    unheard: str | None = None

@@ -31,8 +31,11 @@ __all__ = ["AcousticFrame", "FrontEnd"]
 
 # Far above full scale of any converter; the power of an STFT frame still fits single precision.
 _LOUDEST = 1e15
+# Share of a window: with .6 s lost the feature and the evidence of a side are off by as much as they change
+# in half a second (medians .08 of .10 and .36 of .30 nats, twelve simulated demos), with .7 s by .54 nats.
+_MOST_LOST = 0.6
 # The energy of less than half a hop scatters too much for a point of the looming fit.
-_MOST_LOST = 0.5
+_MOST_LOST_OF_HOP = 0.5
 
 
 def _full_scale(dtype: np.dtype[Any]) -> np.float32:
@@ -248,6 +251,7 @@ class FrontEnd:
         spectrum, floor = self._srp(heard), self._least_prominence
         peaks = find_peaks(spectrum, self._azimuths)
         bearing = bearing_of(spectrum, peaks, self._azimuths, floor)
+        lost = sum(hop.lost for hop in self._hops) / WINDOW_HOPS
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
             sample_index=hop.end,
@@ -265,7 +269,9 @@ class FrontEnd:
             health=self._hops[-1].health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
-            lost=sum(hop.lost for hop in self._hops) / WINDOW_HOPS,
+            lost=lost,
+            heard=0.0 if lost > _MOST_LOST else 1.0 - max(lost, self._hops[-1].lost),
+            unheard="lost samples" if lost > 0.0 else None,
         )
 
     def _noise_prominence(self) -> float:
@@ -326,7 +332,7 @@ class FrontEnd:
         return segment_feature([hop.pairs for hop in used], n_frames, n_bins, n_microphones)
 
     def _looming(self, end: int) -> Looming | NotUsable:
-        hops = [hop for hop in self._hops if hop.lost <= _MOST_LOST]
+        hops = [hop for hop in self._hops if hop.lost <= _MOST_LOST_OF_HOP]
         # The same microphones in the whole window: one that fails within it must not look like a step of
         # level.
         energies = np.reshape([hop.energies for hop in hops], (-1, self.array.n_microphones))

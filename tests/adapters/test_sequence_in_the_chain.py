@@ -18,6 +18,7 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.expert import Expert
 from worldstate.abduction.signature.site_reference import SiteReference
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
+from worldstate.adapters.acoustic import LEAST_HEARD
 from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
@@ -29,6 +30,7 @@ from worldstate.commissioning.commission import stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.frontend.approach.looming import Looming
 from worldstate.ground.values import NotUsable
+from worldstate.measurement import Heard
 from worldstate.operations.recordings.hop_table import HopTable
 
 RATE_HZ = 6000
@@ -122,27 +124,62 @@ def test_foreign_sounds_say_as_little_of_each_side_as_of_both() -> None:
     assert heard.sides == replace(sides, log_ratios=(1.0, 0.0))
 
 
-def test_lost_sound_interrupts_the_sequence_and_leaves_nothing_behind(folder: Path, tmp_path: Path) -> None:
+def lossy(folder: Path, tmp_path: Path, seconds: float) -> tuple[list[Step], list[Step]]:
+    """Hear eight seconds of noise, with so much of it lost after three, and without a loss."""
     rng = np.random.default_rng(5)
     # A wave from ahead, so that no microphone looks like a faulty one.
     sound = 0.01 * (rng.standard_normal((8 * RATE_HZ, 1)) + 0.3 * rng.standard_normal((8 * RATE_HZ, 3)))
-    sound[3 * RATE_HZ : 3 * RATE_HZ + RATE_HZ * 9 // 10] = 0.0
-    soundfile.write(tmp_path / "sound.wav", sound, RATE_HZ)
-    source = open_source(tmp_path / "sound.wav", model=folder / "model.json", array=ARRAY)
-    # A silent window has no log energy; the settings of the tests turn a warning about that into an error.
-    heard = list(listen_steps(source))
-    said = [step.measurement.sequence for step in heard]
-    reasons = [one.reason if isinstance(one, NotUsable) else "" for one in said]
-    silent = [at for at, reason in enumerate(reasons) if reason == "lost samples"]
-    assert [round(heard[at].state.stamp_ns / 1e9, 1) for at in (silent[0], silent[-1])] == [3.7, 4.2]
-    assert all((heard[at].frame.lost > 0.6) == (at in silent) for at in range(len(heard)))
-    # Ten hops later a sequence is read again.
-    assert set(reasons[silent[-1] + 1 : silent[-1] + 10]) == {"less than 10 hops of evidence"}
-    assert set(reasons[silent[-1] + 10 :]) == {""}
-    end = heard[-1].checkpoint.history
-    assert end is not None
-    assert np.isfinite(end.minute).all()
-    assert len(end.minute) == len(heard) - len(silent)
+    heard = []
+    for name, lost in (("lossy.wav", round(seconds * RATE_HZ)), ("whole.wav", 0)):
+        hurt = sound.copy()
+        hurt[3 * RATE_HZ : 3 * RATE_HZ + lost] = 0.0
+        soundfile.write(tmp_path / name, hurt, RATE_HZ)
+        source = open_source(tmp_path / name, model=folder / "model.json", array=ARRAY)
+        heard.append(list(listen_steps(source)))
+    return heard[0], heard[1]
+
+
+def test_lost_sound_is_no_evidence_and_leaves_nothing_behind(folder: Path, tmp_path: Path) -> None:
+    hurt, whole = lossy(folder, tmp_path, 1.0)
+    measured = {round(step.state.stamp_ns / 1e9, 1): step.measurement for step in hurt}
+    unheard = [at for at, one in measured.items() if one.heard.share < LEAST_HEARD]
+    # From the first lost hop until four tenths of the window are sound again.
+    assert unheard == [round(3.1 + 0.1 * k, 1) for k in range(13)]
+    refused = NotUsable("lost samples")
+    for at in unheard:
+        one = measured[at]
+        assert one.heard.reason == "lost samples"
+        assert one.sequence == one.bearing == one.approach == refused
+        assert set(one.signature.log_likelihoods) == {0.0}
+    assert {one.heard for at, one in measured.items() if not 3.0 < at < 5.0} == {Heard()}
+    ends = [steps[-1].checkpoint for steps in (hurt, whole)]
+    assert ends[0].site is not None and ends[1].site is not None
+    assert ends[0].site.heard_s == pytest.approx(ends[1].site.heard_s - 1.3, abs=0.05)
+    assert ends[0].history is not None and ends[1].history is not None
+    assert len(ends[0].history.minute) == len(ends[1].history.minute) - 13
+    # Level, loudness and prominence of the last three seconds are as if nothing had been lost.
+    recent = [end.history.recent[:, 3:6] for end in ends if end.history is not None]
+    np.testing.assert_allclose(recent[0], recent[1], atol=1e-9)
+
+
+def test_the_seconds_before_a_short_loss_join_on_and_those_before_a_long_one_are_forgotten(
+    folder: Path, tmp_path: Path
+) -> None:
+    for seconds, first in ((1.0, ""), (4.0, "less than 10 hops of evidence")):
+        hurt, _ = lossy(folder, tmp_path, seconds)
+        said = [step.measurement.sequence for step in hurt]
+        reasons = [one.reason if isinstance(one, NotUsable) else "" for one in said]
+        assert reasons[len(reasons) - 1 - reasons[::-1].index("lost samples") + 1] == first
+
+
+def test_a_checkpoint_within_a_loss_goes_on_as_the_whole(folder: Path, tmp_path: Path) -> None:
+    hurt, _ = lossy(folder, tmp_path, 1.0)
+    cut = hurt[25]
+    save_checkpoint(tmp_path / "half.json", cut.checkpoint)
+    assert cut.checkpoint.history is not None and cut.checkpoint.history.missed > 0
+    before = read_checkpoint(tmp_path / "half.json")
+    source = open_source(tmp_path / "lossy.wav", model=folder / "model.json", array=ARRAY, resume=before)
+    assert [one.state.to_json() for one in listen_steps(source)] == [one.state.to_json() for one in hurt[26:]]
 
 
 def test_a_model_that_states_no_times_says_so(folder: Path) -> None:

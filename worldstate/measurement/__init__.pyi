@@ -2,6 +2,7 @@ from .measurement import Approach as Approach
 from .measurement import Bearing as Bearing
 from .measurement import CameraLook as CameraLook
 from .measurement import CoEvidenceChannel as CoEvidenceChannel
+from .measurement import Heard as Heard
 from .measurement import Look as Look
 from .measurement import Measurement as Measurement
 from .measurement import MeasurementAdapter as MeasurementAdapter

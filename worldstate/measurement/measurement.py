@@ -13,7 +13,7 @@ from worldstate.abduction.road_users import ClassShares, class_shares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.checks import all_of, check_fields, named, pair
-from worldstate.ground.serialisation import ADDED, Layout
+from worldstate.ground.serialisation import ADDED, Layout, Probability
 from worldstate.ground.values import NotUsable, integer_ns
 
 _ABOVE_ZERO, _MOST = math.ulp(0.0), sys.float_info.max
@@ -89,6 +89,36 @@ class Approach:
 
     def __post_init__(self) -> None:
         check_fields(self, inverse_tta_hz=(-1e3, 1e3), std_hz=(_ABOVE_ZERO, 1e6))
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """How well could be heard, as a look says what was searched.
+
+    Parameters
+    ----------
+    share : float
+        Probability that a hidden vehicle would have been noticed, in [0, 1].
+    reason : str or None
+        Why it would not: "lost samples", "clipped", "noise far above this place's usual", "wind", "dead
+        channels" or "loud source in view"; None where nothing is against it.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
+    Examples
+    --------
+    >>> Heard(0.7, "lost samples").share
+    0.7
+    """
+
+    share: Probability = 1.0
+    reason: str | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self, share=(0.0, 1.0), reason=str | None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +247,7 @@ _PARTS = {
     "domain": DomainVerdict | None,
     "sequence": SequenceReading | NotUsable | None,
     "fault": str | None,
+    "heard": Heard,
 }
 
 
@@ -252,6 +283,8 @@ class Measurement:
         Name of the modality.
     fault : str or None
         What is known to be wrong with the sensor, in words; the snapshot says it.
+    heard : Heard
+        How likely a hidden vehicle would have been noticed. Of a modality without masking, 1.
 
     Raises
     ------
@@ -286,6 +319,7 @@ class Measurement:
     source: str = "acoustic"
     fault: str | None = None
     further: tuple[CameraLook, ...] = field(default=(), metadata=ADDED)
+    heard: Heard = field(default=Heard(), metadata=ADDED)
 
     def __post_init__(self) -> None:
         named("source", self.source)
