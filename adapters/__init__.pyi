@@ -33,7 +33,6 @@ from .files.checkpoint_file import read_checkpoint as read_checkpoint
 from .files.checkpoint_file import save_checkpoint as save_checkpoint
 from .files.model_file import Model as Model
 from .files.model_file import Provenance as Provenance
-from .files.model_file import load_model as load_model
 from .files.model_file import read_model as read_model
 from .files.model_file import save_model as save_model
 from .listen import Step as Step

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from importlib.resources import as_file, files
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.road_users import RoadUserModel
@@ -14,10 +14,10 @@ from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import AnySignature
 from worldstate.abduction.signature.model_domain import ModelDomain
-from worldstate.ground.serialisation import ADDED, Layout, Via, decode, encode
+from worldstate.ground.serialisation import ADDED, Layout, Via, encode
 
 from .atomic import write_text
-from .text_file import read_json, refused_as_file
+from .text_file import read_record
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,34 +101,6 @@ class Model:
         return self.signature.domain
 
 
-def load_model(path: str | Path | None = None) -> tuple[AnySignature, CueingPolicies]:
-    """Read what inference needs; without a path, of the model that ships with the package.
-
-    Parameters
-    ----------
-    path : str or Path, optional
-        JSON file.
-
-    Returns
-    -------
-    signature, policies : SignatureModel or EnsembleModel, and CueingPolicies
-        Ready to use.
-
-    Raises
-    ------
-    InputFileError
-        As `read_model`.
-
-    Examples
-    --------
-    >>> signature, policies = load_model()
-    >>> policies.for_alpha(0.02).sustain_hops
-    3
-    """
-    model = read_model(path)
-    return model.signature, model.policies
-
-
 def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> Model:
     """Read a model; without a path, the one that ships with the package.
 
@@ -158,10 +130,10 @@ def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> M
     ['standing', 'moving']
     """
     if path is not None:
-        return model_from_dict(read_json(path, "a model file"), path)
+        return read_record(Model, path, "model")
     name = "moving_model.json" if moving_ego else "default_model.json"
     with as_file(files("worldstate") / "data" / name) as default:
-        return model_from_dict(read_json(default, "a model file"), default.name)
+        return read_record(Model, default, "model")
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -187,16 +159,5 @@ def save_model(path: str | Path, model: Model) -> None:
     ...     read_model(Path(folder) / "copy.json").provenance == read_model().provenance
     True
     """
-    lines = [f"{json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in model_to_dict(model).items()]
+    lines = [f"{json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in encode(model).items()]
     write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
-
-
-def model_to_dict(model: Model) -> dict[str, Any]:
-    """Return JSON-able values."""
-    return encode(model)
-
-
-def model_from_dict(data: object, source: object) -> Model:
-    """Return the model that `model_to_dict` wrote; unknown keys are ignored."""
-    with refused_as_file(source):
-        return decode(Model, data, "model")

@@ -36,7 +36,7 @@ from worldstate_lab.trials.trial import Decisions, Trial
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.files.model_file import load_model, read_model, save_model
+from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
 from worldstate.operations.recordings.hop_table import ABSENT, HopTable
@@ -202,7 +202,7 @@ def test_figures_of_few_recordings_come_with_a_caution(streets):
 
 def test_another_classifier_judges_what_was_heard(streets):
     """Eq. (6) of the shipped classifier, hop by hop, from the kept features and answers."""
-    signature, _ = load_model()
+    signature = read_model().signature
     features = np.random.default_rng(2).uniform(0.05, 0.4, (HOPS, 60))
     asked_of = {"answer": np.full(HOPS, ABSENT), "miss_rate": np.full(HOPS, 0.3)}
     trial = replace(streets[0], hops=streets[0].hops.replace(features=features, **asked_of))

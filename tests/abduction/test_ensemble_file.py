@@ -12,16 +12,21 @@ from worldstate_lab.features.feature_evaluation import predict_held_out
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import (
-    load_model,
-    model_from_dict,
-    model_to_dict,
+    Model,
     read_model,
     save_model,
 )
+from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.ground.errors import InputFileError, WorldstateError
+from worldstate.ground.serialisation import decode, encode
 from worldstate.operations.training.training import TrainingSettings, train_model
 
 WRONG = [None, True, "text", [], {}, [None], -1.5, 10**400, float("nan"), float("inf"), "1.0", ["1.0"]]
+
+
+def read(data: object) -> Model:
+    with refused_as_file("bad.json"):
+        return decode(Model, data, "model")
 
 
 def made_up_table(seed=0, recordings=60):
@@ -46,14 +51,15 @@ def model():
 
 @pytest.fixture(scope="module")
 def default(model):
-    return model_to_dict(model)
+    return encode(model)
 
 
 def test_written_and_read_back_to_the_bit(model, default, tmp_path):
     save_model(tmp_path / "m", model)
     again = read_model(tmp_path / "m")
-    assert model_to_dict(again) == default
-    signature, policies = load_model(tmp_path / "m")
+    assert encode(again) == default
+    read = read_model(tmp_path / "m")
+    signature, policies = read.signature, read.policies
     assert isinstance(signature, EnsembleModel)
     assert policies.for_alpha(0.02).reference_prior == signature.reference_prior
     X = made_up_table(1).features
@@ -101,11 +107,11 @@ def replaced(data, path, value):
 def test_wrong_values_are_refused_or_harmless(default, data, value):
     path = data.draw(st.sampled_from([place for place in places(default) if place[:1] == ("signature",)]))
     try:
-        changed = model_from_dict(replaced(default, path, value), "bad.json")
+        changed = read(replaced(default, path, value))
     except WorldstateError as error:
         assert str(error).startswith("bad.json")
     else:
-        json.dumps(model_to_dict(changed), allow_nan=False)
+        json.dumps(encode(changed), allow_nan=False)
         inputs = np.zeros((1, changed.signature.n_features))
         assert np.isfinite(changed.signature.predict_proba(inputs)).all()
 
@@ -123,7 +129,7 @@ def test_wrong_values_are_refused_or_harmless(default, data, value):
 @pytest.mark.parametrize("value", [None, "0.5", True, float("nan"), 10**400, [0.5]])
 def test_a_number_that_is_none_is_always_refused(default, path, value):
     with pytest.raises(InputFileError):
-        model_from_dict(replaced(default, ("signature", *path), value), "bad.json")
+        read(replaced(default, ("signature", *path), value))
 
 
 def test_experts_that_do_not_fit_are_refused(default):
@@ -132,4 +138,4 @@ def test_experts_that_do_not_fit_are_refused(default):
     unknown = replaced(default, ("signature", "experts", 0, "view"), "colour")
     for data, problem in ((many, "experts"), (short, "empty"), (unknown, "view")):
         with pytest.raises(InputFileError, match=problem):
-            model_from_dict(data, "bad.json")
+            read(data)

@@ -13,13 +13,17 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.published_signature import SignatureModel
 from worldstate.adapters.files.model_file import (
     Model,
-    load_model,
-    model_from_dict,
-    model_to_dict,
     read_model,
     save_model,
 )
+from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.ground.errors import InputFileError, SchemaVersionError, WorldstateError
+from worldstate.ground.serialisation import decode, encode
+
+
+def read(data: object) -> Model:
+    with refused_as_file("bad.json"):
+        return decode(Model, data, "model")
 
 
 def published():
@@ -30,7 +34,7 @@ def published():
     return replace(read_model(), signature=signature)
 
 
-DEFAULT = model_to_dict(published())
+DEFAULT = encode(published())
 
 
 def paths(value, here=()):
@@ -65,7 +69,8 @@ def test_the_default_model_ships_and_says_where_it_comes_from():
     assert model.sequence is not None and model.guard is not None and model.road_users is not None
     assert "Schulz" in model.provenance.dataset
     assert len(model.provenance.excluded_lists) == 2
-    signature, policies = load_model()
+    read = read_model()
+    signature, policies = read.signature, read.policies
     assert policies.for_alpha(0.02).reference_prior == signature.reference_prior
     thresholds = [policies.for_alpha(alpha).gamma for alpha in (0.05, 0.02, 0.01)]
     assert thresholds == sorted(thresholds)
@@ -77,17 +82,17 @@ def test_written_and_read_back_to_the_bit(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["m"]
     again = read_model(path)
     assert isinstance(again, Model)
-    assert model_to_dict(again) == DEFAULT
+    assert encode(again) == DEFAULT
     X = np.random.default_rng(0).random((5, 60))
     np.testing.assert_array_equal(again.signature.predict_proba(X), published().signature.predict_proba(X))
 
 
 def test_unknown_keys_are_ignored_and_another_major_version_is_not():
-    model_from_dict({**DEFAULT, "later": 1}, "m")
+    read({**DEFAULT, "later": 1})
     newer = {**DEFAULT, "schema": {"name": "worldstate.Model", "version": "1.8.0"}}
-    model_from_dict(newer, "m")
-    with pytest.raises(SchemaVersionError, match="m: expected"):
-        model_from_dict({**DEFAULT, "schema": {"name": "worldstate.Model", "version": "2.0.0"}}, "m")
+    read(newer)
+    with pytest.raises(SchemaVersionError, match=r"bad\.json: expected"):
+        read({**DEFAULT, "schema": {"name": "worldstate.Model", "version": "2.0.0"}})
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40, deadline=None)
@@ -107,11 +112,11 @@ WRONG = [None, True, "text", [], {}, [None], -1.5, 10**400, float("nan"), float(
 @given(st.sampled_from(PATHS), st.sampled_from(WRONG))
 def test_wrong_values_are_refused_or_harmless(path, value):
     try:
-        model = model_from_dict(replaced(path, value), "bad.json")
+        model = read(replaced(path, value))
     except WorldstateError as error:
         assert str(error).startswith("bad.json")
     else:
-        json.dumps(model_to_dict(model), allow_nan=False)
+        json.dumps(encode(model), allow_nan=False)
         assert np.isfinite(model.signature.predict_proba(np.zeros((1, 60)))).all()
 
 
@@ -121,7 +126,7 @@ def test_wrong_values_are_refused_or_harmless(path, value):
 @pytest.mark.parametrize("value", [None, "0.5", True, float("nan"), 10**400, [0.5]])
 def test_a_number_that_is_none_is_always_refused(path, value):
     with pytest.raises(InputFileError):
-        model_from_dict(replaced(path, value), "bad.json")
+        read(replaced(path, value))
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.detections import read_detections
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import atomic_path, write_text
-from worldstate.adapters.files.model_file import load_model, read_model, save_model
+from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError, WorldstateError
 
@@ -317,7 +317,7 @@ def test_a_model_of_another_major_version(tmp_path: Path, version: str) -> None:
     name = tmp_path / "other.json"
     name.write_text(json.dumps(document))
     with pytest.raises(SchemaVersionError, match=version) as raised:
-        load_model(name)
+        read_model(name)
     assert str(raised.value).startswith(f"{name}: ")
 
 

@@ -17,7 +17,7 @@ from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.files.model_file import load_model, read_model, save_model
+from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.adapters.listen import listen, measure_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
@@ -116,13 +116,13 @@ def test_a_wrong_array_is_never_taken(
     assert not states.exists()
     if case != "one twice":  # no such object can be made
         with pytest.raises(OutOfDomainError, match=why):
-            AcousticAdapter(MicrophoneArray(positions), RATE, load_model()[0])
+            AcousticAdapter(MicrophoneArray(positions), RATE, read_model().signature)
 
 
 @pytest.mark.parametrize("case", RIGHT)
 def test_the_same_places_are_taken_in_any_order_and_anywhere(case: str, alone: Path) -> None:
     assert open_source(alone, array=MicrophoneArray(RIGHT[case])).policy.alpha == 0.02
-    AcousticAdapter(MicrophoneArray(RIGHT[case]), RATE, load_model()[0])
+    AcousticAdapter(MicrophoneArray(RIGHT[case]), RATE, read_model().signature)
 
 
 def test_the_command_refuses_in_one_line_unless_told_to_go_on(
@@ -184,7 +184,7 @@ def test_an_ego_that_moves_is_heard_by_the_model_that_was_made_for_it(alone: Pat
 
 
 def test_another_rate_or_feature_is_refused() -> None:
-    model = load_model()[0]
+    model = read_model().signature
     for rate in (44_100, 16_000, 96_000):
         with pytest.raises(OutOfDomainError, match=r"sample rate: .*47040 to 48960 Hz"):
             AcousticAdapter(ovad_array(), rate, model)
@@ -198,7 +198,7 @@ def test_another_rate_or_feature_is_refused() -> None:
 def test_permuted_channels_give_the_model_the_same_feature() -> None:
     sound = RNG.standard_normal((RATE, 56), dtype=np.float32)
     order = RNG.permutation(56)
-    model = load_model()[0]
+    model = read_model().signature
     (there,) = AcousticAdapter(ovad_array(), RATE, model).front_end.process(sound)
     shuffled = AcousticAdapter(MicrophoneArray(HERE[order]), RATE, model)
     (found,) = shuffled.front_end.process(sound[:, order])

@@ -12,7 +12,7 @@ from scipy.signal import resample_poly
 
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.adapters.files.acoustic_domain import check_tables, feature_order
-from worldstate.adapters.files.model_file import load_model
+from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listen import measure_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
@@ -140,14 +140,14 @@ def test_recordings_up_to_two_kilohertz_are_heard_by_the_model_that_ships(tmp_pa
     assert main(["model", "features", str(tmp_path), "--out", str(tmp_path / "table.csv")]) == 0
     # A model of such windows hears full-rate sound as well: what counts is how long a frame lasts.
     domain = read_features(tmp_path / "table.csv").domain
-    shipped = load_model()[0].domain
+    shipped = read_model().signature.domain
     assert domain is not None and shipped is not None
     check_tables(shipped, domain)
     assert feature_order(domain, ARRAY, SAMPLE_RATE_HZ, FrontEndSettings()) is None
 
 
 def test_a_model_refuses_sound_whose_frames_cannot_last_as_long() -> None:
-    shipped = load_model()[0].domain
+    shipped = read_model().signature.domain
     assert shipped is not None
     for rate in (6_000, 12_000, 24_000):
         assert feature_order(shipped, ARRAY, rate, ListenSettings().front_end(ARRAY, rate)) is None

@@ -23,7 +23,7 @@ from worldstate.abduction.cueing.calibration_error import (
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.adapters.files.model_file import load_model
+from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.inputs import add_array_options, given_array
 from worldstate.cli.common.listening import read_streams
 from worldstate.cli.common.output import CommandResult
@@ -296,7 +296,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    policy = load_model(arguments.model)[1].policies[0]
+    policy = read_model(arguments.model).policies.policies[0]
     switches = AblationSwitches(alpha=arguments.alpha, sustain_hops=policy.sustain_hops)
     streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     table = ablation_table(streams, policy.reference_prior, arguments.seed, switches)

@@ -12,11 +12,12 @@ import numpy as np
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.files.model_file import model_to_dict, read_model
+from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.degradation import looks, staged_filter
@@ -365,7 +366,7 @@ class _Passes:
             staged_filter.VERSION,
             self._look_key(item),
             rates,
-            model_to_dict(model),
+            encode(model),
             list(map(repr, RAIN_DB)),
         ]
 

@@ -11,8 +11,9 @@ from typing import TypeVar
 import numpy as np
 
 from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.files.model_file import model_to_dict, read_model
+from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import IndexArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.degradation.degradation_study import (
@@ -211,7 +212,7 @@ class _StagedStream:
         """Return the advisories of every state of the camera, or what an earlier run found."""
         folder, model = self.hearing.folder, self.hearing.model
         mark = fingerprint(take.path, folder / "fingerprints")
-        key = [STREAM_VERSION, mark, states_told(), model_to_dict(read_model(model)), self.seed]
+        key = [STREAM_VERSION, mark, states_told(), encode(read_model(model)), self.seed]
 
         def make() -> dict[str, HopTable]:
             return {"advised": staged_advisories(take.path, model, self.seed)}

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.adapters.files.model_file import Model, model_to_dict
+from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.commissioning.stream_exam import approaches
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import StreamApproach
 from worldstate.operations.recordings.hop_table import HopTable
@@ -68,7 +69,7 @@ def believed_stream(path: Path, model: Model, cache: Path | None) -> BelievedStr
     if cache is None:
         return with_chances(HeardStream.load(path), follow()[_CHANCES])
     # The filter's own code is no part of the name: after a change of it another folder is due.
-    marks = [content_hash(path), model_to_dict(model)]
+    marks = [content_hash(path), encode(model)]
     return with_chances(HeardStream.load(path), PassCache(cache).tables(_CHANCES, marks, follow)[_CHANCES])
 
 

@@ -20,7 +20,7 @@ from sklearn.metrics import roc_auc_score
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.files.model_file import load_model
+from worldstate.adapters.files.model_file import read_model
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
@@ -124,7 +124,8 @@ def last_second(sound: Sound, array: MicrophoneArray, scene: Scene, gate: str) -
     """
     nfft = 512 if scene.rate_hz > 30_000 else 256
     settings = FrontEndSettings(nfft=nfft, ego_noise=EgoNoiseSettings())
-    model, policies = load_model(None)
+    read = read_model(None)
+    model, policies = read.signature, read.policies
     assert isinstance(model, EnsembleModel)
     signature = SiteSignature(model, SiteEstimateSettings())
     adapter = AcousticAdapter(array, scene.rate_hz, signature, front_end_settings=settings, uncalibrated=True)

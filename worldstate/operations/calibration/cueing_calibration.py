@@ -152,8 +152,9 @@ class CueingCalibration:
 
     Examples
     --------
-    >>> from worldstate.adapters.files.model_file import load_model
-    >>> found = CueingCalibration(load_model()[1], (), 0.5, 18_000, 3, 180, 1.1, "kept", ("too few hours",))
+    >>> from worldstate.adapters.files.model_file import read_model
+    >>> shipped = read_model().policies
+    >>> found = CueingCalibration(shipped, (), 0.5, 18_000, 3, 180, 1.1, "kept", ("too few hours",))
     >>> found.policies.for_alpha(0.02).alpha, found.warnings
     (0.02, ('too few hours',))
     """
@@ -202,8 +203,8 @@ def calibrate_cueing(
     --------
     Ten hazard-free recordings of a minute, made up:
 
-    >>> from worldstate.adapters.files.model_file import load_model
-    >>> rng, kept = np.random.default_rng(0), load_model()[1]
+    >>> from worldstate.adapters.files.model_file import read_model
+    >>> rng, kept = np.random.default_rng(0), read_model().policies
     >>> quiet = [
     ...     HopTable({"time_s": 0.1 * np.arange(600), "log_likelihoods": rng.normal(0.0, 1.0, (600, 4))})
     ...     for i in range(10)
