@@ -19,7 +19,7 @@ class AcousticFrame:
 
     .. math:: \hat\theta = \arg\max_\theta P(\theta), \qquad \rho = P(\hat\theta) / \mathrm{median}_\theta P
 
-    with the bearing, its prominence rho, and the SRP-PHAT spectrum P of the last `bearing_hops` hops.
+    with the bearing, its prominence rho, and the SRP-PHAT spectrum P of the last two hops.
 
     Parameters
     ----------

@@ -17,8 +17,8 @@ vehicle.
 
 The accuracy is limited by the randomness of the sound itself, which no number of microphones averages out: n
 energies over T seconds, each of scatter s = (bandwidth x interval)^(-1/2), give TTA with a relative error of
-about (s / 2) (TTA / T + 1/2) sqrt(12 / n). Noise from 0.3 to 20 kHz, 1 to 3 s away, scattered by 4.0 % when
-read from one second and by 1.5 % when read from two: `FrontEndSettings.looming_hops` is that choice.
+about (s / 2) (TTA / T + 1/2) sqrt(12 / n). Noise from 0.3 to 20 kHz, 1 to 3 s away, scatters by 4.0 % when
+read from one second, as a stream does, and by 1.5 % when read from two.
 
 References
 ----------
