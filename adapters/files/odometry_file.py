@@ -83,8 +83,8 @@ def read_odometry(path: Path | str) -> OdometryLog:
     name, told = Path(path), []
     for line, row in read_rows(name, ("time_s", "speed_mps"), ("yaw_rate_rad_s", "x_m", "y_m", "yaw_rad")):
         known = {column: number(name, line, row, column) for column in row}
-        stamp_ns = nanoseconds(known.pop("time_s"))
         with refused_as_file(name, f"line {line}: "):
+            stamp_ns = nanoseconds(known.pop("time_s"))
             told.append(OdometryRecord(**known).at(stamp_ns))
     with refused_as_file(name):
         return OdometryLog(tuple(told))

@@ -212,6 +212,12 @@ def test_the_128_likeliest_are_kept_and_what_is_only_heard() -> None:
     assert state.delivery.tracks_left_out > 50
     chances = [one.existence_probability for one in state.entities if one.id != hidden.id]
     assert min(chances) > 0.25  # Claims begin at .1
+    # Counted since the filter began, also where the belief begins anew.
+    last = crowded(1, ())
+    anew = [
+        world := world.update(replace(last, stamp_ns=last.stamp_ns - at)) for at in (2 * HOUR_NS, HOUR_NS)
+    ][-1]
+    assert anew.state.delivery == replace(state.delivery, too_late=1, reanchored=1)
 
 
 def test_sources_and_sensors_unheard_for_an_hour_are_forgotten() -> None:

@@ -221,6 +221,7 @@ class WorldFilter:
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery
         fresh = first_memory(self.context, measurement.stamp_ns)
+        fresh = replace(fresh, tracks_left_out=self._memory.tracks_left_out)
         counted = replace(delivery, reanchored=delivery.reanchored + 1)
         world = replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=FixedLag(fresh, (), counted))
         return world.update(measurement)

@@ -122,7 +122,10 @@ def nanoseconds(time_s: float) -> int:
     >>> nanoseconds(1.5)
     1500000000
     """
-    return round(time_s * NANOSECONDS_PER_SECOND)
+    time_ns = time_s * NANOSECONDS_PER_SECOND
+    if not abs(time_ns) < 1 << 63:  # Of NaN, too
+        raise InvalidArgumentError(f"time: expected nanoseconds of 64 bits, got {time_s:g} s")
+    return round(time_ns)
 
 
 def integer_ns(name: str, value: object) -> int:
