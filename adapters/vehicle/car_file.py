@@ -60,18 +60,8 @@ class Mounting:
     def rotation(self) -> FloatArray:
         """From the sensor's axes to those of `base_link`, shape (3, 3)."""
         yaw, pitch, roll = (math.radians(one) for one in (self.yaw_deg, self.pitch_deg, self.roll_deg))
-        about_z = [[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
-        upwards = [
-            [math.cos(pitch), 0.0, -math.sin(pitch)],
-            [0.0, 1.0, 0.0],
-            [math.sin(pitch), 0.0, math.cos(pitch)],
-        ]
-        about_x = [
-            [1.0, 0.0, 0.0],
-            [0.0, math.cos(roll), -math.sin(roll)],
-            [0.0, math.sin(roll), math.cos(roll)],
-        ]
-        return np.asarray(np.array(about_z) @ np.array(upwards) @ np.array(about_x))
+        about_z, upwards, about_x = _turn(0, 1, yaw), _turn(0, 2, pitch), _turn(1, 2, roll)
+        return np.asarray(about_z @ upwards @ about_x)
 
     def applied(self, points_m: ArrayLike) -> FloatArray:
         """Return points of the sensor, shape (n, 3), in `base_link`."""
@@ -217,13 +207,11 @@ def write_aligned(
     car = read_car(path)
     if car.camera(camera) is None:
         raise InputFileError(path, "expected a camera to align, it has none")
-    with refused_as_file(path):
-        record = decode(_CarFile, read_json(path, "a car file"), "car")
+    document: Any = read_json(path, "a car file")
     here, there = Path(path).absolute().parent, Path(out).absolute().parent
-    file = None if record.array is None else record.array.file
+    file = (document.get("array") or {}).get("file")
     if file is not None and here != there and not Path(file).is_absolute():
         raise InputFileError(out, f"expected a file in {here}, where {file} is")
-    document: Any = read_json(path, "a car file")
     one = next(each for each in document["cameras"] if camera is None or each["name"] == camera)
     one["stamp_offset_s"] = round((one.get("stamp_offset_s") or 0.0) + offset_s, 4)
     one["yaw_deg"] = round((one.get("yaw_deg") or 0.0) + yaw_deg, 3)
@@ -337,6 +325,14 @@ class _CarFile:
             measurements={name: folder / file for name, file in self.measurements.items()},
             crossing_m=in_range("car.crossing_m", self.crossing_m, 1.0, 100.0),
         )
+
+
+def _turn(first: int, second: int, angle_rad: float) -> FloatArray:
+    """Return the rotation of one axis towards another."""
+    turn, cosine, sine = np.eye(3), math.cos(angle_rad), math.sin(angle_rad)
+    turn[[first, second], [first, second]] = cosine
+    turn[first, second], turn[second, first] = -sine, sine
+    return turn
 
 
 def _beside(folder: Path, file: str | None) -> Path | None:
