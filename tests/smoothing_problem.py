@@ -7,6 +7,7 @@ import numpy as np
 
 from worldstate.belief.kinematics import motion
 from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.ground import wrap_angle
 from worldstate.measurement import Approach, Bearing
 from worldstate.smoothing import AngularHeight, FixedLagSmoother, Range, SmoothingSettings
 
@@ -31,7 +32,7 @@ def heard_then_seen(rng: np.random.Generator) -> Problem:
     for hop in range(HOPS):
         hidden = hop < HIDDEN_HOPS
         std = HIDDEN_STD_RAD if hidden else SEEN_STD_RAD
-        seen = [Bearing(azimuth[hop] + rng.normal(0.0, std), std)]
+        seen = [Bearing(wrap_angle(azimuth[hop] + rng.normal(0.0, std)), std)]
         seen.append(Approach(rate[hop] + rng.normal(0.0, LOOMING_STD_HZ), LOOMING_STD_HZ))
         if not hidden:
             seen.append(Range(max(r[hop] + rng.normal(0.0, RANGE_STD_M), 1.0), RANGE_STD_M))
@@ -102,10 +103,13 @@ def crossing(hop: int, number: int, rng: np.random.Generator) -> list:
     azimuth, r = math.atan2(y, x), math.hypot(x, y)
     inverse_tta = side * y * speed / r**2
     heard = [
-        Bearing(azimuth + rng.normal(0.0, 0.07), 0.07),
+        Bearing(wrap_angle(azimuth + rng.normal(0.0, 0.07)), 0.07),
         Approach(inverse_tta + rng.normal(0.0, 0.25), 0.25),
     ]
     hidden = side * y / x > 0.6
+    if hop % 10 == 0:
+        # Without any range, one entity in some 300 ends in gtsam's "indeterminate linear system".
+        heard.append(Range(max(r + rng.normal(0.0, 2.0), 1.0), 2.0))
     if not hidden:
         heard[0] = Bearing(azimuth + rng.normal(0.0, 0.01), 0.01)
         heard.append(AngularHeight(1.5 / r * math.exp(rng.normal(0.0, 0.03)), 0.03))
