@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
-    check_outputs(arguments, "out", "keep_sound", "save_state", exported=exports.exported_files(arguments))
+    check_outputs(arguments, "out", "keep_sound", "save_state")
     given = listening.checked_sensors(arguments, [] if arguments.play is None else [arguments.play])
     with ExitStack() as opened:
         recorded = None if arguments.play is None else _source(arguments, given, arguments.play)

@@ -68,8 +68,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    files = exports.exported_files(arguments)
-    check_outputs(arguments, "out", "save_state", figures=("figure",), exported=files)
+    check_outputs(arguments, "out", "save_state", figures=("figure",))
     given = listening.checked_sensors(arguments, arguments.input if inputs.bag_of(arguments) is None else [])
     return _heard(arguments, given)
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from worldstate.adapters.files.atomic import write_text
 from worldstate.ground.errors import InputFileError
 
+from .exports import exported_files
+
 _SINCE_1970_S = 1e9
 
 
@@ -59,13 +61,8 @@ def _readable(value: object) -> str:
     return str(value)
 
 
-def check_outputs(
-    arguments: argparse.Namespace,
-    *options: str,
-    figures: tuple[str, ...] = (),
-    exported: Mapping[str, Path] | None = None,
-) -> None:
-    """Refuse output files that cannot be written, that replace an input, or that are one and the same.
+def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[str, ...] = ()) -> None:
+    """Refuse outputs, those of --export too, that cannot be written, replace an input or are one file.
 
     Examples
     --------
@@ -80,7 +77,7 @@ def check_outputs(
 
     given = vars(arguments)
     outputs = {name: given[name] for name in (*options, *figures) if given[name] is not None}
-    outputs |= exported or {}
+    outputs |= exported_files(arguments) if "export" in given else {}
     lists = [
         value if isinstance(value, list) else [value] for name, value in given.items() if name not in outputs
     ]

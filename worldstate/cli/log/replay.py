@@ -7,7 +7,7 @@ an MCAP file or a bag that `worldstate run` wrote holds the same bytes as the --
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.exports import CROSSING_M, add_output_options, exported_files, open_exports
+from worldstate.cli.common.exports import CROSSING_M, add_output_options, open_exports
 from worldstate.cli.common.output import CommandResult, check_outputs
 
 EXAMPLE = """\
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.ground.values import seconds
     from worldstate.operations.recordings.warning import WarningMeter
 
-    check_outputs(arguments, "out", exported=exported_files(arguments))
+    check_outputs(arguments, "out")
     crossing_m = in_range("--crossing", arguments.crossing, 1.0, 100.0)
     meter = WarningMeter(t0_s=None)
     with (
