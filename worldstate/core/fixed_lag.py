@@ -60,23 +60,27 @@ class FixedLag:
         """Return the buffer with one more measurement; None where all have been too late for a second.
 
         A stamp that is ahead of `now_ns`, the time that the belief was predicted to, by more than the lag is
-        held back. It is confirmed by one that is ahead, too, and as near to it as it is to all others.
+        held back, and taken with the next one that is ahead of all others, too, and about as far.
         """
-        stamp_ns, held, latest_ns = measurement.stamp_ns, self.held, self.latest.stamp_ns
+        stamp_ns, held = measurement.stamp_ns, self.held
         key = (stamp_ns, measurement.source)
         if any(key == one.key for one in self.arrivals) or (held and key == (held.stamp_ns, held.source)):
             return self.counted(repeated=1)
-        if stamp_ns < max(latest_ns - LAG_NS, self.base.stamp_ns):
+        if stamp_ns < max(self.latest.stamp_ns - LAG_NS, self.base.stamp_ns):
             return self._too_late(stamp_ns)
-        if not self._is_ahead(stamp_ns, now_ns):
-            refuted = held is not None and held.source == measurement.source
-            return replace(self, held=None if refuted else held)._taken(measurement, step)
-        if held is None or not self._is_ahead(held.stamp_ns, now_ns):
+        if held is not None and self._agree(held.stamp_ns, stamp_ns):
+            first, second = sorted((held, measurement), key=attrgetter("stamp_ns"))
+            return replace(self.counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
+        if self._is_ahead(stamp_ns, now_ns):
             return replace(self.counted(held_back=1), held=measurement)
-        if not -LAG_NS <= stamp_ns - held.stamp_ns <= max(LAG_NS, held.stamp_ns - latest_ns):
-            return replace(self.counted(held_back=1), held=measurement)
-        first, second = sorted((held, measurement), key=attrgetter("stamp_ns"))
-        return replace(self.counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
+        refuted = held is not None and held.source == measurement.source
+        return replace(self, held=None if refuted else held)._taken(measurement, step)
+
+    def _agree(self, held_ns: int, stamp_ns: int) -> bool:
+        """Tell whether two stamps are ahead of all others, and as near to each other as to these."""
+        latest_ns = self.latest.stamp_ns
+        near = -LAG_NS <= stamp_ns - held_ns <= max(LAG_NS, held_ns - latest_ns)
+        return near and self._is_ahead(held_ns, latest_ns) and self._is_ahead(stamp_ns, latest_ns)
 
     def _is_ahead(self, stamp_ns: int, now_ns: int) -> bool:
         """Tell whether a stamp is ahead of all others, and of the belief, by more than a delay explains."""
