@@ -284,7 +284,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         Parameters
         ----------
         none_probability : float
-            `WorldFilter.explanation.none`, in [0, 1].
+            The third of `WorldFilter.belief.hypotheses`, in [0, 1].
 
         Raises
         ------

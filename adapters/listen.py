@@ -138,7 +138,7 @@ def listen_steps(source: Source) -> Iterator[Step]:
     world, signature, reader = source.world(), source.signature(), source.reader()
     # What the belief to go on from has taken in already, or what was told before it began, is left out.
     waiting = Waiting(source.others, source.start_ns - 1 if source.before is None else world.stamp_ns)
-    measured = measure_steps(source, lambda: world.explanation.none, signature, reader)
+    measured = measure_steps(source, lambda: world.belief.hypotheses[2], signature, reader)
     for frame, measurement in measured:
         running = () if source.told is None else source.told(measurement.stamp_ns)
         for other in chain(waiting.until(measurement.stamp_ns), running):

@@ -33,9 +33,14 @@ _COMING = len(COMING_S)
 # A vehicle comes with none in view or behind another: of the sequence's groups each coming one is two states
 # here. Taken as one, every second of an empty view would count against a vehicle that comes.
 STATES = (*GROUPS[:_COMING], *(f"{group}_behind" for group in GROUPS[:_COMING]), *GROUPS[_COMING:])
-_SEEN = STATES.index("seen")
+SEEN = STATES.index("seen")
 COMES = np.array([state.startswith("coming") for state in STATES])
-IN_VIEW = np.array([state == "seen" or state.endswith("_behind") for state in STATES])
+BEHIND = np.array([state.endswith("_behind") for state in STATES])
+IN_VIEW = BEHIND | (np.arange(len(STATES)) == SEEN)
+# States of a vehicle that follows one just come into view: gaps of up to eight seconds, alike.
+FOLLOWS = np.concatenate(
+    [np.zeros(_COMING), np.diff((0.0, *COMING_S)) / COMING_S[-1], np.zeros(len(STATES) - 2 * _COMING)]
+)
 # Mean seconds in a state before another one follows: passages, and births of .004 a hop.
 _PASSED_S = 3.0
 _FOLLOWS_S = {
@@ -124,8 +129,8 @@ def _rates_hz(prior: tuple[float, ...]) -> FloatArray:
     """Return Q, 1/s, from the chain of one hop that is nearest to the countdown."""
     hop, share = np.eye(len(STATES)), states_of(np.array(prior), np.array(prior))
     spans_s = np.diff((0.0, *COMING_S))
-    arrows = {(k, k - 1 if k else _SEEN): span for k, span in enumerate(spans_s)}
-    arrows |= {(_COMING + k, _COMING + k - 1 if k else _SEEN): span for k, span in enumerate(spans_s)}
+    arrows = {(k, k - 1 if k else SEEN): span for k, span in enumerate(spans_s)}
+    arrows |= {(_COMING + k, _COMING + k - 1 if k else SEEN): span for k, span in enumerate(spans_s)}
     arrows |= {(STATES.index(one), STATES.index(to)): mean_s for (one, to), mean_s in _FOLLOWS_S.items()}
     for (one, to), mean_s in arrows.items():
         hop[one, [one, to]] += [-HOP_S / mean_s, HOP_S / mean_s]

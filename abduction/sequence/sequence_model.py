@@ -173,32 +173,37 @@ class SequenceAlarm:
     def over(
         self, log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
     ) -> BoolArray:
-        """Return which sides are named by their mean log-odds, shapes as in `named_sides`."""
-        return (log_odds >= self.threshold_nats) & named_sides(log_odds, groups, learned_nats)
+        """Return which sides are in alarm by their mean log-odds, shapes as in `deciding`."""
+        return self.deciding(log_odds, groups, learned_nats) >= self.threshold_nats
 
+    def deciding(
+        self, log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
+    ) -> FloatArray:
+        r"""Return what is held against the threshold, nats.
 
-def named_sides(
-    log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
-) -> BoolArray:
-    r"""Return which sides an alarm may name: the likelier one; the other one if a vehicle comes there, too.
+        The log-odds, and of the less likely side at most
 
-    Where it is not known from which side one vehicle comes, both are likely; that two come is told by how
-    rarely the other one is believed to come alone: beside the likelier side one is named where
+        .. math:: \gamma + \log \frac{P(\text{comes here})}{P(\text{comes on the other side, not here})}
 
-    .. math:: P(\text{comes here}) > P(\text{comes on the other side, not here}).
+        Where it is not known from which side one vehicle comes, both are likely; that two come is told by how
+        rarely the other one is believed to come alone.
 
-    Shapes: log_odds (n, 2), groups (n, 2, groups).
+        Shapes: log_odds (..., 2), groups (..., 2, groups), learned_nats (2,): what was learned of the traffic
+        of a side, which `groups` hold and `log_odds` do not.
 
-    Examples
-    --------
-    >>> either = np.zeros((1, 2, len(GROUPS)))
-    >>> either[..., [3, GROUPS.index("other")]] = 0.45, 0.45
-    >>> named_sides(np.array([[0.1, 0.0]]), either).tolist()
-    [[True, False]]
-    """
-    here, elsewhere = groups[..., : len(COMING_S)].sum(axis=-1), groups[..., _OTHER]
-    likelier = log_odds >= log_odds.max(axis=-1, keepdims=True)
-    return np.asarray(likelier | (here > np.exp(learned_nats) * elsewhere))
+        Examples
+        --------
+        >>> either = np.zeros((1, 2, len(GROUPS)))
+        >>> either[..., [3, GROUPS.index("other")]] = 0.45, 0.45
+        >>> SequenceAlarm(-1.0, 30.0).deciding(np.array([[0.1, 0.0]]), either).round(3).tolist()
+        [[0.1, -1.0]]
+        """
+        here, elsewhere = groups[..., : len(COMING_S)].sum(axis=-1), groups[..., _OTHER]
+        apart = np.log(np.maximum(here, _SMALLEST)) - np.log(np.maximum(elsewhere, _SMALLEST)) - learned_nats
+        likelier = log_odds >= log_odds.max(axis=-1, keepdims=True)
+        # One that is exactly as likely alone as here is not named.
+        least = self.threshold_nats + np.where(apart > 0.0, apart, np.minimum(apart, -_SMALLEST))
+        return np.asarray(np.where(likelier, log_odds, np.minimum(log_odds, least)))
 
 
 def soon_log_odds(posterior: SequencePosterior) -> FloatArray:

@@ -32,13 +32,13 @@ def hidden(measurements):
     world = WorldFilter(context=STILL)
     for measurement in measurements:
         world = world.update(measurement)
-    return np.array([*world.explanation.hidden, world.explanation.visible, world.explanation.none])
+    return np.array([*world.belief.hidden, world.belief.hypotheses[1], world.belief.hypotheses[2]])
 
 
 def counted(times, signature):
     """The posterior by hand: the prior times the likelihood, so many times."""
-    start = WorldFilter(context=STILL).explanation
-    log = np.log([*start.hidden, start.visible, start.none])
+    start = WorldFilter(context=STILL).belief
+    log = np.log([*start.hidden, *start.hypotheses[1:]])
     for _ in range(times):
         log = np.array(abduce(log, signature, UNASKED).log_probabilities)
     return np.exp(log)
@@ -75,12 +75,12 @@ def test_it_keeps_one_window_and_no_more():
     world = WorldFilter(context=STILL)
     for hop in range(200):
         world = world.update(heard(1.0 + hop / 10, signature))
-    assert len(world._memory.lag.beliefs) == 11
+    assert len(world._memory.windows.past) == 11
 
 
 def test_a_loud_second_is_believed_at_once():
     loud = SignatureEvidence(("left", "right"), (4.0, 0.0), 0.0, 0.0)
     quiet = replace(loud, hidden=(-4.0, -4.0))
     first = WorldFilter().update(heard(1.0, quiet))
-    assert first.explanation.hidden_total < 0.05
-    assert first.update(heard(1.1, loud)).explanation.hidden_total > 0.7
+    assert first.belief.hypotheses[0] < 0.05
+    assert first.update(heard(1.1, loud)).belief.hypotheses[0] > 0.7

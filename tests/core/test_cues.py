@@ -86,7 +86,7 @@ def test_what_evidence_adds_to_a_sequence_adds_up_to_what_is_believed(seed: int,
             assert cue.evidence is not None and cue.evidence.hypothesis == "coming"
             terms = cue.evidence.terms_nats
             assert sum(terms.values()) == pytest.approx(math.log(soon / (1.0 - soon)), abs=1e-9)
-            assert list(terms)[:2] == ["prior", "sequence"] and terms["emerged"] <= 0.0
+            assert list(terms)[:2] == ["prior", "sequence"]
             assert cue.within is not None and cue.within["3"] == pytest.approx(soon)
 
 
@@ -110,7 +110,7 @@ def test_what_evidence_adds_to_the_rule_adds_up_to_the_statistic(seed: int) -> N
             odds = math.log(cue.statistic / (1.0 - cue.statistic))
             assert cue.evidence is not None and cue.evidence.hypothesis == "hidden"
             assert sum(cue.evidence.terms_nats.values()) == pytest.approx(odds, abs=1e-9)
-            assert cue.evidence.compared_nats == pytest.approx(odds, abs=1e-9)
+            assert cue.evidence.compared_nats <= odds + 1e-9
             assert cue.evidence.threshold_nats == pytest.approx(math.log(9.0))  # gamma .9
             assert (cue.evidence.terms_nats["look"] == 0.0) == isinstance(_last(world), Unqueried)
 
@@ -295,7 +295,7 @@ def test_two_of_which_each_is_found_stay_two() -> None:
     assert len(world.state.entities) == 2
 
 
-def test_halves_of_one_vehicle_heard_on_both_sides_become_one_when_it_comes_into_view() -> None:
+def test_one_vehicle_heard_on_both_sides_is_one_when_it_comes_into_view() -> None:
     told: list[Event] = []
     both, none = (SignatureEvidence(("left", "right"), (one, one), 0.0, 0.0) for one in (4.0, -4.0))
     world = WorldFilter(settings=FilterSettings(birth_probability=0.3))
@@ -306,9 +306,10 @@ def test_halves_of_one_vehicle_heard_on_both_sides_become_one_when_it_comes_into
             Measurement(hop * 10**8, both if hop < 30 else none, answer, SILENT, SILENT, seen)
         )
         told += world.state.events
-    (merged,) = (one for one in told if one.kind == "merged")
-    assert merged.into == next(one.entity_id for one in told if one.kind == "handed_over")
-    assert [one.id for one in world.state.entities] == [merged.into]
+    (found,) = (one for one in told if one.kind == "handed_over")
+    assert [one.id for one in world.state.entities] == [found.entity_id]
+    (died,) = (one for one in told if one.kind == "died")
+    assert died.stamp_ns - found.stamp_ns <= 3 * 10**8
 
 
 def test_a_relation_says_since_when_it_holds_and_until_when_it_did() -> None:

@@ -108,10 +108,10 @@ def test_beacons_and_sound_share_one_filter(v2x):
         return world
 
     both = heard([*radio, *sound])
-    assert both.explanation.hidden[0] > max(heard(w).explanation.hidden[0] for w in (radio, sound))
+    assert both.belief.hidden[0] > max(heard(w).belief.hidden[0] for w in (radio, sound))
     (entity,) = both.state.entities
     assert set(entity.sources) <= {"acoustic", "v2x"}
-    assert {source for source, _ in both.memory.last_ns} == {"acoustic", "v2x"}
+    assert {rule.source for rule in both.memory.rules} == {"acoustic", "v2x"}
 
 
 @pytest.mark.parametrize("example", ["v2x_beacon.py", "own_loop.py"])

@@ -11,11 +11,11 @@ import numpy as np
 from worldstate.abduction.road_users import ClassShares
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, predict_place
 from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief, predict, relax
-from worldstate.ground.serialisation import ADDED, FLAT, Count, Keys, Probability
+from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 
-from .explanation import HiddenBelief
 from .settings import FilterSettings
+from .side_belief import SideBelief
 from .site_geometry import SiteGeometry
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
@@ -59,9 +59,9 @@ class Track:
     approach_heard: bool = False  # Whether its approach rate was ever measured
     # Whether it was ever heard before it was seen, or lost from view and heard again.
     was_hidden: bool = False
-    place: CartesianBelief | None = field(default=None, metadata=ADDED)  # Then `motion` follows from it
-    behind: Probability = field(default=1.0, metadata=ADDED)  # P(behind its side's occluder), by that place
-    width_rad: float = field(default=0.0, metadata=ADDED)  # Of its last box
+    place: CartesianBelief | None = None  # Then `motion` follows from it
+    behind: Probability = 1.0  # P(behind its side's occluder), by that place
+    width_rad: float = 0.0  # Of its last box
 
     @property
     def detected(self) -> bool:
@@ -200,7 +200,7 @@ def relabelled(
     return tuple(sorted((label, round(p, 12)) for label, p in kept.items() if p > 1e-3))
 
 
-def hidden_share(track: Track, sides: HiddenBelief) -> float:
+def hidden_share(track: Track, sides: SideBelief) -> float:
     """Return P(hidden | exists) of a track, 0 once it was seen."""
     if track.seen:
         return 0.0

@@ -39,7 +39,7 @@ def acoustic_update(
     if weight <= 0.0 or silent or not at:
         return memory
     updated, tracks, sides = list(memory.tracks), [memory.tracks[i] for i in at], memory.sides
-    visible = memory.explanation.visible
+    visible = sides.hypotheses[1]
     # P(this entity is the source of this window's sound)
     sounding = [visible * one.existence if one.seen else sides.existence(one.side) for one in tracks]
     motion = MotionBelief.stacked([track.motion for track in tracks])

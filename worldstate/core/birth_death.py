@@ -7,11 +7,11 @@ from operator import itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.association import Association
-from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import Track, entity_id, heard_as, hidden_share
+from worldstate.belief.track import Track, entity_id, heard_as
+from worldstate.belief.window_belief import ExplanationBelief
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Event
@@ -46,7 +46,8 @@ def birth_death(
         rearmed = before_ns is None or memory.stamp_ns - before_ns > rearm_ns
         if rearmed and (sides.hidden[k] >= settings.birth_probability or alarmed[k]):
             # What came into view from here before was another vehicle: the new one starts without its mass.
-            memory = memory.explained(partial(ExplanationBelief.forget_origin, direction=k))
+            forget = partial(ExplanationBelief.forget_origin, direction=k)
+            memory = replace(memory, windows=memory.windows and memory.windows.map(forget))
             returning = _returning(kept, k, measurement.stamp_ns, site)
             if returning is None:
                 kept.append(_born(k, counts[k], min(sides.hidden[k], 1.0), measurement, site))
@@ -150,8 +151,6 @@ def _born(k: int, number: int, existence: float, measurement: Measurement, site:
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.
 MOST_EVENTS = 64
-# A window of sound, and the second for which an advisory holds an entity that is no longer heard.
-_HALF_NS = nanoseconds(2.0)
 HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 
 
@@ -172,19 +171,6 @@ def events_between(
     return tuple(events)[:MOST_EVENTS]
 
 
-def halves_of_one(before: Memory, after: Memory) -> dict[str, str]:
-    """Return the ids under which entities go on that were heard opposite to one that has just come into view.
-
-    Within two seconds of that they have ended, or sound as if they were in view.
-    """
-    still = {one.id for one in after.tracks if one.detected or hidden_share(one, after.sides) >= HIDDEN}
-    halves = [one for one in before.tracks if not one.detected and one.id not in still]
-    sides = {k for k, ns in enumerate(after.handover_ns) if ns and after.stamp_ns - ns <= _HALF_NS}
-    seen = [one for one in after.tracks if one.seen and one.was_hidden]
-    latest = max(seen, key=lambda one: one.last_seen_ns or 0, default=None)
-    return {} if latest is None else {one.id: latest.id for one in halves if sides - {one.side}}
-
-
 def _became(before: Track, after: Track | None) -> EventKind | None:
     if after is None:
         return "died"
@@ -199,9 +185,6 @@ def after_look(
     """Return the memory with the tracks after a look: those of before in their order, then the new ones."""
     before, settings = memory.tracks, site.settings
     handed_over = whose.handed_over(before, tracks[: len(before)], settings)
-    explanation = memory.explanation
-    for side, residual in handed_over.items():
-        explanation = explanation.emerge(side, residual)
     # First seen near an edge, it came past it unheard.
     unheard = {
         track.side
@@ -209,27 +192,35 @@ def after_look(
         if track.seen and track.moving
         if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * settings.edge_std_rad
     }
-    memory = replace(memory, tracks=surviving(tracks, settings), explanation=explanation)
-    return past_edges(memory, handed_over, {*handed_over, *unheard}, stamp_ns)
+    memory = replace(memory, tracks=surviving(tracks, settings))
+    return past_edges(memory, handed_over, unheard, stamp_ns)
 
 
 def past_edges(
-    memory: Memory, handed_over: Mapping[int, float], emerged: Collection[int], stamp_ns: int
+    memory: Memory, handed_over: Mapping[int, float], unheard: Collection[int], stamp_ns: int
 ) -> Memory:
-    """Return the memory after vehicles came past the edges of some sides.
+    """Return the memory after vehicles came past the edges of some sides: the one place that tells of it.
 
-    `handed_over` is the share of P(hidden) that is left on the sides on which a vehicle was believed hidden.
+    `handed_over` is P(it was another vehicle than the one believed hidden there), by side; `unheard` are
+    sides from which one came that was not believed.
     """
-    # The lagged beliefs are what the next windows build on: they have to know of the hand-over, too.
-    lag = memory.lag
+    windows, sequence = memory.windows, memory.sequence
     for side, residual in handed_over.items():
-        lag = lag.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
+        emerge = partial(ExplanationBelief.emerge, direction=side, residual=residual)
+        windows = windows and windows.map(emerge)
+    if sequence is not None and (handed_over or unheard):
+        hidden = [one for one in memory.tracks if not one.seen]
+        # One that is still believed hidden where another came from was not what came.
+        left = {k: float(any(one.side == k for one in hidden)) for k in unheard}
+        # Vehicles of another side that were told apart before: by a message, or since they were seen.
+        apart = {one.side for one in hidden if one.detected or one.last_seen_ns is not None}
+        sequence = sequence.handed_over(left | dict(handed_over), apart, stamp_ns)
     before = enumerate(memory.handover_ns)
     return replace(
         memory,
-        lag=lag,
+        windows=windows,
         handover_ns=tuple(stamp_ns if k in handed_over else before_ns for k, before_ns in before),
-        sequence=memory.sequence and memory.sequence.emerged(emerged, stamp_ns),
+        sequence=sequence,
     )
 
 

@@ -4,76 +4,59 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-import numpy as np
-
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.belief.hidden_bearing import announced
-from worldstate.state import Advisory, EvidenceTerms, RiskCue, SensorHealth
+from worldstate.belief.side_belief import SideBelief
+from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
 
+from .advisories import (
+    MOST_NATS,
+    SideAdvisory,
+    advisories,
+    announced_advisories,
+    bounded_log_odds,
+    claimed_nats,
+    decided_log_odds,
+    heard_advisories,
+    why_none,
+)
 from .birth_death import hidden_on
-from .memory import Memory, priors_of
+from .memory import Memory
 from .sequence_memory import SequenceMemory
+from .site_model import FilterModel, published_belief
 from .snapshot_builder import hidden_azimuth, sector, time_to_arrival, visible_in
-from .step import FilterModel, advisory_ends_ns, announced_ends_ns, claimed_nats, heard_ends_ns
 
-# Certainty has no end; e^-20 is once in fifteen years of hops.
-_MOST_NATS = 20.0
 _Times = tuple[dict[str, float], tuple[float, float, float] | None]
-
-
-def hidden_risks(memory: Memory, model: FilterModel) -> tuple[float, ...]:
-    r"""Return the risk of every side.
-
-    .. math:: r_k = P(hid_k \mid y_{1:t}), \qquad r_k = g(P(hid \mid y_{1:t}))\, P(k \mid hid, y_{1:t})
-
-    with a sequence model, whose probabilities are calibrated and whose sides do not exclude each other, and
-    without one, by the map g of the policy. An announced one is hidden at least as surely as messages say.
-    """
-    told = announced(memory.tracks, model.site)
-    if memory.sequence is not None:
-        return tuple(map(max, memory.sides.hidden, told))
-    total = memory.explanation.hidden_total
-    risk = float(model.policy.risk_map(min(total, 1.0)))
-    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
-    return tuple(risk * hidden / max(total, 1e-300) for hidden in memory.explanation.hidden)
 
 
 def cues_of(memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...]) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
-    instant, explanation = memory.instant, memory.explanation
+    instant = memory.instant
     if instant is None:
         return ()
-    ends_ns = advisory_ends_ns(memory)
+    sides, told = published_belief(memory, model), advisories(memory, model)
     rested_on = tuple(one for one in sensors if one.condition != "silent")
-    advisories = [
-        None
-        if end_ns is None
-        else Advisory(memory.stamp_ns if since_ns is None else since_ns, end_ns, rested_on)
-        for since_ns, end_ns in zip(memory.advised_ns, ends_ns, strict=True)
-    ]
-    times = _times(memory.sequence, advisories)
+    times = _times(memory.sequence, [one is not None for one in told])
     evidence = _evidence(memory, model)
     # All sides together: what is taken out of arrays once.
     shared = partial(
         RiskCue,
-        statistic=instant.hidden_total,
+        statistic=instant.statistic,
         log_lambda=instant.log_lambda,
-        hypotheses=priors_of(explanation),
+        hypotheses=Priors(*sides.hypotheses),
     )
-    risks = hidden_risks(memory, model)
-    shares = np.array(risks) / max(sum(risks), 1e-300)
-    build = partial(_cue, memory, model, shared)
-    return tuple(map(build, range(len(ends_ns)), risks, shares.tolist(), advisories, times, evidence))
+    build = partial(_cue, memory, model, shared, sides, rested_on)
+    return tuple(map(build, range(len(told)), told, times, evidence))
 
 
 def _cue(
     memory: Memory,
     model: FilterModel,
     shared: Callable[..., RiskCue],
+    sides: SideBelief,
+    sensors: tuple[SensorHealth, ...],
     k: int,
-    risk: float,
-    share: float,
-    advisory: Advisory | None,
+    told: SideAdvisory | None,
     times: _Times | None,
     evidence: EvidenceTerms,
 ) -> RiskCue:
@@ -87,32 +70,39 @@ def _cue(
     arrival_s = time_to_arrival(closing_hz, motion.inverse_tta_std_hz)
     # Distance and speed of an announced vehicle tell more than the sound.
     interval_s = (track and visible_in(track, model.site)) or interval_s
+    since_ns, entity_id = memory.advised_ns[k], None if track is None else track.id
+    advisory = held = None
+    if told is not None:
+        advisory = Advisory(memory.stamp_ns if since_ns is None else since_ns, told.ends_ns, sensors)
+        held = Held(entity_id, told.ends_ns) if told.held else None
     return shared(
         direction=model.site.sides[k].label,
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
-        risk=risk,
-        confidence=share,
+        risk=sides.risks[k],
+        confidence=sides.risks[k] / max(sum(sides.risks), 1e-300),
         advisory=advisory,
         alpha=model.policy.alpha or None if evidence.hypothesis == "hidden" else None,
-        entity_id=None if track is None else track.id,
+        entity_id=entity_id,
         horizon_s=arrival_s if interval_s is None else interval_s[1],
         within=within,
         time_to_visible_s=interval_s,
         sector_rad=sector(azimuth_rad, std_rad),
         evidence=evidence,
+        held=held,
+        not_advised=None if told is not None else why_none(memory, model, k, sides),
     )
 
 
-def _times(kept: SequenceMemory | None, advisories: list[Advisory | None]) -> list[_Times | None]:
+def _times(kept: SequenceMemory | None, advised: list[bool]) -> list[_Times | None]:
     """Return the probabilities of coming into view, and the time to it where a vehicle is expected."""
     if kept is None:
-        return [None] * len(advisories)
+        return [None] * len(advised)
     posterior = kept.posterior
     within = posterior.within()[0].tolist()
     soon = posterior.groups[0, :, :STATED].sum(axis=1) > 0.5
     # The times are those of a vehicle that comes: in an empty street they would say nothing.
-    stated = [told is not None or likely for told, likely in zip(advisories, soon.tolist(), strict=True)]
+    stated = [told or likely for told, likely in zip(advised, soon.tolist(), strict=True)]
     intervals_s = posterior.time_to_visible_s()[0].tolist() if any(stated) else within
     names = [f"{end_s:g}" for end_s in HORIZONS_S]
     return [
@@ -123,11 +113,15 @@ def _times(kept: SequenceMemory | None, advisories: list[Advisory | None]) -> li
 
 def _evidence(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
     """Return what raises the advisory of each side: the sound, or messages where they alone do."""
-    heard, told_ns = _heard(memory, model), announced_ends_ns(memory)
-    if all(end_ns is None for end_ns in told_ns):
+    heard, by_messages = _heard(memory, model), announced_advisories(memory, model.policy)
+    if not any(by_messages):
         return heard
-    told, sides = _announced(memory, model), zip(heard, heard_ends_ns(memory), told_ns, strict=True)
-    return [own if heard_ns is not None or end_ns is None else told for own, heard_ns, end_ns in sides]
+    told = _announced(memory, model)
+    sides = zip(heard, heard_advisories(memory, model), by_messages, strict=True)
+    return [
+        told if by_message and (by_sound is None or by_sound.held) else own
+        for own, by_sound, by_message in sides
+    ]
 
 
 def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
@@ -135,17 +129,17 @@ def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
     kept, instant = memory.sequence, memory.instant
     assert instant is not None
     if kept is not None and kept.alarm is not None:
-        terms, means = kept.log_odds_terms(model.context), kept.mean_log_odds.tolist()
+        terms = kept.log_odds_terms(model.context)
         threshold = kept.alarm.threshold_nats
         return [
-            EvidenceTerms("coming", {name: both[k] for name, both in terms.items()}, means[k], threshold)
-            for k in range(len(means))
+            EvidenceTerms("coming", {name: both[k] for name, both in terms.items()}, decides, threshold)
+            for k, decides in enumerate(kept.decided)
         ]
     prior, threshold = _rule_log_odds(memory, model)
     looked_nats = math.inf if instant.log_lambda is None else instant.log_lambda
-    heard, looked = _bounded(memory.heard_nats), _bounded(looked_nats)
+    heard, looked = (min(max(one, -MOST_NATS), MOST_NATS) for one in (instant.heard_nats, looked_nats))
     terms_nats = {"prior": prior, "window": heard, "look": looked - heard}
-    told = EvidenceTerms("hidden", terms_nats, prior + looked, threshold)
+    told = EvidenceTerms("hidden", terms_nats, decided_log_odds(memory, model.policy), threshold)
     return [told] * len(model.site.sides)
 
 
@@ -162,14 +156,4 @@ def _announced(memory: Memory, model: FilterModel) -> EvidenceTerms:
 def _rule_log_odds(memory: Memory, model: FilterModel) -> tuple[float, float]:
     """Return the log-odds of the rule's prior and of its threshold."""
     gamma = model.policy.gamma_at(memory.threshold.shift_nats)
-    return _log_odds(sum(model.policy.reference_prior[:-2])), _log_odds(gamma)
-
-
-def _log_odds(probability: float) -> float:
-    least = math.exp(-_MOST_NATS)
-    inside = min(max(probability, least), 1.0 - least)
-    return math.log(inside) - math.log1p(-inside)
-
-
-def _bounded(nats: float) -> float:
-    return min(max(nats, -_MOST_NATS), _MOST_NATS)
+    return bounded_log_odds(sum(model.policy.reference_prior[:-2])), bounded_log_odds(gamma)

@@ -1,6 +1,5 @@
 """The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
-import math
 from collections.abc import Sequence, Sized
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,19 +8,21 @@ from typing import Any, ClassVar
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated_policy
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
+from worldstate.belief.side_belief import SideBelief
 from worldstate.core import step
 from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds
-from worldstate.ground.serialisation import ADDED, Layout, decode, encode
+from worldstate.ground.serialisation import Layout, decode, encode
 from worldstate.measurement import Measurement, Odometry, PositionScan
-from worldstate.state import Context, WorldState
+from worldstate.state import Context, Priors, WorldState
 
+from .advisories import update_advisories
 from .birth_death import published
-from .cue_builder import cues_of, hidden_risks
+from .cue_builder import cues_of
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
-from .memory import NEWS_HOLDS_NS, Memory, first_memory, priors_of
+from .memory import NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
+from .site_model import FilterModel, from_here, published_belief, site_geometry_of, without_open_sides
 from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
 from .vision_update import counting_boxes, vision_update
 
@@ -92,9 +93,9 @@ class WorldFilter:
         return self._memory.stamp_ns
 
     @property
-    def explanation(self) -> ExplanationBelief:
-        """Filtered probabilities of the explanations."""
-        return self._memory.explanation
+    def belief(self) -> SideBelief:
+        """What is believed of the sides, of which the snapshot states marginals."""
+        return published_belief(self._memory, self._model)
 
     @property
     def gamma(self) -> float:
@@ -104,14 +105,13 @@ class WorldFilter:
     @property
     def risk(self) -> float:
         """Calibrated risk of a road user hidden in any direction."""
-        risks = hidden_risks(self._memory, self._model)
-        return sum(risks) if self._memory.sequence is None else 1.0 - math.prod(1.0 - one for one in risks)
+        return self.belief.risk
 
     @cached_property
     def state(self) -> WorldState:
         """The snapshot S_t."""
         memory, settings = self._memory, self.settings
-        model = step.from_here(self._model, memory.ego)
+        model = from_here(self._model, memory.ego)
         context = model.context
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings)
         return WorldState(
@@ -119,7 +119,7 @@ class WorldFilter:
             seq=memory.seq,
             entities=entities_of(tracks, memory, model.site),
             relations=relations_at(memory, tracks, context),
-            context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
+            context=replace(context, priors=Priors(*(memory.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
             calibrated=self.policy.alpha > 0.0,
             bearing=memory.bearing,
@@ -196,7 +196,7 @@ class WorldFilter:
         # Within the slack the belief is not moved back.
         elif measurement.stamp_ns > memory.stamp_ns:
             memory = step.advance(memory, measurement.stamp_ns, self._model)
-        carried, model = memory, step.from_here(self._model, memory.ego)
+        carried, model = memory, from_here(self._model, memory.ego)
         if isinstance(measurement, Odometry):
             memory = step.update_odometry(memory, measurement)
         elif isinstance(measurement, PositionScan):
@@ -205,16 +205,16 @@ class WorldFilter:
             memory = self._perceived(memory, measurement, model)
         return step.chronicled(before, carried, _with_likeliest(memory), model)
 
-    def _perceived(self, memory: Memory, measurement: Measurement, model: step.FilterModel) -> Memory:
+    def _perceived(self, memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
         """Return the memory after a measurement with its signature, its looks and its sequence."""
-        measurement = step.where_nobody_hides(measurement, model.context)
+        measurement = without_open_sides(measurement, model.context)
         weight = step.sound_weight(memory, measurement, self.start_ns, self.settings)
         memory, measurement, looks = step.new_looks(memory, measurement, self.start_ns, self.settings)
         # Evidence first: association and births need the explanations of this very window.
         memory = step.update_evidence(memory, measurement, weight, model)
         for seen, look_weight in looks:
             memory = vision_update(memory, measurement, seen, look_weight, model.site)
-        memory = step.update_advisories(memory, measurement, model)
+        memory = update_advisories(memory, measurement, model)
         memory = step.update_sequence(memory, measurement, [seen for seen, _ in looks], model)
         return step.update_entities(memory, measurement, model)
 
@@ -275,22 +275,22 @@ class WorldFilter:
         return self.lag or FixedLag(self._memory)
 
     @cached_property
-    def _model(self) -> step.FilterModel:
-        return step.FilterModel(self.context, self.policy, step.site_geometry_of(self.context, self.settings))
+    def _model(self) -> FilterModel:
+        return FilterModel(self.context, self.policy, site_geometry_of(self.context, self.settings))
 
 
 @dataclass(frozen=True, slots=True)
 class FilterRecord:
     """All of a filter, as it is written."""
 
-    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.5.0")
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "3.0.0")
 
     context: Context
     policy: CueingPolicy
     settings: FilterSettings
     start_ns: int
     memory: Memory
-    past: LagRecord | None = field(default=None, metadata=ADDED)
+    past: LagRecord | None = None
 
     def __post_init__(self) -> None:
         self._check(self.memory)
@@ -299,14 +299,14 @@ class FilterRecord:
 
     def _check(self, memory: Memory) -> None:
         k = len(self.context.directions)
-        beliefs = [belief.log_probabilities for _, belief in memory.lag.beliefs]
+        windows = [] if memory.windows is None else [memory.windows.now, *(b for _, b in memory.windows.past)]
+        heard = () if memory.windows is None else memory.windows.heard
         lengths: dict[str, tuple[Sequence[Sized], int]] = {
-            "log_explanations": ([memory.explanation.log_probabilities, *beliefs], 2 * k + 2),
-            "trail.heard": ([heard.log_likelihoods for heard in memory.lag.heard], k + 2),
+            "windows": ([belief.log_probabilities for belief in windows], 2 * k + 2),
+            "windows.heard": ([one.log_likelihoods for one in heard], k + 2),
             "births": ([memory.births], k),
             "handover_ns": ([memory.handover_ns], k),
             "advised_ns": ([memory.advised_ns], k),
-            "instant": ([memory.instant.log_probabilities] if memory.instant else [], k + 2),
         }
         for name, (rows, length) in lengths.items():
             for row in rows:
@@ -314,10 +314,10 @@ class FilterRecord:
                     raise InvalidArgumentError(f"memory.{name}: expected {length} numbers, got {len(row)}")
         if memory.sequence is not None:
             memory.sequence.check()
-        if not beliefs:
-            raise InvalidArgumentError("memory.trail.beliefs: expected at least one")
-        if any(one.run > self.policy.sustain_hops for one in memory.rules):
-            raise InvalidArgumentError("memory.rules: expected runs within the policy's rule")
+        if len(windows) < 2 and memory.sequence is None:
+            raise InvalidArgumentError("memory.windows: expected a belief and its past, or a sequence")
+        if any(len(one.statistic) > self.policy.sustain_hops for one in memory.rules):
+            raise InvalidArgumentError("memory.rules: expected statistics of the policy's rule")
         if any(side >= k for one in memory.rules for side in one.announced):
             raise InvalidArgumentError("memory.rules: expected known sides")
         if any(track.side >= k for track in memory.tracks):

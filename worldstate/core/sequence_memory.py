@@ -1,8 +1,8 @@
 """Belief of the vehicles that come into view: the sequence's reading with looks, hand-overs and traffic."""
 
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 
@@ -11,7 +11,10 @@ import numpy as np
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
 from worldstate.abduction.sequence.sequence_chain import (
+    BEHIND,
     COMES,
+    FOLLOWS,
+    SEEN,
     STATES,
     context_prior,
     groups_of,
@@ -22,9 +25,9 @@ from worldstate.abduction.sequence.sequence_chain import (
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.belief.explanation import HiddenBelief
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, seconds
-from worldstate.ground.serialisation import ADDED, Probability
+from worldstate.belief.side_belief import SideBelief
+from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, seconds
+from worldstate.ground.serialisation import Probability
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
 
@@ -34,6 +37,9 @@ _FORGOTTEN_S = 3600.0  # Traffic changes with the hour
 # A prior slides the alarm: by +2 nats from 15 to 58 onsets an hour, by -1 to a detection of .73 for .94.
 _MOST_NATS = 0.5
 _STEP_NATS = 0.1  # The chain is computed anew for every prior: a few are enough
+# In dense traffic one in six has another one right behind; as sure of that as six arrivals would make it.
+_FOLLOWED, _FOLLOWED_SHAPE = 1.0 / 6.0, 6.0
+_RIGHT_BEHIND_NS = 8_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +49,33 @@ class ArrivalRate:
     .. math:: \lambda \mid n, T \sim \Gamma\Big(a + n,\ \frac{a}{\lambda_0} + T\Big), \qquad
               \log \frac{E \lambda}{\lambda_0} = \log \frac{a + n}{a + \lambda_0 T}
 
-    with n arrivals in a time T of watching, both forgotten slowly, and the usual rate :math:`\lambda_0`.
+    with n arrivals in a time T of watching, both forgotten slowly, and the usual rate :math:`\lambda_0`. Of
+    the arrivals f came right behind another one:
+
+    .. math:: P(\text{another one follows}) = \frac{1 + f}{6 + n}
     """
 
     count: float = 0.0
     watched_s: float = 0.0
+    followed: float = 0.0
 
     def later(self, step_s: float, watched: bool) -> "ArrivalRate":
         """Return the rate after a time, watched or not."""
-        kept = math.exp(-step_s / _FORGOTTEN_S) if watched else 1.0
-        return ArrivalRate(self.count * kept, self.watched_s * kept + (step_s if watched else 0.0))
+        if not watched:
+            return self
+        kept = math.exp(-step_s / _FORGOTTEN_S)
+        return ArrivalRate(self.count * kept, self.watched_s * kept + step_s, self.followed * kept)
+
+    def after(self, since_last_ns: float) -> "ArrivalRate":
+        """Return the rate after one more arrival, so long after the last one."""
+        return replace(
+            self, count=self.count + 1.0, followed=self.followed + (since_last_ns <= _RIGHT_BEHIND_NS)
+        )
+
+    @property
+    def follower_share(self) -> float:
+        """P(another one comes within eight seconds of one)."""
+        return (_FOLLOWED * _FOLLOWED_SHAPE + self.followed) / (_FOLLOWED_SHAPE + self.count)
 
     def shift_nats(self, usual_hz: float) -> float:
         """Return by how much the log-odds of a vehicle coming differ from usual, in steps of .1 nats.
@@ -72,12 +95,15 @@ _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 300_000_000, 1_000_000_000, 5_000_000
 # A look says what is in view then, not what will be: multiplied into the belief hop by hop, looks at one
 # vehicle outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
 _LOOK_NS = 500_000_000
-# A window and the smoothing of the alarm; then a follower counts like any other. In dense traffic one in six
-# has another one right behind.
-_EXPLAINED_NS, _FOLLOWED = 1_300_000_000, 0.2
+# A window and the smoothing of the alarm: so long the sound of a side is that of the vehicle that has just
+# come into view, and says nothing of the next one.
+_MASKED_NS = 1_300_000_000
 _IN_VIEW_S = 6.0  # Two passages: before, it is the sound that tells whether it is still there
 _OTHERS = 0.1  # Vehicles in view from no side that is listened to
-_SEEN, _PAST = GROUPS.index("seen"), GROUPS.index("past")
+_TWO = 0.5  # P(both) from which on the vehicles of two sides are two
+_OTHER, _PAST = GROUPS.index("other"), GROUPS.index("past")
+_FAR = [_PAST, GROUPS.index("rising"), GROUPS.index("falling")]
+_SEEN_GROUP = GROUPS.index("seen")
 # States of vehicles that come into view within three seconds.
 _SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range(len(STATES))])
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
@@ -88,21 +114,22 @@ _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
 class SequenceMemory:
     """Belief of both sides, and the alarm that goes by it."""
 
-    sides: SequenceBelief  # Without the looks: each tells of its own time
+    states: SequenceBelief  # Without the looks: each tells of its own time
     share: FloatArray  # shape (groups,): Prior that the model was trained at
     margin_s: float
     alarm: SequenceAlarm | None
     # Stamps of the last .3 s with the log-odds of coming into view within three seconds, left and right.
     recent: tuple[tuple[int, float, float], ...] = ()
-    over_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When each side was last above the threshold
+    # What was last held against the threshold, nats, and when each side was last above it.
+    decided: tuple[float, ...] = (-math.log(1e9),) * len(SIDES)
+    over_ns: tuple[int | None, ...] = (None,) * len(SIDES)
     looks: tuple[Look, ...] = ()  # The last one of each sensor, for as long as it holds
-    emerged_ns: tuple[int | None, ...] = (None,) * len(
-        SIDES
-    )  # When a vehicle last came into view from a side
+    # When a vehicle last came into view from a side.
+    emerged_ns: tuple[int | None, ...] = (None,) * len(SIDES)
     # P(a vehicle has come into view from a side and no look has told), where no camera looks or none sees.
-    unseen: tuple[Probability, ...] = field(default=(0.0,) * len(SIDES), metadata=ADDED)
+    unseen: tuple[Probability, ...] = (0.0,) * len(SIDES)
     # How often a vehicle has come into view past the edge of each side, while a camera looked.
-    arrivals: tuple[ArrivalRate, ...] = field(default=(ArrivalRate(),) * len(SIDES), metadata=ADDED)
+    arrivals: tuple[ArrivalRate, ...] = (ArrivalRate(),) * len(SIDES)
     stamp_ns: int = 0
 
     def check(self) -> None:
@@ -110,43 +137,131 @@ class SequenceMemory:
         groups, sides = (len(GROUPS),), (len(SIDES), len(STATES))
         for name, array, shape in (
             ("share", self.share, groups),
-            ("belief", self.sides.belief, sides),
-            ("alone", self.sides.alone, sides),
+            ("belief", self.states.belief, sides),
+            ("alone", self.states.alone, sides),
         ):
             finite_array(f"memory.sequence.{name}", array, shape)
             if (array < 0.0).any() or not np.allclose(array.sum(axis=-1), 1.0, atol=1e-3):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected probabilities")
-        for name in ("over_ns", "emerged_ns", "unseen", "arrivals"):
+        for name in ("decided", "over_ns", "emerged_ns", "unseen", "arrivals"):
             if (got := len(getattr(self, name))) != len(SIDES):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected {len(SIDES)}, got {got}")
 
     @cached_property
+    def weighed(self) -> FloatArray:
+        """Probabilities of the states of both sides, looks included, shape (2, states)."""
+        told = sum(self._told.values(), np.zeros(len(STATES)))
+        weighed = self.states.belief * np.exp(told - told.max())
+        return np.asarray(weighed / weighed.sum(axis=1, keepdims=True))
+
+    @cached_property
     def posterior(self) -> SequencePosterior:
         """The belief, as one hop of a stream."""
-        told = sum(self._told.values(), np.zeros(len(STATES)))
-        weighed = self.sides.belief * np.exp(told - told.max())
-        return SequencePosterior(groups_of(weighed / weighed.sum(axis=1, keepdims=True))[None], self.margin_s)
+        return SequencePosterior(groups_of(self.weighed)[None], self.margin_s)
 
     @cached_property
     def _told(self) -> dict[str, FloatArray]:
-        """Log-likelihoods of everything but the sound, in the order of their names, each (2, states)."""
-        looks = ((f"look {look.sensor}", look_log_likelihoods(look.answer)) for look in self.looks)
-        told = {name: np.stack([nats] * len(SIDES)) for name, nats in looks}
-        return told | {"emerged": self._explained()[:, None] * COMES}
+        """Log-likelihoods of the looks, in the order of their sensors, each (states,)."""
+        return {f"look {look.sensor}": look_log_likelihoods(look.answer) for look in self.looks}
 
     @property
     def coming(self) -> FloatArray:
         """Probabilities of the groups of `COMING_S`, shape (2, 9)."""
         return self.posterior.groups[0, :, : len(COMING_S)]
 
-    def emerged(self, sides: Collection[int], stamp_ns: int) -> "SequenceMemory":
-        """Return the memory after a vehicle came into view past the edge of some sides."""
-        known = (stamp_ns if side in sides else ns for side, ns in enumerate(self.emerged_ns))
-        unseen = (0.0 if side in sides else chance for side, chance in enumerate(self.unseen))
-        arrivals = tuple(
-            replace(rate, count=rate.count + (side in sides)) for side, rate in enumerate(self.arrivals)
+    @cached_property
+    def comes(self) -> FloatArray:
+        """P(a vehicle comes into view within eight seconds), shape (2,)."""
+        return np.asarray(np.minimum(self.coming.sum(axis=1), 1.0))
+
+    @cached_property
+    def none_comes(self) -> float:
+        r"""P(no vehicle comes into view on either side).
+
+        The reading of a side tells how likely only the other one is that of a vehicle, so that each gives
+
+        .. math:: P(\bar C_k, \bar C_j) = 1 - P(C_k) - P(C_j, \bar C_k), \qquad
+                  P(C_j, \bar C_k) = q_k(other) + P(C_j, V)\, P(\bar C_k \mid V)
+
+        with V one in view, of which that reading does not tell; their mean, within what the two allow.
+        """
+        groups, comes = self.posterior.groups[0], self.comes
+        in_view = self.weighed[:, BEHIND].sum(axis=1)
+        seen = groups[:, _SEEN_GROUP]
+        beside = in_view[::-1] * seen / np.maximum(seen + in_view, _LEAST_WEIGHT)
+        none = float((1.0 - comes - groups[:, _OTHER] - beside).mean())
+        return min(max(none, 1.0 - float(comes.sum()), 0.0), 1.0 - float(comes.max()))
+
+    @cached_property
+    def sides(self) -> SideBelief:
+        """What the states say of the sides and of the explanations.
+
+        Hidden is a vehicle that comes into view, or one that is heard and not in view. What sounds in view,
+        or as if it had left the view into the other side, is one that may have come into view unseen, or a
+        vehicle of which nothing is known. As few as explain it: one that may have come from either side is
+        one, of the likelier side, and two only as far as both chances exceed one; so is a far one.
+        """
+        groups, comes, none = self.posterior.groups[0], self.comes, self.none_comes
+        unseen = _as_few(np.array(self.unseen))
+        there = groups[:, _SEEN_GROUP] + groups[::-1, _PAST]
+        # P(this one | a vehicle is there), each of them with a chance of its own.
+        present = 1.0 - (1.0 - unseen).prod() * (1.0 - _OTHERS)
+        emerged = np.minimum(there * unseen / present, 1.0 - comes)
+        # Given that none comes, here or only there.
+        rest = np.maximum(1.0 - comes - groups[:, _OTHER], _LEAST_WEIGHT)
+        far = min(float((groups[:, _FAR].sum(axis=1) / rest).max()), 1.0)
+        seen = min(float((groups[:, _SEEN_GROUP] / rest).mean()), 1.0 - far)
+        hypotheses = (1.0 - none * (1.0 - far), none * seen, none * (1.0 - far - seen))
+        told = tuple(comes.tolist())
+        return SideBelief(told, tuple(emerged.tolist()), told, 1.0 - none, hypotheses)
+
+    def masked(self) -> BoolArray:
+        """Return the sides whose sound is that of a vehicle just come into view, shape (2,)."""
+        ages_ns = [math.inf if ns is None else self.stamp_ns - ns for ns in self.emerged_ns]
+        return np.array(ages_ns) <= _MASKED_NS
+
+    def handed_over(
+        self, kept: Mapping[int, float], apart: Collection[int], stamp_ns: int
+    ) -> "SequenceMemory":
+        r"""Return the memory after vehicles came into view past the edge of some sides.
+
+        .. math:: p_k \leftarrow (1 - r)\, \big(f\, g + (1 - f)\, e_{seen}\big) + r\, p_k, \qquad
+                  P(C_j) \leftarrow r\, P(C_j) + (1 - r)\, \min\big(P(C_j),\ P(C_j \mid C_k)\big)
+
+        with the chance r, in `kept`, that it was another vehicle than the one believed there, the share f of
+        vehicles that another one follows, and the gaps g of these. One vehicle of unknown side was believed
+        on both sides; vehicles of sides that are `apart`, or that were likelier two than one, stay.
+        """
+        belief, alone = self.states.belief.copy(), self.states.alone.copy()
+        unseen, comes = np.array(self.unseen), self.comes
+        both = float(comes.sum()) - (1.0 - self.none_comes)
+        for k, residual in kept.items():
+            j = 1 - k
+            if j not in kept and j not in apart and both <= _TWO:
+                given = both / max(comes[k], _LEAST_WEIGHT)
+                less = residual + (1.0 - residual) * min(given / max(comes[j], _LEAST_WEIGHT), 1.0)
+                moved = belief[j, COMES].sum() * (1.0 - less)
+                belief[j, COMES] *= less
+                belief[j, SEEN] += moved
+                unseen[j] *= less
+            share = self.arrivals[k].follower_share
+            now = share * FOLLOWS
+            now[SEEN] += 1.0 - share
+            belief[k] = (1.0 - residual) * now + residual * belief[k]
+            # The sound of before told of the vehicle that is in view now.
+            alone[k], unseen[k] = belief[k], 0.0
+        since_ns = [math.inf if ns is None else stamp_ns - ns for ns in self.emerged_ns]
+        pairs = zip(self.arrivals, since_ns, strict=True)
+        return replace(
+            self,
+            states=SequenceBelief(belief, alone),
+            emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
+            over_ns=tuple(None if k in kept else ns for k, ns in enumerate(self.over_ns)),
+            unseen=tuple(unseen.tolist()),
+            arrivals=tuple(
+                rate.after(gap_ns) if k in kept else rate for k, (rate, gap_ns) in enumerate(pairs)
+            ),
         )
-        return replace(self, emerged_ns=tuple(known), unseen=tuple(unseen), arrivals=arrivals)
 
     def prior(self, context: Context) -> FloatArray:
         """Return the distribution of the groups that is expected of each side, shape (2, groups)."""
@@ -158,31 +273,6 @@ class SequenceMemory:
         usual_hz = float(self.share[: len(COMING_S)].sum() / self.share.sum()) / COMING_S[-1]
         return [0.0 if context.priors else one.shift_nats(usual_hz) for one in self.arrivals]
 
-    def _explained(self) -> FloatArray:
-        """Return log p(sound | one comes) of each side, given a vehicle just come into view, shape (2,).
-
-        The last seconds hold the sound of this vehicle while it was hidden; that another one follows it is
-        rare. Onsets within six seconds of T0 fall from .17 to .08 an approach by this.
-        """
-        ages_ns = [np.inf if ns is None else self.stamp_ns - ns for ns in self.emerged_ns]
-        return np.where(np.array(ages_ns) <= _EXPLAINED_NS, math.log(_FOLLOWED), 0.0)
-
-    @cached_property
-    def hidden(self) -> HiddenBelief:
-        """A vehicle that comes into view within eight seconds is hidden; an unseen one is as it sounds.
-
-        What sounds in view, or as if it had left the view into the other side, is one that may have come into
-        view unseen, or a vehicle of which nothing is known. As few as explain it: one that may have come
-        from either side is one, of the likelier side, and two only as far as both chances exceed one.
-        """
-        groups, unseen = self.posterior.groups[0], _as_few(np.array(self.unseen))
-        coming = np.minimum(self.coming.sum(axis=1), 1.0)
-        there = groups[:, _SEEN] + groups[::-1, _PAST]
-        # P(this one | a vehicle is there), each of them with a chance of its own.
-        present = 1.0 - (1.0 - unseen).prod() * (1.0 - _OTHERS)
-        emerged = np.minimum(there * unseen / present, 1.0 - coming)
-        return HiddenBelief(tuple(coming.tolist()), tuple(emerged.tolist()))
-
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
         """Return for each side when its alarm ends: a second after it was last above the threshold."""
         ends_ns = (None if over_ns is None else over_ns + _HELD_NS + _SLACK_NS for over_ns in self.over_ns)
@@ -193,7 +283,7 @@ class SequenceMemory:
 
         .. math:: t_j = L_j - L_{j-1}
 
-        with L of both sides after the prior, the sequence, every look, and a vehicle just come into view.
+        with L of both sides after the prior, the sequence, and every look.
         """
         after = self.log_odds(context)
         terms = np.diff(list(after.values()), axis=0, prepend=np.zeros((1, len(SIDES))))
@@ -205,20 +295,29 @@ class SequenceMemory:
         The last piece takes the learned traffic out again: the alarm keeps to its onsets an hour of a usual
         street. Left in, in busy streets the other side of a single was alarmed in .56 of the cases for .35.
         """
-        nats, pieces = np.array(self.learned_nats(context)), self._told
+        nats = np.array(self.learned_nats(context))
+        pieces = {name: np.stack([told] * len(SIDES)) for name, told in self._told.items()}
         if nats.any():
-            pieces = pieces | {"usual traffic": -nats[:, None] * COMES}
-        told = np.cumsum([np.zeros_like(self.sides.belief), *pieces.values()], axis=0)
+            pieces |= {"usual traffic": -nats[:, None] * COMES}
+        told = np.cumsum([np.zeros_like(self.states.belief), *pieces.values()], axis=0)
         # States and groups count alike: a vehicle that comes soon behind another comes soon.
         before = states_of(self.prior(context), self.share)
-        weights = np.concatenate([before[None], self.sides.belief * np.exp(told)])
+        weights = np.concatenate([before[None], self.states.belief * np.exp(told)])
         soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
         return dict(zip(("prior", "sequence", *pieces), np.log(soon) - np.log(later), strict=True))
 
-    @property
-    def mean_log_odds(self) -> FloatArray:
-        """Mean log-odds of coming into view within three seconds over the last .3 s, shape (2,)."""
-        return np.asarray(np.mean([one[1:] for one in self.recent], axis=0))
+    def _deciding(self, context: Context) -> FloatArray:
+        """Return what is held against the alarm's threshold, nats, shape (2,).
+
+        The mean log-odds of coming into view within three seconds over the last .3 s, or since a vehicle came
+        into view from that side, and of the less likely side no more than that two come.
+        """
+        since_ns = [0 if ns is None else ns for ns in self.emerged_ns]
+        rows = [[row[1 + k] for row in self.recent if row[0] >= ns] for k, ns in enumerate(since_ns)]
+        mean = np.array([float(np.mean(row)) for row in rows])
+        if self.alarm is None:
+            return mean
+        return self.alarm.deciding(mean, self.posterior.groups[0], np.array(self.learned_nats(context)))
 
 
 def _as_few(chances: FloatArray) -> FloatArray:
@@ -232,10 +331,10 @@ def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context)
     """Return the belief at a later time, with nothing heard."""
     chain = np.array([state_transition(one, step_ns) for one in kept.prior(context)])
     looks = tuple(look for look in kept.looks if stamp_ns - look.stamp_ns <= _LOOK_NS)
-    sides, unseen = next_belief(kept.sides, None, chain), _unseen(kept, step_ns)
+    states, unseen = next_belief(kept.states, None, chain), _unseen(kept, step_ns)
     watched = any(not isinstance(look.answer, Unqueried) and look.answer.miss_rate < 1.0 for look in looks)
     arrivals = tuple(rate.later(seconds(step_ns), watched) for rate in kept.arrivals)
-    return replace(kept, sides=sides, looks=looks, unseen=unseen, arrivals=arrivals, stamp_ns=stamp_ns)
+    return replace(kept, states=states, looks=looks, unseen=unseen, arrivals=arrivals, stamp_ns=stamp_ns)
 
 
 def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
@@ -260,32 +359,34 @@ def informed(
             kept = SequenceMemory(first, reading.share, reading.margin_s, reading.alarm)
         kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
         said = states_of(at_prior(reading.groups, reading.share, kept.prior(context)), reading.share)
+        said = np.where(kept.masked()[:, None], kept.states.alone, said)
     if kept is None:
         return None
     # The chain of the hops since then was taken when the belief was carried here.
-    sides = next_belief(kept.sides, said, np.eye(len(STATES)))
+    states = next_belief(kept.states, said, np.eye(len(STATES)))
     # A vehicle that has come into view is seen there but for a miss; one that is seen was handed over.
     missed = math.prod(look.answer.miss_rate for look in looks if not isinstance(look.answer, Unqueried))
     held = {look.sensor: look for look in (*kept.looks, *looks)}
     kept = replace(
         kept,
-        sides=sides,
+        states=states,
         looks=tuple(sorted(held.values(), key=attrgetter("sensor"))),
         unseen=tuple(chance * missed for chance in kept.unseen),
         stamp_ns=measurement.stamp_ns,
     )
-    return _alerted(kept, context)
+    return alerted(kept, context)
 
 
-def _alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
+def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     """Return the memory with the mean log-odds of the last .3 s held against the threshold."""
     left, right = list(kept.log_odds(context).values())[-1].tolist()
     since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
     kept = replace(kept, recent=recent)
+    decided = kept._deciding(context)
+    kept = replace(kept, decided=tuple(decided.tolist()))
     if kept.alarm is None:
         return kept
-    learned_nats = np.array(kept.learned_nats(context))
-    over = kept.alarm.over(kept.mean_log_odds, kept.posterior.groups[0], learned_nats)
+    over = decided >= kept.alarm.threshold_nats
     over_ns = tuple(kept.stamp_ns if now else ns for now, ns in zip(over, kept.over_ns, strict=True))
     return replace(kept, over_ns=over_ns)

@@ -8,7 +8,6 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.explanation import HiddenBelief
 from worldstate.belief.hidden_bearing import hidden_bearing, time_to_visible
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.kinematics.motion import (
@@ -22,6 +21,7 @@ from worldstate.belief.kinematics.motion import (
     MotionBelief,
 )
 from worldstate.belief.settings import FilterSettings
+from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import PARKED_ACCELERATION, Track, hidden_share
 from worldstate.ground import FloatArray, seconds
@@ -98,9 +98,7 @@ def entities_of(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -
     return tuple(map(build, tracks, moments))
 
 
-def _entity(
-    memory: Memory, sides: HiddenBelief, site: SiteGeometry, track: Track, moments: _Moments
-) -> Entity:
+def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track, moments: _Moments) -> Entity:
     mean, std, (variance, mixed, rate_variance), forecast = moments
     share, existence = hidden_share(track, sides), existence_of(track, sides)
     hidden = share >= 0.5
@@ -154,7 +152,7 @@ def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
     return round(math.remainder(right_rad, math.tau), 6), round(math.remainder(left_rad, math.tau), 6)
 
 
-def existence_of(track: Track, sides: HiddenBelief) -> float:
+def existence_of(track: Track, sides: SideBelief) -> float:
     """Return the existence of a track, from the belief of its side until it is seen."""
     if track.seen or track.behind < 0.5:
         return track.existence

@@ -5,6 +5,7 @@ from .context import Rates as Rates
 from .context import blind_corner as blind_corner
 from .cue import Advisory as Advisory
 from .cue import EvidenceTerms as EvidenceTerms
+from .cue import Held as Held
 from .cue import RiskCue as RiskCue
 from .entity import Classification as Classification
 from .entity import Entity as Entity
@@ -12,6 +13,7 @@ from .entity import Event as Event
 from .entity import Relation as Relation
 from .entity import Visibility as Visibility
 from .sensor import Delivery as Delivery
+from .sensor import Hearing as Hearing
 from .sensor import SearchedView as SearchedView
 from .sensor import SensorHealth as SensorHealth
 from .world_state import WorldState as WorldState

@@ -36,6 +36,27 @@ class Advisory:
 
 
 @dataclass(frozen=True, slots=True)
+class Held:
+    """An advisory that stands although what decides it has fallen below its threshold.
+
+    Parameters
+    ----------
+    entity_id : str or None
+        The vehicle for which it is held.
+    until_ns : int
+        When it ends without news, ns; the hand-over of that vehicle ends it before.
+
+    Examples
+    --------
+    >>> Held(None, 1_000_000_000).until_ns
+    1000000000
+    """
+
+    entity_id: str | None
+    until_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class EvidenceTerms:
     r"""What every piece of evidence adds to the log-odds that an alarm goes by.
 
@@ -50,9 +71,11 @@ class EvidenceTerms:
         By what was said: the prior, the sequence or the window, each sensor's look, what has just come into
         view, messages; each given those before it, so that they add up.
     compared_nats : float
-        What is held against the threshold: for a sequence the mean of the log-odds over .3 s.
+        What decides: for a sequence the mean of the log-odds over .3 s, of the less likely side no more than
+        that two come; for the rule the least log-odds of the hops that it asks for.
     threshold_nats : float
-        Not below it an advisory is raised, by the rule after so many hops.
+        An advisory stands exactly where `compared_nats` is not below it, or where the cue says that it is
+        held.
 
     Examples
     --------
@@ -70,12 +93,12 @@ class EvidenceTerms:
 class RiskCue:
     r"""Risk that a road user is hidden in one direction: an advisory, never a control command.
 
-    .. math:: r_k = P(hid_k \mid y_{1:t}) \quad\text{or}\quad
-              r_k = g(P(hid \mid y_{1:t}))\, P(k \mid hid, y_{1:t})
+    .. math:: r_k = P(T_k \le 8\,\mathrm{s} \mid y_{1:t})
 
-    With a sequence model r_k is the calibrated probability that a vehicle comes into view from there within
-    eight seconds; sides do not exclude each other. Without one g is the calibrated monotone map of the
-    policy, and the risks of all directions add up to that of a hidden road user at all.
+    The probability that a vehicle comes into view from there within eight seconds: a marginal of the one
+    belief, never above P(hidden); sides do not exclude each other. With a sequence model it is calibrated.
+    Without one it is :math:`\min(P(hid), g(P(hid)))\, P(k \mid hid)` with the calibrated monotone map g of
+    the policy: the sides exclude each other, and when one comes is not known.
 
     Parameters
     ----------
@@ -92,10 +115,13 @@ class RiskCue:
     log_lambda : float or None
         log Lambda of the last window, nats; None where it is infinite.
     hypotheses : Priors
-        Filtered P(hidden), P(visible), P(none).
+        Probabilities of the explanations. *hidden*: at least one vehicle that is not in line of sight and
+        comes into view within eight seconds or is audible now, whether or not another is in view; *visible*:
+        one in view and none hidden; *none*: neither.
     advisory : Advisory or None
         Given where the sustained rule is in alarm and names this direction; with the alarm of a sequence
-        model, where it is raised for it.
+        model, where it is raised for it. It ends with the hand-over of the vehicle that it announced, and
+        none stands beside a risk below .1.
     alpha : float or None
         False-positive budget that the rule was calibrated for; None for an uncalibrated policy, and where the
         alarm of a sequence model stands in for the rule, which has a budget of onsets an hour.
@@ -113,6 +139,10 @@ class RiskCue:
         Where it is in nine of ten cases: from this azimuth to the left until that one.
     evidence : EvidenceTerms or None
         What an advisory is raised by, piece by piece.
+    held : Held or None
+        Given where the advisory stands below its threshold, with what for and until when.
+    not_advised : str or None
+        Where the risk is above .7 and no advisory is out, why.
 
     Examples
     --------
@@ -142,3 +172,5 @@ class RiskCue:
     time_to_visible_s: tuple[float, float, float] | None = None
     sector_rad: tuple[float, float] | None = None
     evidence: EvidenceTerms | None = None
+    held: Held | None = None
+    not_advised: str | None = None

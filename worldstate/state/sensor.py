@@ -36,6 +36,33 @@ class SensorHealth:
 
 
 @dataclass(frozen=True, slots=True)
+class Hearing:
+    """How well a sensor that listens could hear: what it did not hear is evidence only that far.
+
+    Parameters
+    ----------
+    sensor : str
+        Source of measurements.
+    share : float
+        Probability that a hidden vehicle would have been noticed.
+    since_ns : int
+        Since when it has been what it is, ns.
+    reason : str or None
+        What keeps it from hearing; None where nothing does.
+
+    Examples
+    --------
+    >>> Hearing("acoustic", 0.0, 1_000_000_000, "lost samples").reason
+    'lost samples'
+    """
+
+    sensor: str
+    share: Probability
+    since_ns: int
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class SearchedView:
     """The last look of a sensor: where it searched, whether anything was there, and how often it errs.
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground import InvalidArgumentError, NotUsable
 from worldstate.ground.extras import optional
-from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
+from worldstate.ground.serialisation import Layout, decode, decode_json, encode
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
 from .cue import RiskCue
 from .entity import EGO, Entity, Event, Relation
-from .sensor import Delivery, Ego, SearchedView, SensorHealth
+from .sensor import Delivery, Ego, Hearing, SearchedView, SensorHealth
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -35,7 +35,7 @@ class WorldState:
     relations : tuple of Relation
         Kept in order of their ends and kind.
     context : Context
-        With the predicted explanation priors.
+        With the probabilities of the explanations before the last evidence as its priors.
     cues : tuple of RiskCue
         One per direction, none before the first measurement; kept in order of direction.
     frame_id : str
@@ -64,6 +64,10 @@ class WorldState:
     ego : Ego or None
         Pose and twist of the ego vehicle; None without odometry. With it the context's occluders, too, are
         as they are seen from there.
+    heard : tuple of Hearing, or None
+        How well each sensor that listens could hear; None where none does.
+    budget : str or None
+        Whether the budget of alarms still holds; None, since nothing watches it yet.
     events : tuple of Event
         What became of entities with the last measurement, at most 64.
 
@@ -74,7 +78,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "2.1.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "3.0.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -93,7 +97,9 @@ class WorldState:
     sensors: tuple[SensorHealth, ...] = ()
     searched: tuple[SearchedView, ...] = ()
     events: tuple[Event, ...] = ()
-    ego: Ego | None = field(default=None, metadata=ADDED)
+    ego: Ego | None = None
+    heard: tuple[Hearing, ...] | None = None
+    budget: str | None = None
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.

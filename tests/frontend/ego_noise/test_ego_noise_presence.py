@@ -138,7 +138,7 @@ def last_second(sound: Sound, array: MicrophoneArray, scene: Scene, gate: str) -
             if gate == "belief":
                 measurement = adapter.interpret(frame)
                 world = world.predict_to(measurement.stamp_ns).update(measurement)
-                adapter.set_no_source_probability(world.explanation.none)
+                adapter.set_no_source_probability(world.belief.hypotheses[2])
             if scene.in_sight_s - 1.05 < frame.sample_index / scene.rate_hz < scene.in_sight_s + 0.05:
                 peak = frame.srp.max()
                 rows.append(np.log([peak, peak / np.median(frame.srp)]))

@@ -1,4 +1,4 @@
-r"""The belief over explanations: a Markov chain in continuous time, filtered in log space.
+r"""The belief by single windows: explanations on a Markov chain in continuous time, filtered in log space.
 
 Its states are, in order: hidden in direction 1 .. K, in view having come from direction 1 .. K, in view from
 elsewhere, none. All visible states leave at the same rates, so the chain lumps exactly onto (hidden_1 ..
@@ -6,8 +6,8 @@ hidden_K, visible, none) and, with equal rates for all directions, onto the thre
 chain adds is whether a source in view is the one that was heard while hidden.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from operator import attrgetter
 from typing import Annotated, TypeAlias
@@ -18,8 +18,10 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, posterior_of
 from worldstate.abduction.sequence.ratio_recursion import transitions
-from worldstate.ground.serialisation import Keys, Via
+from worldstate.ground.serialisation import Keys, Via, written_as
 from worldstate.ground.typing import FloatArray
+
+from .side_belief import SideBelief
 
 RatesHz = tuple[float, ...]
 """arrival (each), emergence, departure, reocclusion (all together), visible arrival, visible departure"""
@@ -63,9 +65,6 @@ LOG_FLOOR = -600.0
 # The co-evidence enters through the prior here, with the evidence of the other sources, and must not count
 # again.
 _IN_PRIOR = Unqueried("already weighed into the prior")
-
-# Certainty would take several windows of evidence to undo.
-_MOST_HIDDEN = 0.999
 
 
 # No slots: the probabilities are computed once, and read some sixteen times a step.
@@ -134,6 +133,13 @@ class ExplanationBelief:
         """P(none)."""
         return float(np.exp(self.log_probabilities[-1]))
 
+    @cached_property
+    def sides(self) -> SideBelief:
+        """The belief of the sides, which exclude each other here; whether and when one comes is not told."""
+        # A sum of exponentials may exceed one by rounding, which readers of a snapshot refuse.
+        hidden, visible, none = (min(one, 1.0) for one in (self.hidden_total, self.visible, self.none))
+        return SideBelief(self.hidden, self.emerged, self.hidden, hidden, (hidden, visible, none))
+
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "ExplanationBelief":
         """Return the belief after a time step without a measurement."""
         moved = self.probabilities @ transition(rates_hz, self.k, step_ns)
@@ -154,29 +160,14 @@ class ExplanationBelief:
         return replace(self, log_probabilities=tuple(np.clip(spread, LOG_FLOOR, 0.0).tolist()))
 
     def emerge(self, direction: int, residual: float) -> "ExplanationBelief":
-        """Return the belief after a hand-over: the hidden mass of a direction moves into view."""
-        # `residual` is the share that stays hidden, since the sighting may be of another vehicle. The rest
-        # counts as from elsewhere: the entity is seen now, and its existence no longer read from here.
+        """Return the belief after a hand-over: the vehicle that was hidden in a direction is in view."""
+        # `residual` is P(it was another vehicle). Explanations exclude each other, so that what was believed
+        # in the other directions was the same vehicle. It counts as from elsewhere: the entity is seen now,
+        # and its existence no longer read from here.
         p, k = self.probabilities.copy(), self.k
-        moved = p[direction] * (1.0 - residual)
-        p[direction] -= moved
-        p[2 * k] += moved + p[k + direction]
+        p[2 * k] += (1.0 - residual) * p[:k].sum() + p[k + direction]
+        p[:k] *= residual
         p[k + direction] = 0.0
-        return replace(self, log_probabilities=_logs(p))
-
-    def at_least(self, hidden: Sequence[float]) -> "ExplanationBelief":
-        """Return the belief with P(hidden_k) raised to at least those given; the rest shrinks alike.
-
-        Shapes: hidden (K,). Sides exclude each other here: given more than one in all, they share it.
-        """
-        p, k = self.probabilities.copy(), self.k
-        least = np.array(hidden) * min(_MOST_HIDDEN / max(sum(hidden), _MOST_HIDDEN), 1.0)
-        raised = np.maximum(least - p[:k], 0.0)
-        if not raised.any():
-            return self
-        free = np.where(raised > 0.0, 0.0, p[:k]).sum() + p[k:].sum()
-        p *= (1.0 - least[raised > 0.0].sum()) / max(free, 1e-300)
-        p[:k] = np.where(raised > 0.0, least, p[:k])
         return replace(self, log_probabilities=_logs(p))
 
     def forget_origin(self, direction: int) -> "ExplanationBelief":
@@ -198,31 +189,6 @@ def _logs(probabilities: FloatArray) -> tuple[float, ...]:
         return tuple(np.maximum(np.log(probabilities), LOG_FLOOR).tolist())
 
 
-@dataclass(frozen=True, slots=True)
-class HiddenBelief:
-    """P(hidden) and P(in view, come from there), side by side; sides do not exclude each other.
-
-    Examples
-    --------
-    >>> both = HiddenBelief((0.9, 0.8), (0.0, 0.1))
-    >>> [round(both.existence(side), 2) for side in (0, 1)]
-    [0.9, 0.9]
-    """
-
-    hidden: tuple[float, ...]
-    emerged: tuple[float, ...]
-
-    def existence(self, side: int) -> float:
-        """Return the probability that there is such a vehicle."""
-        # The sum of two exponentials exceeds one by rounding where nothing else is possible.
-        return min(self.hidden[side] + self.emerged[side], 1.0)
-
-    def hidden_share(self, side: int) -> float:
-        """Return P(hidden | exists)."""
-        either = self.hidden[side] + self.emerged[side]
-        return self.hidden[side] / either if either > 0.0 else 1.0
-
-
 # Window ends are rounded to samples and stamps to nanoseconds: two windows end to end differ from one
 # window's length by less than this.
 SLACK_NS = 5_000_000
@@ -237,17 +203,17 @@ class SourceEvidence:
     log_likelihoods: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class BeliefLag:
-    r"""Past beliefs over one window W; the update starts from the one that is W old.
+# No slots: what is read of the sides is computed once.
+@dataclass(frozen=True)
+class WindowBelief:
+    r"""The belief and its past of one window W; an update starts from the one that is W old.
 
     .. math:: p_t \propto \Big(\int p(x_t \mid x_{t-W})\, p_{t-W}\, dx_{t-W}\Big)\, \ell(y_t)
 
     Examples
     --------
-    >>> belief = ExplanationBelief.from_priors(2, 0.2, 0.3, 0.5)
-    >>> lag = BeliefLag(((0, belief),))
-    >>> lag.base("acoustic", 10**9, window_ns=10**9)[0]
+    >>> belief = WindowBelief.starting(ExplanationBelief.from_priors(2, 0.2, 0.3, 0.5), 0)
+    >>> belief.base("acoustic", 10**9, window_ns=10**9)[0]
     0
     """
 
@@ -256,30 +222,66 @@ class BeliefLag:
     # Updating the belief of one window ago with the full likelihood makes ten interleaved filters of windows
     # that do not overlap, each of them exact.
 
+    now: AsLogs = field(metadata=written_as("log_explanations"))
     # Time stamps, ns, in order, and the posterior at each.
-    beliefs: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
+    past: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
     heard: tuple[SourceEvidence, ...] = ()  # Most recent evidence of each source, sorted by its name
+
+    @classmethod
+    def starting(cls, belief: ExplanationBelief, start_ns: int) -> "WindowBelief":
+        """Return the first belief, before any window."""
+        return cls(belief, ((start_ns, belief),))
+
+    @property
+    def sides(self) -> SideBelief:
+        """The belief of the sides now."""
+        return self.now.sides
+
+    def predict(self, rates_hz: RatesHz, step_ns: int) -> "WindowBelief":
+        """Return the belief after a time step without a window."""
+        return replace(self, now=self.now.predict(rates_hz, step_ns))
 
     def base(self, source: str, stamp_ns: int, window_ns: int) -> tuple[int, ExplanationBelief, FloatArray]:
         """Return the newest belief that is a window old, its time, ns, and the evidence of others since."""
-        old = [past for past in self.beliefs if past[0] <= stamp_ns - window_ns + SLACK_NS]
-        since_ns, belief = old[-1] if old else self.beliefs[0]
+        old = [past for past in self.past if past[0] <= stamp_ns - window_ns + SLACK_NS]
+        since_ns, belief = old[-1] if old else self.past[0]
         others = np.zeros(belief.k + 2)
         for other in self.heard:
             if other.source != source and other.stamp_ns > since_ns:
                 others += other.log_likelihoods
         return since_ns, belief, others
 
-    def add(self, heard: SourceEvidence, belief: ExplanationBelief, window_ns: int) -> "BeliefLag":
-        """Return the lag with one more posterior, without those that no later window needs."""
-        latest = [past for past in self.beliefs if past[0] < heard.stamp_ns]
-        old = sum(stamp_ns <= heard.stamp_ns - window_ns + SLACK_NS for stamp_ns, _ in latest)
-        others = [other for other in self.heard if other.source != heard.source]
-        return BeliefLag(
-            (*latest[max(old - 1, 0) :], (heard.stamp_ns, belief)),
-            tuple(sorted([*others, heard], key=lambda evidence: evidence.source)),
-        )
+    def update(
+        self,
+        source: str,
+        stamp_ns: int,
+        evidence: SignatureEvidence,
+        log_co_evidence: FloatArray,
+        rates_hz: RatesHz,
+        window_ns: int,
+    ) -> tuple["WindowBelief", ExplanationBelief]:
+        """Return the belief after one window with its looks, and what was predicted for it.
 
-    def map(self, change: Callable[[ExplanationBelief], ExplanationBelief]) -> "BeliefLag":
-        """Return the lag with a function applied to every belief, as at a hand-over."""
-        return replace(self, beliefs=tuple((stamp_ns, change(belief)) for stamp_ns, belief in self.beliefs))
+        Shapes: log_co_evidence (K + 2,).
+        """
+        base_ns, belief, others = self.base(source, stamp_ns, window_ns)
+        prior = belief.predict(rates_hz, stamp_ns - base_ns)
+        after = prior.update(evidence, log_co_evidence + others)
+        # -inf would stay for the length of the window and cannot be written as JSON.
+        own = np.maximum(evidence.log_likelihoods + log_co_evidence, LOG_FLOOR)
+        heard = SourceEvidence(source, stamp_ns, tuple(own.tolist()))
+        sources = [other for other in self.heard if other.source != source]
+        # Beliefs that no later window needs are left out.
+        latest = [past for past in self.past if past[0] < stamp_ns]
+        old = sum(past_ns <= stamp_ns - window_ns + SLACK_NS for past_ns, _ in latest)
+        past = (*latest[max(old - 1, 0) :], (stamp_ns, after))
+        return WindowBelief(after, past, tuple(sorted([*sources, heard], key=attrgetter("source")))), prior
+
+    def heard_since(self, since_ns: int) -> "WindowBelief":
+        """Return the belief without the evidence of sources that are silent since then."""
+        return replace(self, heard=tuple(one for one in self.heard if one.stamp_ns >= since_ns))
+
+    def map(self, change: Callable[[ExplanationBelief], ExplanationBelief]) -> "WindowBelief":
+        """Return the belief with a function applied to it and to its past, which later windows build on."""
+        past = tuple((stamp_ns, change(belief)) for stamp_ns, belief in self.past)
+        return replace(self, now=change(self.now), past=past)

@@ -1,0 +1,198 @@
+"""Everything that a snapshot states is a marginal of one belief: laws over random inputs."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
+from worldstate.abduction.cueing.risk_map import PlattMap
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.ground.values import NotUsable
+from worldstate.measurement import Look, Position, PositionScan
+
+SEEDS = st.integers(0, 2**32 - 1)
+SILENT = NotUsable("not scripted")
+COMING, SLACK = len(COMING_S), 1e-9
+SHARE = 0.9 * np.random.default_rng(0).dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
+
+
+def reading(rng: np.random.Generator, threshold: float = 0.0) -> SequenceReading:
+    groups = 0.999 * rng.dirichlet(np.full(len(GROUPS), 0.2), 2) + 0.001 / len(GROUPS)
+    return SequenceReading(groups, SHARE, 0.1, SequenceAlarm(threshold, 20.0))
+
+
+def hop(rng: np.random.Generator, number: int, *, sequence: bool) -> Measurement:
+    """Return a random hop of sound, with a look and boxes near either edge."""
+    stamp_ns = number * 10**8
+    answer = (Absent(0.04, 0.01), Present(0.04, 0.01), Unqueried("-"))[rng.integers(3)]
+    said = SignatureEvidence(("left", "right"), tuple(rng.uniform(-3, 3, 2)), *rng.uniform(-3, 3, 2).tolist())
+    sightings = tuple(
+        Sighting(float(rng.uniform(-0.6, 0.6)), 0.02, "car", 0.9) for _ in range(rng.integers(0, 3))
+    )
+    return Measurement(
+        stamp_ns, said, answer, SILENT, SILENT,
+        sightings if not isinstance(answer, Unqueried) else (),
+        look=Look("camera", stamp_ns, answer),
+        sequence=reading(rng) if sequence else None,
+    )  # fmt: skip
+
+
+def scan(rng: np.random.Generator, number: int) -> PositionScan:
+    """Return a message that places a vehicle behind the left or the right corner, or in view."""
+    side = rng.choice([-1.0, 0.0, 1.0])
+    place = (10.0, 30.0 * side - 0.8 * side * number)
+    car = Position(
+        place, tuple(map(tuple, np.diag([0.5] * 4))), (0.0, -8.0 * side), float(rng.uniform(0.5, 0.99))
+    )
+    return PositionScan("v2x", number * 10**8 - 10**7, (car,))
+
+
+def states(seed: int, *, sequence: bool, hops: int = 25) -> list[WorldState]:
+    rng = np.random.default_rng(seed)
+    world = WorldFilter(policy=replace(uncalibrated_policy(), risk_map=PlattMap(-1.7, 0.3)))
+    found = []
+    for number in range(1, hops):
+        if rng.random() < 0.3:
+            world = world.update(scan(rng, number))
+        world = world.update(hop(rng, number, sequence=sequence and rng.random() < 0.9))
+        found += [world.state, world.predict(float(rng.uniform(0.0, 0.09))).state]
+    return found
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+@given(SEEDS)
+@settings(max_examples=8, deadline=None)
+def test_hidden_is_at_least_every_risk_and_none_at_most_what_it_leaves(sequence: bool, seed: int) -> None:
+    for state in states(seed, sequence=sequence):
+        for cue in state.cues:
+            said = cue.hypotheses
+            assert said.hidden + said.visible + said.none == pytest.approx(1.0, abs=1e-9)
+            assert said.hidden >= cue.risk - SLACK
+            assert said.none <= 1.0 - cue.risk + SLACK
+
+
+@given(SEEDS)
+@settings(max_examples=8, deadline=None)
+def test_chances_rise_with_the_horizon_and_stay_below_the_risk(seed: int) -> None:
+    for state in states(seed, sequence=True):
+        for cue in state.cues:
+            if cue.within is not None:
+                chances = list(cue.within.values())
+                assert chances == sorted(chances) and chances[-1] <= cue.risk + SLACK
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+@given(SEEDS)
+@settings(max_examples=8, deadline=None)
+def test_an_advisory_stands_where_what_decides_does_or_is_held(sequence: bool, seed: int) -> None:
+    for state in states(seed, sequence=sequence):
+        likeliest = max((cue.risk for cue in state.cues), default=0.0)
+        for cue in state.cues:
+            terms = cue.evidence
+            assert terms is not None
+            over = terms.compared_nats >= terms.threshold_nats - 1e-9
+            if cue.advisory is not None:
+                assert cue.risk >= 0.1 and cue.not_advised is None
+                assert over or cue.held is not None or terms.hypothesis == "announced"
+            if cue.held is not None:
+                assert cue.advisory is not None and cue.held.until_ns >= state.stamp_ns
+            if cue.advisory is None and cue.risk > 0.7:
+                assert cue.not_advised
+            # The rule names the likeliest side only.
+            if over and terms.hypothesis == "coming" and cue.risk >= 0.1 and likeliest:
+                assert cue.advisory is not None
+
+
+@given(SEEDS)
+@settings(max_examples=8, deadline=None)
+def test_single_windows_move_nothing_where_a_sequence_is_read(seed: int) -> None:
+    """What a window of that source says is in its sequence already."""
+    rng = np.random.default_rng(seed)
+    one = other = WorldFilter()
+    for number in range(1, 20):
+        heard = hop(rng, number, sequence=True)
+        drawn = SignatureEvidence(("left", "right"), tuple(rng.uniform(-3, 3, 2)), 0.0, 0.0)
+        one, other = one.update(heard), other.update(replace(heard, signature=drawn))
+        mine, its = one.state, other.state
+        assert [cue.risk for cue in mine.cues] == [cue.risk for cue in its.cues]
+        assert [cue.hypotheses for cue in mine.cues] == [cue.hypotheses for cue in its.cues]
+        assert mine.entities == its.entities
+
+
+def both_sides(coming: tuple[float, float], other: tuple[float, float], bin_: str) -> SequenceReading:
+    """Return a reading of how likely one comes on each side, and only on the other one."""
+    groups = np.full((2, len(GROUPS)), 1e-4)
+    groups[:, GROUPS.index(bin_)] = coming
+    groups[:, GROUPS.index("other")] = other
+    groups[:, GROUPS.index("none")] = 1.0 - np.array(coming) - np.array(other)
+    return SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, SequenceAlarm(0.0, 20.0))
+
+
+def seen_from_left(said: SequenceReading) -> tuple[WorldState, WorldState]:
+    """Return the states before and after a vehicle came into view past the left edge."""
+    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    for number in range(1, 12):
+        answer = Absent(0.04, 0.01) if number < 11 else Present(0.04, 0.01)
+        look = Look("camera", number * 10**8, answer)
+        boxes = (Sighting(0.53, 0.02, "car", 0.9),) if number == 11 else ()
+        before, world = (
+            world,
+            world.update(
+                Measurement(number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=look, sequence=said)
+            ),
+        )
+    return before.state, world.state
+
+
+def cue_of(state: WorldState, side: str):
+    return next(cue for cue in state.cues if cue.direction == side)
+
+
+def test_one_vehicle_of_unknown_side_is_gone_from_the_other_side_when_it_is_seen() -> None:
+    before, after = seen_from_left(both_sides((0.55, 0.42), (0.42, 0.55), "coming_1s"))
+    assert cue_of(before, "right").risk > 0.3
+    assert cue_of(after, "right").risk < 0.2
+    assert cue_of(before, "left").hypotheses.none < 0.2
+
+
+def test_a_second_vehicle_believed_apart_stays_when_the_first_is_seen() -> None:
+    before, after = seen_from_left(both_sides((0.9, 0.85), (0.04, 0.08), "coming_1s"))
+    assert cue_of(after, "right").risk > 0.95 * cue_of(before, "right").risk
+
+
+def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_that_follow() -> None:
+    before, after = seen_from_left(both_sides((0.97, 0.01), (0.01, 0.97), "coming_0.5s"))
+    assert [event.kind for event in after.events] == ["handed_over"]
+    assert cue_of(before, "left").advisory is not None and cue_of(after, "left").advisory is None
+    # One in six has another one behind it.
+    assert cue_of(after, "left").risk == pytest.approx(1.0 / 6.0, abs=0.03)
+
+
+def test_high_risk_without_advisory_says_why() -> None:
+    far = both_sides((0.9, 0.02), (0.02, 0.9), "coming_8s")
+    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    for number in range(1, 6):
+        world = world.update(Measurement(number * 10**8, quiet, Unqueried("-"), SILENT, SILENT, sequence=far))
+    cue = cue_of(world.state, "left")
+    assert cue.risk > 0.7 and cue.advisory is None
+    assert cue.not_advised is not None and "three seconds" in cue.not_advised
+
+
+@given(SEEDS)
+@settings(max_examples=5, deadline=None)
+def test_without_a_sequence_the_explanations_are_those_of_the_rates(seed: int) -> None:
+    """No window at all: the equilibrium stays, whatever the steps."""
+    rng, world = np.random.default_rng(seed), WorldFilter(Context())
+    start = world.belief.hypotheses
+    for step_s in rng.uniform(0.0, 2.0, 10).tolist():
+        world = world.predict(step_s)
+        assert world.belief.hypotheses == pytest.approx(start, abs=2e-2)
+        assert math.isclose(sum(world.belief.hypotheses), 1.0, abs_tol=1e-9)

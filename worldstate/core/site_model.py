@@ -1,0 +1,100 @@
+"""What the filter knows of the place: the context as the ego vehicle has it, and the belief with it."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.hidden_bearing import announced
+from worldstate.belief.kinematics.cartesian import EgoBelief
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
+from worldstate.belief.window_belief import LOG_FLOOR
+from worldstate.measurement import Measurement
+from worldstate.state import Context
+from worldstate.state.context import seen_from
+
+from .memory import Memory
+
+_NONE = 1e-12  # Of a coming group where no vehicle can come: shares of none at all are not defined
+
+
+@dataclass(frozen=True, slots=True)
+class FilterModel:
+    """Context, policy and site geometry, constant while the filter runs."""
+
+    context: Context
+    policy: CueingPolicy
+    site: SiteGeometry
+
+
+def site_geometry_of(
+    context: Context, settings: FilterSettings, ego: EgoBelief | None = None
+) -> SiteGeometry:
+    """Return the site geometry of a context, as the ego vehicle has it."""
+    yaw_rad = 0.0 if ego is None else float(ego.pose[2])
+    sides = (
+        SideGeometry(
+            one.direction,
+            one.edge_azimuth_rad,
+            one.hidden_azimuth_rad,
+            one.hidden_std_rad,
+            one.edge_std_rad,
+            one.pace_hz,
+            one.hides,
+            0.0 if one.corner_m is None else yaw_rad,
+        )
+        for one in context.occluders
+    )
+    twist = (context.ego_speed_mps or 0.0, 0.0) if ego is None else (ego.speed_mps, ego.yaw_rate_rad_s)
+    return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, *twist)
+
+
+def from_here(model: FilterModel, ego: EgoBelief | None) -> FilterModel:
+    """Return the model as the ego vehicle has it where it is now; without odometry, as the context says."""
+    if ego is None:
+        return model
+    x_var, y_var, yaw_var = ego.covariance.diagonal().tolist()
+    stds = math.sqrt(0.5 * (x_var + y_var)), math.sqrt(yaw_var)
+    x, y, yaw = ego.pose.tolist()
+    occluders = tuple(seen_from(one, (x, y, yaw), *stds) for one in model.context.occluders)
+    context = replace(model.context, occluders=occluders, ego_speed_mps=ego.speed_mps)
+    return replace(model, context=context, site=site_geometry_of(context, model.site.settings, ego))
+
+
+def without_open_sides(measurement: Measurement, context: Context) -> Measurement:
+    """Remove the evidence for hidden vehicles on sides without an occluder."""
+    is_open = np.array([not one.hides for one in context.occluders])
+    if not is_open.any():
+        return measurement
+    said, reading = measurement.signature, measurement.sequence
+    hidden = np.where(is_open, LOG_FLOOR, said.hidden).tolist()
+    measurement = replace(measurement, signature=replace(said, hidden=tuple(hidden)))
+    if not isinstance(reading, SequenceReading):
+        return measurement
+    groups = reading.groups.copy()
+    groups[is_open] = np.maximum(groups[is_open] * (np.arange(len(GROUPS)) >= len(COMING_S)), _NONE)
+    groups /= groups.sum(axis=1, keepdims=True)
+    return replace(measurement, sequence=replace(reading, groups=groups))
+
+
+def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
+    r"""Return the belief of the sides as it is published: with the policy's calibration, and with messages.
+
+    .. math:: r_k = \min\big(P(hid),\ g(P(hid))\big)\, P(k \mid hid)
+
+    without a sequence model, whose probabilities are calibrated: of what is hidden at most all comes into
+    view, so that the calibrated map g of the policy can only lower it.
+    """
+    sides = memory.sides
+    if memory.sequence is None:
+        hidden = sides.hypotheses[0]
+        risk = min(float(model.policy.risk_map(hidden)), hidden)
+        # The floor only matters where P(hidden) has underflowed; then no direction has a share.
+        share = risk / max(hidden, 1e-300)
+        sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
+    return sides.at_least(announced(memory.tracks, model.site))
