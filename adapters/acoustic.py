@@ -63,8 +63,6 @@ from .acoustic_sequence import LEVEL_BAND_HZ, read_hop
 # would take a wrong guess of the ear for a look at the right thing.
 _ASKED = 0.95
 LINE_SPACING = "line_spacing_hz"
-LEAST_HEARD = 0.2
-"""Share that could be heard below which a hop is not read: `Measurement.heard`."""
 
 
 class Signature(Protocol):
@@ -302,7 +300,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         """
         self.last_frame = frame
         heard_well = heard_of(frame)
-        if heard_well.share < LEAST_HEARD:
+        if not heard_well.usable:
             return asked_again(self._unheard(frame, heard_well), self._vision, self._settings)
         heard = signature = self._model.evidence(frame.feature)
         self._directions = signature.directions

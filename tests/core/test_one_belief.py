@@ -16,7 +16,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.ground.values import NotUsable
-from worldstate.measurement import Look, Position, PositionScan
+from worldstate.measurement import Heard, Look, Position, PositionScan
 
 SEEDS = st.integers(0, 2**32 - 1)
 SILENT = NotUsable("not scripted")
@@ -184,6 +184,67 @@ def test_high_risk_without_advisory_says_why() -> None:
     cue = cue_of(world.state, "left")
     assert cue.risk > 0.7 and cue.advisory is None
     assert cue.not_advised is not None and "three seconds" in cue.not_advised
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+@given(SEEDS)
+@settings(max_examples=5, deadline=None)
+def test_a_hop_that_could_not_be_heard_moves_nothing_but_what_time_moves(sequence: bool, seed: int) -> None:
+    rng, world = np.random.default_rng(seed), WorldFilter()
+    for number in range(1, 15):
+        world = world.update(hop(rng, number, sequence=sequence))
+    deaf = Measurement(
+        1_500_000_000, SignatureEvidence(("left", "right"), tuple(rng.uniform(-3, 3, 2)), 0.0, 0.0),
+        Unqueried("-"), SILENT, SILENT, heard=Heard(0.0, "lost samples"),
+        sequence=NotUsable("lost samples") if sequence else None,
+    )  # fmt: skip
+    after, carried = world.update(deaf).state, world.predict_to(1_500_000_000).state
+    for told, alone in zip(after.cues, carried.cues, strict=True):
+        assert told.risk == pytest.approx(alone.risk, abs=1e-12)
+        assert (told.within or {}) == pytest.approx(alone.within or {}, abs=1e-12)
+        assert told.hypotheses.hidden == pytest.approx(alone.hypotheses.hidden, abs=1e-12)
+    assert after.heard is not None and not after.calibrated
+    assert [(one.share, one.since_ns, one.reason) for one in after.heard] == [
+        (0.0, 1_500_000_000, "lost samples")
+    ]
+
+
+@given(SEEDS, st.floats(0.2, 1.0))
+@settings(max_examples=8, deadline=None)
+def test_absence_counts_as_far_as_a_vehicle_would_have_been_heard(seed: int, share: float) -> None:
+    """The odds of one that comes fall at most to the chance that it was masked."""
+    rng = np.random.default_rng(seed)
+    for sequence in (False, True):
+        world = WorldFilter()
+        for number in range(1, 15):
+            world = world.update(
+                replace(hop(rng, number, sequence=sequence), co_evidence=Unqueried("-"), look=None)
+            )
+        none = np.full((2, len(GROUPS)), 1e-6)
+        none[:, -1] = 1.0
+        empty = SequenceReading(none / none.sum(axis=1, keepdims=True), SHARE, 0.1)
+        quiet = Measurement(
+            1_500_000_000, SignatureEvidence(("left", "right"), (-9.0, -9.0), 0.0, 0.0), Unqueried("-"),
+            SILENT, SILENT, heard=Heard(share, "wind"), sequence=empty if sequence else None,
+        )  # fmt: skip
+        after, before = world.update(quiet).belief, world.predict_to(1_500_000_000).belief
+        if sequence:
+            for now, then in zip(after.risks, before.risks, strict=True):
+                odds = then / (1.0 - then)
+                assert now / (1.0 - now) >= (1.0 - share) * odds - 1e-6
+        assert sum(after.hypotheses) == pytest.approx(1.0)
+
+
+def test_a_source_that_falls_silent_gives_no_news() -> None:
+    rng, world = np.random.default_rng(0), WorldFilter()
+    for number in range(1, 5):
+        world = world.update(hop(rng, number, sequence=True))
+    assert world.state.heard is not None and [one.sensor for one in world.state.heard] == ["acoustic"]
+    silent = world.predict(2.0).state
+    assert silent.heard == () and not silent.calibrated
+    assert [(one.condition, one.stamp_ns) for one in silent.sensors if one.sensor == "acoustic"] == [
+        ("silent", 400_000_000)
+    ]
 
 
 @given(SEEDS)

@@ -14,7 +14,13 @@ from scipy.stats import gamma
 from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
+from worldstate.abduction.sequence.sequence_model import (
+    COMING_S,
+    GROUPS,
+    SequenceAlarm,
+    SequencePosterior,
+    smoothed_log_odds,
+)
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.core.sequence_memory import ArrivalRate
 from worldstate.ground.errors import InvalidArgumentError
@@ -156,13 +162,18 @@ def test_a_checkpoint_goes_on_to_the_bit(seed: int, cut: int) -> None:
 def test_the_alarm_is_that_of_the_stream_side_by_side(seed: int) -> None:
     alarm = SequenceAlarm(0.5, 15.0)
     said = drawn(np.random.default_rng(seed), 40, alarm)
-    expected = alarm.raised(SequencePosterior(np.stack([one.groups for one in said]), 0.1))
+    stream = SequencePosterior(np.stack([one.groups for one in said]), 0.1)
+    over = alarm.over(smoothed_log_odds(stream), stream.groups)
     # A mean over three hops needs three, and an alarm of the two before is held for a second.
     worlds = run(WorldFilter(), [heard(hop, one) for hop, one in enumerate(said, 1)])
     raised = [[cue.advisory is not None for cue in world.state.cues] for world in worlds]
-    # None stands beside a risk that denies it.
-    likely = [[cue.risk >= 0.1 for cue in world.state.cues] for world in worlds]
-    assert raised[13:] == (expected & likely)[13:].tolist()
+    # Held for a second, unless a risk below .1 denies it in between.
+    likely = np.array([[cue.risk >= 0.1 for cue in world.state.cues] for world in worlds])
+    for side in (0, 1):
+        last = -np.inf
+        for hop in range(40):
+            last = -np.inf if not likely[hop, side] else hop if over[hop, side] else last
+            assert hop < 13 or raised[hop][side] == (hop - last <= 10)
     assert all(cue.alpha is None for cue in worlds[-1].state.cues)
 
 

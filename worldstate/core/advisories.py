@@ -17,14 +17,13 @@ from worldstate.ground.values import seconds
 from worldstate.measurement import Measurement
 
 from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceRule
+from .sequence_memory import LEAST_RISK
 from .site_model import FilterModel, published_belief
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
 _MOST_CERTAIN = 0.999  # Of a message
 NO_LOOK = Unqueried("sound alone")
-# An advisory does not stand beside a risk that denies it.
-_LEAST_RISK = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +46,18 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     before_ns = max((one.stamp_ns for one in memory.rules), default=measurement.stamp_ns)
     domain = measurement.domain
     fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
-    rule = SourceRule(measurement.source, measurement.stamp_ns, fault=fault)
+    last = next((one for one in memory.rules if one.source == measurement.source), None)
+    same = last is not None and last.heard.reason == measurement.heard.reason
+    rule = SourceRule(
+        measurement.source,
+        measurement.stamp_ns,
+        fault=fault,
+        heard=measurement.heard,
+        heard_ns=last.heard_ns if last is not None and same else measurement.stamp_ns,
+    )
+    if not measurement.heard.usable and memory.instant is not None:
+        # What could not be heard neither raises an alarm nor ends one: silence does, after a second.
+        return memory.with_rule(replace(rule, statistic=() if last is None else last.statistic))
     memory = ruled(memory, rule, measurement.signature, measurement.co_evidence, model)
     elapsed_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
     return _adapted(memory, elapsed_s, model.policy)
@@ -64,9 +74,7 @@ def ruled(
     instant = Instant.of(posterior, heard)
     before = next((one.statistic for one in memory.rules if one.source == rule.source), ())
     kept = (*before, instant.statistic)[-model.policy.sustain_hops :]
-    others = (one for one in memory.rules if one.source != rule.source)
-    rules = sorted((*others, replace(rule, statistic=kept)), key=attrgetter("source"))
-    return replace(memory, instant=instant, rules=tuple(rules))
+    return replace(memory.with_rule(replace(rule, statistic=kept)), instant=instant)
 
 
 def _adapted(memory: Memory, elapsed_s: float, policy: CueingPolicy) -> Memory:
@@ -92,7 +100,7 @@ def advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None,
     if not any(both):
         return both
     risks = published_belief(memory, model).risks
-    return tuple(one if risk >= _LEAST_RISK else None for one, risk in zip(both, risks, strict=True))
+    return tuple(one if risk >= LEAST_RISK else None for one, risk in zip(both, risks, strict=True))
 
 
 def heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
@@ -166,5 +174,7 @@ def _rule_ends_ns(memory: Memory, policy: CueingPolicy, announced: int | None = 
     # A rule that announces no vehicle hears, which is asked for with None.
     rules = (one for one in memory.rules if announced in (one.announced or (None,)))
     alarmed = (one for one in rules if len(one.statistic) >= hops and one.sustained(hops) >= gamma)
-    ends_ns = (one.stamp_ns + NEWS_HOLDS_NS for one in alarmed)
+    # What cannot be heard is no news.
+    news_ns = (one.stamp_ns if one.heard.usable else one.heard_ns for one in alarmed)
+    ends_ns = (ns + NEWS_HOLDS_NS for ns in news_ns)
     return max((end_ns for end_ns in ends_ns if end_ns >= memory.stamp_ns), default=None)

@@ -13,7 +13,7 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.core import step
 from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds
 from worldstate.ground.serialisation import Layout, decode, encode
-from worldstate.measurement import Measurement, Odometry, PositionScan
+from worldstate.measurement import Heard, Measurement, Odometry, PositionScan
 from worldstate.state import Context, Priors, WorldState
 
 from .advisories import update_advisories
@@ -23,7 +23,7 @@ from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
 from .site_model import FilterModel, from_here, published_belief, site_geometry_of, without_open_sides
-from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
+from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
 from .vision_update import counting_boxes, vision_update
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
@@ -114,6 +114,9 @@ class WorldFilter:
         model = from_here(self._model, memory.ego)
         context = model.context
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings)
+        heard = hearings(memory)
+        # What could not be heard is no evidence, and no budget was measured without it.
+        deaf = heard is not None and not any(Heard(one.share).usable for one in heard)
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
@@ -121,7 +124,7 @@ class WorldFilter:
             relations=relations_at(memory, tracks, context),
             context=replace(context, priors=Priors(*(memory.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
-            calibrated=self.policy.alpha > 0.0,
+            calibrated=self.policy.alpha > 0.0 and not deaf,
             bearing=memory.bearing,
             domain=memory.domain,
             no_sequence=memory.no_sequence,
@@ -130,6 +133,7 @@ class WorldFilter:
             sensors=sensors,
             searched=searched_views(memory, context),
             events=memory.events,
+            heard=heard,
             ego=None if memory.ego is None else ego_of(memory.ego),
         )
 

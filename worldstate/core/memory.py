@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Annotated, TypeAlias
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
@@ -15,7 +16,7 @@ from worldstate.belief.track import Track
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
 from worldstate.ground.serialisation import Count, Keys, Probability
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Bearing
+from worldstate.measurement.measurement import Bearing, Heard
 from worldstate.state import Context, Event, Relation
 
 from .sequence_memory import SequenceMemory
@@ -40,6 +41,8 @@ class SourceRule:
     statistic: tuple[Probability, ...] = ()
     fault: str | None = None  # What was wrong with it then
     announced: tuple[Count, ...] = ()  # Sides on which its messages announce vehicles; empty of what hears
+    heard: Heard = field(default=Heard())  # How well it could hear, and since when so
+    heard_ns: int = 0
 
     def sustained(self, hops: int) -> float:
         """Return the least statistic of so many hops, 0 where there are fewer."""
@@ -111,6 +114,11 @@ class Memory:
     def stamp_of(self, source: str, start_ns: int) -> int:
         """Return when a source last measured, or the start where it has not."""
         return next((one.stamp_ns for one in self.rules if one.source == source), start_ns)
+
+    def with_rule(self, rule: SourceRule) -> "Memory":
+        """Return the memory with what a source said last."""
+        others = (one for one in self.rules if one.source != rule.source)
+        return replace(self, rules=tuple(sorted((*others, rule), key=attrgetter("source"))))
 
     @cached_property
     def sides(self) -> SideBelief:

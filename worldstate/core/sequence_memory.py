@@ -106,6 +106,7 @@ _FAR = [_PAST, GROUPS.index("rising"), GROUPS.index("falling")]
 _SEEN_GROUP = GROUPS.index("seen")
 # States of vehicles that come into view within three seconds.
 _SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range(len(STATES))])
+LEAST_RISK = 0.1  # An advisory does not stand beside a risk that denies it
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
 
 
@@ -359,6 +360,8 @@ def informed(
             kept = SequenceMemory(first, reading.share, reading.margin_s, reading.alarm)
         kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
         said = states_of(at_prior(reading.groups, reading.share, kept.prior(context)), reading.share)
+        # By whatever else is heard, and by a vehicle just come into view on that side.
+        said = _as_heard(kept.states.alone, said, measurement.heard.share)
         said = np.where(kept.masked()[:, None], kept.states.alone, said)
     if kept is None:
         return None
@@ -377,6 +380,23 @@ def informed(
     return alerted(kept, context)
 
 
+def _as_heard(alone: FloatArray, said: FloatArray, share: float) -> FloatArray:
+    r"""Return a reading in which a hidden vehicle is noticed with a probability s, shapes (2, states).
+
+    .. math:: g_i = q_i / n_i, \qquad g'_i = s\, g_i + (1 - s)\, \bar g \quad \text{of states that come},
+              \qquad q' \propto n\, g'
+
+    with n what the reading was expected to be and the mean :math:`\bar g` of the states in which none comes:
+    one that is masked sounds as if it were not there, so that its absence counts by s only.
+    """
+    if share >= 1.0:
+        return said
+    rest = said[:, ~COMES].sum(axis=1) / np.maximum(alone[:, ~COMES].sum(axis=1), _LEAST_WEIGHT)
+    missed = share * said + (1.0 - share) * rest[:, None] * alone
+    heard = np.where(COMES, missed, said)
+    return np.asarray(heard / heard.sum(axis=1, keepdims=True))
+
+
 def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     """Return the memory with the mean log-odds of the last .3 s held against the threshold."""
     left, right = list(kept.log_odds(context).values())[-1].tolist()
@@ -388,5 +408,7 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     if kept.alarm is None:
         return kept
     over = decided >= kept.alarm.threshold_nats
-    over_ns = tuple(kept.stamp_ns if now else ns for now, ns in zip(over, kept.over_ns, strict=True))
-    return replace(kept, over_ns=over_ns)
+    # A risk that denies an alarm ends it: it is not held, and does not come back by itself.
+    sides = zip(over, kept.over_ns, kept.sides.risks, strict=True)
+    over_ns = (None if risk < LEAST_RISK else kept.stamp_ns if now else ns for now, ns, risk in sides)
+    return replace(kept, over_ns=tuple(over_ns))

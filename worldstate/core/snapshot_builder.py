@@ -25,7 +25,15 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import PARKED_ACCELERATION, Track, hidden_share
 from worldstate.ground import FloatArray, seconds
-from worldstate.state import Classification, Context, Entity, SearchedView, SensorHealth, Visibility
+from worldstate.state import (
+    Classification,
+    Context,
+    Entity,
+    Hearing,
+    SearchedView,
+    SensorHealth,
+    Visibility,
+)
 from worldstate.state.sensor import Ego
 
 from .memory import NEWS_HOLDS_NS, CountedLook, Memory
@@ -221,6 +229,14 @@ def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
     looked = {look.sensor: (look.stamp_ns, _look_fault(look)) for look in memory.looks}
     told = sorted((looked | spoke).items())
     return tuple(_health(name, ns, fault, memory.stamp_ns) for name, (ns, fault) in told)
+
+
+def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
+    """Return how well every source that listens could hear; of one that is silent nothing is known."""
+    listening = [one for one in memory.rules if not one.announced]
+    fresh = [one for one in listening if memory.stamp_ns <= one.stamp_ns + NEWS_HOLDS_NS]
+    told = tuple(Hearing(one.source, one.heard.share, one.heard_ns, one.heard.reason) for one in fresh)
+    return told if listening else None
 
 
 def _health(sensor: str, stamp_ns: int, fault: str | None, now_ns: int) -> SensorHealth:

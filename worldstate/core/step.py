@@ -5,6 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from operator import attrgetter
 
+import numpy as np
+
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.belief.hidden_bearing import announced, hidden_motion
@@ -120,14 +122,29 @@ def update_evidence(memory: Memory, measurement: Measurement, weight: float, mod
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
     settings, windows = model.site.settings, memory.windows
     memory = replace(memory, predicted=memory.sides.hypotheses)
-    if windows is not None:
+    if windows is not None and measurement.heard.usable:
         source, stamp_ns = measurement.source, measurement.stamp_ns
         window_ns, rates_hz = nanoseconds(settings.window_s), model.context.rates.values_hz
         looked = log_co_evidence(measurement.co_evidence, len(model.site.sides))
-        signature = _with_hand_overs(measurement.signature, memory.handover_ns, stamp_ns - window_ns)
+        said = masked_by(measurement.signature, measurement.heard.share)
+        signature = _with_hand_overs(said, memory.handover_ns, stamp_ns - window_ns)
         windows, prior = windows.update(source, stamp_ns, signature, looked, rates_hz, window_ns)
         memory = replace(memory, windows=windows, predicted=prior.sides.hypotheses)
     return acoustic_update(memory, measurement, weight, settings)
+
+
+def masked_by(signature: SignatureEvidence, share: float) -> SignatureEvidence:
+    r"""Return the evidence of a window in which a hidden vehicle is noticed with a probability s.
+
+    .. math:: l'_{hid,k} = s\, l_{hid,k} + (1 - s)\, \tfrac{1}{2} (l_{vis} + l_0)
+
+    One that is masked sounds as if it were not there.
+    """
+    if share >= 1.0:
+        return signature
+    rest = float(np.logaddexp(signature.visible, signature.none)) + math.log(0.5 * (1.0 - share))
+    heard = np.logaddexp(np.array(signature.hidden) + math.log(share), rest)
+    return replace(signature, hidden=tuple(heard.tolist()))
 
 
 def _with_hand_overs(
