@@ -18,7 +18,6 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.expert import Expert
 from worldstate.abduction.signature.site_reference import SiteReference
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
-from worldstate.adapters.acoustic import LEAST_HEARD
 from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
@@ -142,7 +141,7 @@ def lossy(folder: Path, tmp_path: Path, seconds: float) -> tuple[list[Step], lis
 def test_lost_sound_is_no_evidence_and_leaves_nothing_behind(folder: Path, tmp_path: Path) -> None:
     hurt, whole = lossy(folder, tmp_path, 1.0)
     measured = {round(step.state.stamp_ns / 1e9, 1): step.measurement for step in hurt}
-    unheard = [at for at, one in measured.items() if one.heard.share < LEAST_HEARD]
+    unheard = [at for at, one in measured.items() if not one.heard.usable]
     # From the first lost hop until four tenths of the window are sound again.
     assert unheard == [round(3.1 + 0.1 * k, 1) for k in range(13)]
     refused = NotUsable("lost samples")

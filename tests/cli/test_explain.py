@@ -53,7 +53,6 @@ left: advisory raised: not below the threshold now
     prior                    -0.41         -0.41
     sequence                 +2.79         +2.79
     look camera              +0.59         +0.59
-    emerged                  +0.00         +0.00
     together                 +2.97         +2.97
     mean of .3 s             +1.63         +2.97
     threshold                +1.00         +1.00
@@ -73,7 +72,6 @@ left: advisory held: below the threshold now, it ends without news
     prior                    -0.41         -0.41
     sequence                 +2.79         -1.24
     look camera              +0.59         +0.59
-    emerged                  +0.00         +0.00
     together                 +2.97         -1.05
     mean of .3 s             +1.63         -1.05
     threshold                +1.00         +1.00
@@ -137,9 +135,9 @@ def test_a_time_outside_and_a_side_that_is_none_are_named(words, said, states, c
 
 def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, tmp_path, capsys):
     file = tmp_path / "old.jsonl"
-    file.write_text(states.read_text().replace('"version":"2.1.0"', '"version":"1.5.0"'))
+    file.write_text(states.read_text().replace('"version":"3.0.0"', '"version":"2.1.0"'))
     assert main(["explain", str(file), "--time", "1"]) == 2
-    assert "old.jsonl: expected schema worldstate.Snapshot 2.x, got" in (said := capsys.readouterr().err)
+    assert "old.jsonl: expected schema worldstate.Snapshot 3.x, got" in (said := capsys.readouterr().err)
     assert "write it anew" in said
     file.write_text("")
     assert main(["explain", str(file), "--time", "1"]) == 2

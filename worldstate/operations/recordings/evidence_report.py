@@ -13,7 +13,7 @@ Standing: TypeAlias = Literal["raised", "held", "above", "below"]
 _SAID = {
     "raised": "raised: not below the threshold now",
     "held": "held: below the threshold now, it ends without news",
-    "above": "none yet, though above the threshold: not for long enough, or the other side is likelier",
+    "above": "none, though above the threshold: the risk denies it, or there is no second of sound yet",
     "below": "none: below the threshold",
 }
 _OF = {
@@ -82,7 +82,7 @@ class SideEvidenceReport:
         above = evidence is not None and evidence.compared_nats >= evidence.threshold_nats
         if self.cue.advisory is None:
             return "above" if above else "below"
-        return "raised" if above else "held"
+        return "raised" if self.cue.held is None else "held"
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON-able values."""
@@ -102,6 +102,8 @@ class SideEvidenceReport:
             since_s, until_s = seconds(told.since_ns), seconds(told.valid_until_ns)
             rests = ", ".join(f"{one.sensor} ({one.condition})" for one in told.sensors)
             yield f"  since {since_s:.2f} s, valid until {until_s:.2f} s, rests on {rests or 'no sensor'}"
+        if cue.not_advised is not None:
+            yield f"  although the risk is high: {cue.not_advised}"
         yield from self._terms(now_s)
         yield f"  side: {cue.confidence:.2f} of what is hidden; risk {cue.risk:.2f}"
         if cue.within is not None:
@@ -149,6 +151,10 @@ def common_lines(state: WorldState) -> Iterator[str]:
         yield f"sound: a warning signal ({state.domain.signal})"
     if state.no_sequence is not None:
         yield f"sequence: not used, {state.no_sequence.reason}"
+    for hearing in state.heard or ():
+        if hearing.reason is not None:
+            since = f"{hearing.reason} since {seconds(hearing.since_ns):.2f} s"
+            yield f"heard by {hearing.sensor}: {hearing.share:.2f} of hidden vehicles would be, {since}"
     for one in state.sensors:
         yield f"sensor {one.sensor}: {one.condition}{f' ({one.reason})' if one.reason else ''}"
     for view in state.searched:
