@@ -74,8 +74,9 @@ class ArrivalRate:
 
     @property
     def follower_share(self) -> float:
-        """P(another one comes within eight seconds of one)."""
-        return (_FOLLOWED * _FOLLOWED_SHAPE + self.followed) / (_FOLLOWED_SHAPE + self.count)
+        """P(another one comes within eight seconds of one), in hundredths."""
+        # What is forgotten depends in its last digits on how a time is divided into steps.
+        return round((_FOLLOWED * _FOLLOWED_SHAPE + self.followed) / (_FOLLOWED_SHAPE + self.count), 2)
 
     def shift_nats(self, usual_hz: float) -> float:
         """Return by how much the log-odds of a vehicle coming differ from usual, in steps of .1 nats.
