@@ -40,7 +40,7 @@ class AcousticFrame:
     peaks : tuple of Peak
         All peaks of that spectrum, highest first, at most four; the first is the bearing.
     band_log_energy : ndarray of float64, shape (16,)
-        Natural logarithm of the mean square of the last hop per band.
+        Natural logarithm of the mean square of the last hop per band; of the last one that could be heard.
     looming : Looming or NotUsable
         Approach rate at the end of the window.
     feature : ndarray of float64, shape (60,)
@@ -60,9 +60,11 @@ class AcousticFrame:
         frames that hold lost samples are left out of everything here; means are over the others.
     heard : float
         Share that could be heard, of the newest hop or of the window, whichever is less; 0 where less than .4
-        of the window is left.
+        of the window is left. Hops of which less than .2 could be heard are left out of everything here.
     unheard : str or None
-        Why the rest could not.
+        Why the rest could not: "lost samples", "wind" or "noise far above this place's usual".
+    excess_db : float
+        Level of the newest hop above the quiet street, a mean over bands, decibels.
 
     Examples
     --------
@@ -94,4 +96,5 @@ class AcousticFrame:
     character: FloatArray | NotUsable = CHARACTER_IS_OFF
     lost: float = 0.0
     heard: float = 1.0
+    excess_db: float = 0.0
     unheard: str | None = None

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequ
 from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, Float32Array, FloatArray
 
 from .settings import ELEVATIONS_RAD, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
+
+# Share that could be heard below which a hop is left out of its window; `Heard.usable` has the same.
+_LEAST_HEARD = 0.2
 
 
 def hop_end(index: int, sample_rate_hz: float) -> int:
@@ -84,6 +87,8 @@ class HopSums:
 
     heard: BoolArray  # shape (frames,): Frames without lost samples, of which the sums are
     lost: float  # Share of the samples of the hop that are lost
+    share: float  # Share of the hop that lost samples and noise leave to be heard
+    unheard: str | None  # What takes the rest
     centre: float  # Mean of the middles of these frames, samples from the start of the stream
     # shape (elevations * azimuths,): Steered power. Where microphones are left out, power and pairs are
     # scaled to the value for all of them.
@@ -96,6 +101,16 @@ class HopSums:
     def n_frames(self) -> int:
         """Number of frames that the sums are of."""
         return int(np.count_nonzero(self.heard))
+
+    def masked(self, share: float, reason: str | None) -> "HopSums":
+        """Return the hop where noise leaves a share to be heard; below .2 its sums are empty."""
+        if share >= self.share:
+            return self
+        if share >= _LEAST_HEARD:
+            return replace(self, share=share, unheard=reason)
+        arrays = ("heard", "power", "pairs", "energies")
+        nothing = {name: np.zeros_like(getattr(self, name)) for name in arrays}
+        return replace(self, share=share, unheard=reason, **nothing)
 
 
 class HopSpectra:
@@ -143,7 +158,9 @@ class HopSpectra:
         health.mask.silence(whitened)
         srp, pairs = self._sums(prewhitened, whitened, matrices, health.mask)
         mean_square = energies.sum(axis=0) / max(len(energies), 1)
-        return HopSums(heard, float(lost.mean()), centre, srp, pairs, mean_square, health)
+        share = float(lost.mean())
+        reason = "lost samples" if share else None
+        return HopSums(heard, share, 1.0 - share, reason, centre, srp, pairs, mean_square, health)
 
     def _heard_frames(self, lost: BoolArray, n_new: int) -> BoolArray:
         """Return which new frames hold no lost sample; lost has shape (n,)."""

@@ -48,7 +48,7 @@ class FrontEndSettings:
     ego_noise : EgoNoiseSettings, optional
         Settings of ego-noise suppression, used with `FrontEnd.learn_ego_noise`; None switches it off.
     watch_channels : bool
-        Detect faulty microphones and leave them out.
+        Detect faulty microphones, lost samples and masking noise, and leave them out.
     character : bool
         Measure what one microphone hears over two seconds: `AcousticFrame.character`.
     feature_order : tuple of int, optional

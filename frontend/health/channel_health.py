@@ -99,6 +99,8 @@ class ArrayHealth:
     coherence : float or NotUsable
         Median over the channels of the coherence with the prediction from the others. Not usable in the
         first second and without a coherent sound; swapped, inverted and noisy channels are then not found.
+    clipped : float
+        Share of the samples of the hop that are clipped, over all channels.
 
     Examples
     --------
@@ -112,6 +114,7 @@ class ArrayHealth:
     dropouts: tuple[Dropout, ...]
     n_dropouts: int
     coherence: float | NotUsable
+    clipped: float = 0.0
 
     @classmethod
     def unknown(cls, n_channels: int, reason: str = "no hop so far") -> "ArrayHealth":

@@ -32,6 +32,7 @@ class ClippingCounter:
         self._extreme = np.full((2, n_channels), -np.inf, np.float32)
         self._at = np.zeros((2, n_channels), np.int64)
         self._below = np.zeros((2, n_channels), np.int64)
+        self.newest_share = 0.0  # Share of the newest hop at a clipping level, over all channels
 
     def push(self, samples: Float32Array, lowest: Float32Array, highest: Float32Array) -> None:
         r"""Take the samples (n, M) of a hop and their extremes (M,).
@@ -43,6 +44,7 @@ class ClippingCounter:
         """
         # Counted for x and for -x; s is the span of the hop.
         self._n_samples += len(samples)
+        self.newest_share = 0.0
         span = highest - lowest
         self._side(0, np.float32(1.0), samples, highest, span)
         self._side(1, np.float32(-1.0), samples, -lowest, span)
@@ -69,13 +71,19 @@ class ClippingCounter:
             fine = extreme[reached] - next_level < _COARSE * half
             at[reached] += n_at * fine
             below[reached] += n_below * fine
+            n_clipped = int((n_at * fine * self._is_clipped[side, reached]).sum())
+            self.newest_share += n_clipped / samples.size
+
+    @property
+    def _is_clipped(self) -> BoolArray:
+        return np.asarray((self._at >= _MIN_COUNT) & (self._at > self._below))
 
     def clipped_share(self) -> FloatArray:
         r"""Share of all samples at a clipping level, shape (M,); 0 for channels without one.
 
         .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]
         """
-        clipped = np.where((self._at >= _MIN_COUNT) & (self._at > self._below), self._at, 0)
+        clipped = np.where(self._is_clipped, self._at, 0)
         return np.asarray(clipped.sum(axis=0) / max(self._n_samples, 1))
 
 
@@ -345,6 +353,7 @@ class ChannelMonitor:
             self._dropouts,
             self._n_dropouts,
             self._geometry_check.coherence,
+            self._clipping.newest_share,
         )
 
     def _single_channel_faults(self) -> list[ChannelFault]:

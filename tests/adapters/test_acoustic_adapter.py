@@ -18,7 +18,7 @@ from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, Measurement, MeasurementAdapter
+from worldstate.measurement.measurement import Approach, Bearing, Heard, Measurement, MeasurementAdapter
 
 RATE_HZ = 16_000
 SPEED_OF_SOUND_M_S = 343.0
@@ -174,6 +174,60 @@ def test_faults_of_microphones_are_told_and_stand_in_the_snapshot() -> None:
     assert (whole.fault, measured.fault) == (None, "microphones: 2 dead")
     (told,) = WorldFilter().update(measured).state.sensors
     assert (told.condition, told.reason) == ("impaired", measured.fault)
+
+
+def hurt(sound: np.ndarray, fault: str) -> np.ndarray:
+    """Hurt a second of sound from 2.5 s on."""
+    second, rng = slice(5 * RATE_HZ // 2, 7 * RATE_HZ // 2), np.random.default_rng(0)
+    if fault == "lost samples":
+        sound[second] = 0.0
+    elif fault == "dead channels":
+        sound[second, 1:] = 0.0
+    elif fault == "wind":
+        spectrum = np.fft.rfft(rng.standard_normal((RATE_HZ, 12)), axis=0)
+        spectrum[300:] = 0.0
+        sound[second] += 5.0 * np.fft.irfft(spectrum, RATE_HZ, axis=0)
+    else:
+        sound[second] += 0.9 * rng.standard_normal((RATE_HZ, 1 if "same" in fault else 12))
+    return sound
+
+
+@pytest.mark.parametrize(
+    "fault", ["lost samples", "dead channels", "wind", "noise", "noise that is the same in all"]
+)
+def test_what_cannot_be_heard_is_said_and_is_no_evidence(fault: str) -> None:
+    hurt_sound = hurt(plane_wave(0.3, 5.0), fault)
+    measured = AcousticAdapter(ARRAY, RATE_HZ, Level(left=3.0)).measure(hurt_sound)
+    unheard = [m for m in measured if not m.heard.usable]
+    covered = [m for m in measured if 2.65 < m.stamp_ns / 1e9 <= 3.501]
+    assert all(m in unheard for m in covered)
+    # A microphone that failed is left out for five seconds more.
+    assert fault == "dead channels" or all(2.5 < m.stamp_ns / 1e9 < 4.05 for m in unheard)
+    reason = "noise far above this place's usual" if "noise" in fault else fault
+    assert {m.heard.reason for m in covered} == {reason}
+    for one in unheard:
+        assert isinstance(one.bearing, NotUsable) and isinstance(one.approach, NotUsable)
+        assert set(one.signature.log_likelihoods) == {0.0}
+    assert fault == "dead channels" or measured[-1].heard == Heard()
+    assert {m.heard for m in measured if m.stamp_ns / 1e9 <= 2.5} == {Heard()}
+
+
+def test_sound_that_clips_in_half_of_its_samples_is_not_heard() -> None:
+    sound = 20.0 * plane_wave(0.3, 5.0)
+    sound *= np.exp(np.minimum(np.arange(len(sound)) / RATE_HZ - 4.0, 0.0))[:, None]
+    half = np.quantile(np.abs(sound[-RATE_HZ:]), 0.4)
+    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(np.clip(sound, -half, half))
+    assert measured[0].heard.share > 0.9
+    assert measured[-1].heard == Heard(0.0, "clipped")
+
+
+def test_a_loud_source_in_view_hides_others_and_is_not_called_noise() -> None:
+    sound = plane_wave(0.3, 6.0)
+    sound *= np.exp(np.clip(np.arange(len(sound)) / RATE_HZ - 2.0, 0.0, 2.5))[:, None]
+    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(sound)
+    assert measured[5].heard == Heard()
+    assert measured[-1].heard.reason == "loud source in view"
+    assert measured[-1].heard.usable and measured[-1].heard.share < 0.5
 
 
 def test_keeps_the_last_frame_for_plots() -> None:

@@ -18,6 +18,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.levels import BANDS, NoiseMeter
 from worldstate.frontend.settings import ELEVATIONS_RAD, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -335,3 +336,57 @@ def test_where_a_whole_window_is_lost_nothing_is_heard_and_the_channels_are_not_
     assert all(not frame.feature.any() and frame.prominence == 1.0 for frame in gone)
     assert all(np.isfinite(frame.band_log_energy).all() and frame.bearing_age_s >= 0.0 for frame in frames)
     assert frames[-1].lost == 0.0
+
+
+LEVELS = st.lists(st.floats(-20.0, -5.0), min_size=BANDS, max_size=BANDS)
+
+
+@settings(max_examples=30)
+@given(LEVELS, st.floats(-5.0, 5.0), st.floats(0.01, 1.0), st.lists(st.floats(-0.2, 0.2), max_size=40))
+def test_a_street_that_changes_slowly_is_never_masked(
+    levels: list[float], gain: float, coherence: float, steps: list[float]
+) -> None:
+    """Up to .9 dB a hop and 35 dB in all, at any level, as long as it is no less coherent than usual."""
+    meter, level = NoiseMeter(), np.array(levels) + gain
+    for step in (0.0, *steps, *([0.2] * 10)):
+        level = level + step
+        assert meter.push(level, coherence) == (1.0, None)
+
+
+@settings(max_examples=30)
+@given(LEVELS, st.floats(2.5, 6.0), st.integers(1, 30), st.floats(-5.0, 5.0), st.booleans())
+def test_a_burst_of_noise_is_masked_until_it_ends_at_any_gain(
+    levels: list[float], nats: float, hops: int, gain: float, incoherent: bool
+) -> None:
+    meter, level = NoiseMeter(), np.array(levels) + gain
+    assert {meter.push(level, 0.5) for _ in range(50)} == {(1.0, None)}
+    burst = [meter.push(level + nats, 0.1 if incoherent else 0.5) for _ in range(hops)]
+    # A street that is as loud for a fifth of the time is a loud one.
+    assert set(burst[:10]) == {(0.0, "noise far above this place's usual")}
+    assert meter.push(level + 0.5, 0.5) == (1.0, None)
+
+
+def test_what_lasts_for_ten_seconds_is_the_sound_of_the_place() -> None:
+    meter, level = NoiseMeter(), np.full(BANDS, -12.0)
+    shares = [meter.push(level + (3.0 if hop > 100 else 0.0), 0.5)[0] for hop in range(230)]
+    assert set(shares[:101]) == {1.0} and set(shares[101:200]) == {0.0} and set(shares[203:]) == {1.0}
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(17_600, 30_000), st.integers(3200, 9600), st.booleans())
+def test_what_noise_covers_is_left_out_of_the_window(first: int, length: int, same: bool) -> None:
+    rate, sound, rng = 16_000, noise_from(SQUARE, 0.5, 16_000, 3.5), np.random.default_rng(1)
+    noise = 20.0 * rng.standard_normal((length, 1 if same else 4))
+    hurt = sound.copy()
+    hurt[first : first + length] += noise
+    ours, theirs = (FrontEnd(SQUARE, rate).process(one) for one in (hurt, sound))
+    for one, other in zip(ours, theirs, strict=True):
+        begin, end = one.sample_index - 1600, one.sample_index
+        if first <= begin and end <= first + length:
+            assert (one.heard, one.unheard) == (0.0, "noise far above this place's usual")
+        if one.heard >= 0.4:
+            # At its ends a hop may hold so little noise that the level rises by less than 10 dB.
+            assert abs(one.bearing_rad - 0.5) < 0.05
+            np.testing.assert_allclose(one.feature, other.feature, atol=0.3)
+            assert one.band_log_energy.mean() < other.band_log_energy.mean() + 2.3
+    assert ours[-1].heard == 1.0 and theirs[-1].heard == min(one.heard for one in theirs) == 1.0

@@ -21,6 +21,7 @@ from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground import checks
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import (
     Approach,
@@ -230,6 +231,16 @@ def test_whole_numbers_and_numpy_numbers_are_taken_as_what_they_say():
         other = other.update(measured(hop, **numbers))
     assert other.state.to_json() == plain.state.to_json()
     assert json.dumps(other.to_dict()) == json.dumps(plain.to_dict())
+
+
+def test_how_well_was_heard_is_written_and_may_be_missing():
+    one = measured(1, heard=Heard(0.4, "wind"))
+    record = encode(one)
+    assert decode(Measurement, record, "measurement") == one
+    del record["heard"]
+    assert decode(Measurement, record, "measurement") == replace(one, heard=Heard())
+    with pytest.raises(InvalidArgumentError, match=r"share: expected a number in \[0\.0, 1\.0\], got 1\.5"):
+        Heard(1.5)
 
 
 def test_a_filter_that_is_certain_leaves_a_checkpoint_that_reads():

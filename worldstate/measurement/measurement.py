@@ -360,6 +360,7 @@ class MeasurementAdapter(Protocol[RawT]):
       constant. A modality that cannot tell hidden from visible gives both the same value.
     - Say `Unqueried` where no co-evidence channel was asked, and `NotUsable` with the reason for a bearing or
       an approach rate that cannot be given. Never put 0 or NaN in their place.
+    - Say in `heard` how likely a hidden vehicle would have been noticed, where that is less than 1.
     - Azimuth is in `base_link`, radians, left positive, in (-pi, pi]. Convert here, nowhere else.
     - Check raw input once, here, and raise the typed errors of `worldstate.errors`.
 
