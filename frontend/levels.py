@@ -115,7 +115,9 @@ _INCOHERENT = 0.5
 # Decibels above the quiet street: of vehicles that are hidden 1 to 8 s before they come into view 1 to 10.
 # Below the first, incoherent noise hides none of them, above the second all.
 _NOISE_DB = (6.0, 12.0)
-# Rise above the loudest of the last three hops. Vehicles, van and edge included, rise by less than 3 dB.
+# Rise above the loudest of the last three hops. Vehicles, van and edge included, rise by less than 3 dB; in
+# five minutes of busy simulated streets no hop is masked. Of 394 real clips one of 29 idling engines is, no
+# siren of 32, and 27 of 29 shots.
 _JUMP_DB, _JUMP_HOPS = (6.0, 10.0), 3
 # Fall below the loudest hop of a noise by which it ends; what lasts ten seconds is the place's own.
 _END_DB, _LONGEST_HOPS = 5.0, 100

@@ -33,7 +33,7 @@ __all__ = ["AcousticFrame", "FrontEnd"]
 # Far above full scale of any converter; the power of an STFT frame still fits single precision.
 _LOUDEST = 1e15
 # Share of a window: with .6 s lost the feature and the evidence of a side are off by as much as they change
-# in half a second (medians .08 of .10 and .36 of .30 nats, twelve simulated demos), with .7 s by .54 nats.
+# in half a second (medians .08 of .10 and .29 of .30 nats, twelve simulated demos), with .7 s by .39 nats.
 _LEAST_OF_WINDOW = 0.4 - 1e-9
 # Of a tenth of a second the feature is off: fourteen demos after a lost second, probability that a vehicle
 # comes .349 with it, .361 with the whole window in its place, .43 without the loss.

@@ -280,6 +280,18 @@ def test_running_second_is_the_srp_of_the_frames_that_end_in_it() -> None:
     assert frame.bearing_age_s == pytest.approx(1.2 - centres.mean() / rate)
 
 
+def test_clean_sound_is_what_it_is_without_a_look_for_what_is_lost() -> None:
+    sound, chosen = noise_from(SQUARE, 0.5, RATE, 2.0), FrontEndSettings(character=True)
+    watched, plain = (
+        FrontEnd(SQUARE, RATE, replace(chosen, watch_channels=on)).process(sound) for on in (True, False)
+    )
+    for one, other in zip(watched, plain, strict=True):
+        for name in ("feature", "srp", "band_log_energy", "bearing_rad", "prominence", "bearing_age_s"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        assert one.looming == other.looming
+        assert (one.lost, one.heard, one.unheard) == (0.0, 1.0, None)
+
+
 def lose(sound: np.ndarray, first: int, length: int, value: float = 0.0) -> np.ndarray:
     hurt = sound.copy()
     hurt[first : first + length] = value
