@@ -128,9 +128,7 @@ def test_hand_over_moves_mass_into_view_and_keeps_the_sum(hidden, residual):
     start = start.predict((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 10**9)
     after = start.emerge(0, residual)
     assert after.hidden[0] == pytest.approx(residual * start.hidden[0], abs=1e-12)
-    assert (after.emerged[0], after.hidden[1]) == pytest.approx(
-        (0.0, residual * start.hidden[1]), abs=1e-12
-    )
+    assert (after.emerged[0], after.hidden[1]) == pytest.approx((0.0, residual * start.hidden[1]), abs=1e-12)
     assert after.probabilities.sum() == pytest.approx(1.0)
 
 

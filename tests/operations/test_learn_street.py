@@ -14,7 +14,6 @@ from worldstate.ground.errors import InputFileError, SchemaVersionError
 from worldstate.operations.labelling.street_file import read_street, write_street
 from worldstate.operations.labelling.street_passes import (
     HeardStreet,
-    looks_at,
     streets_after,
     watched_recording,
 )
@@ -59,13 +58,6 @@ def test_sound_belongs_to_a_pass_unless_the_other_arm_is_heard_too(recording):
     assert heard.before(replace(first, t0=replace(first.t0, time_s=99.0)), [first]) is None
 
 
-def test_images_without_a_box_between_boxes_are_misses(recording):
-    found, missed = looks_at(recording.tracks[0], recording.image_s)
-    assert len(found) + len(missed) >= 10
-    # One in ten is left out by the camera.
-    assert 0 < len(missed) < 0.4 * len(found)
-
-
 def test_a_street_with_rates_of_the_version_before_is_read_with_a_note(street, tmp_path):
     write_street(tmp_path / "street.json", street[-1])
     told = json.loads((tmp_path / "street.json").read_text())
@@ -97,12 +89,22 @@ def test_what_is_no_street_is_refused_by_name(text, tmp_path):
         read_street(tmp_path / "street.json")
 
 
-def test_a_street_with_other_bins_is_refused(street, tmp_path):
+def test_a_street_of_other_arms_is_refused(street, tmp_path):
     write_street(tmp_path / "street.json", street[-1])
-    told = json.loads((tmp_path / "street.json").read_text()) | {"looks": [1.0]}
+    told = json.loads((tmp_path / "street.json").read_text())
+    told["arms"].reverse()
     (tmp_path / "street.json").write_text(json.dumps(told))
-    with pytest.raises(InputFileError, match="18 bins"):
+    with pytest.raises(InputFileError, match="expected the arms"):
         read_street(tmp_path / "street.json")
+
+
+def test_a_street_with_misses_of_the_camera_is_read_without_them(street, tmp_path):
+    write_street(tmp_path / "street.json", street[-1])
+    told = json.loads((tmp_path / "street.json").read_text())
+    told["schema"]["version"] = "1.2.0"
+    told |= {"looks": [3.0] * 18, "missed": [1.0] * 18}
+    (tmp_path / "street.json").write_text(json.dumps(told))
+    assert read_street(tmp_path / "street.json") == street[-1]
 
 
 def test_the_command_learns_goes_on_and_run_takes_it(approach, tmp_path, capsys):

@@ -1,10 +1,9 @@
-"""A street learned from the vehicles that passed: edges, pace, arrivals, missed boxes, sound of its arms.
+"""A street learned from the vehicles that passed: edges, pace, arrivals, sound of its arms.
 
 Only sufficient statistics are kept: a pass is added, and time forgotten, without the passes before it.
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
@@ -23,10 +22,6 @@ FORGETTING_S = 30.0 * DAY_S
 # Of the logarithm: drivers at a usual corner have .5 per second; simulated junctions have .4 to .7 in the
 # median, and their drivers differ by a factor of 1.35.
 PACE_PRIOR = NormalPrior(math.log(0.5), 0.22, 0.3)
-# Detectors miss by azimuth as slowly as lenses distort; narrower bins stay empty for hours.
-BIN_RAD, BINS = math.radians(5.0), 18
-# One miss in 25 looks, the paper's at boresight, until the bin has seen more.
-_USUAL_MISSES, _USUAL_LOOKS = 1.0, 25.0
 # An arm of which no edge was seen keeps the corner of a usual junction.
 _LEAST_WEIGHT = 0.5
 
@@ -109,27 +104,17 @@ class LearnedStreet:
     (0.5, 0.44)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.LearnedStreet", "1.2.0")
+    LAYOUT: ClassVar = Layout("worldstate.LearnedStreet", "1.3.0")
 
     site: str | None = None
     arms: tuple[LearnedArm, LearnedArm] = (LearnedArm("left"), LearnedArm("right"))
-    looks: tuple[float, ...] = (0.0,) * BINS  # At a vehicle in view, by azimuth from the right
-    missed: tuple[float, ...] = (0.0,) * BINS  # Of these, in which the camera reported nothing there
     # What either arm sounds like
     patterns: SidePatterns = field(default_factory=SidePatterns, metadata=ADDED)
 
     def __post_init__(self) -> None:
         directions = tuple(arm.direction for arm in self.arms)
-        if directions != ARMS or {len(self.looks), len(self.missed)} != {BINS}:
-            told = f"{directions}, {len(self.looks)} and {len(self.missed)}"
-            raise InvalidArgumentError(
-                f"arms, looks, missed: expected the arms {ARMS} and {BINS} bins of azimuth, got {told}"
-            )
-
-    def detection(self, azimuth_rad: float) -> float:
-        """Return the probability that the camera reports a vehicle at an azimuth."""
-        at = _bin(azimuth_rad)
-        return 1.0 - (_USUAL_MISSES + self.missed[at]) / (_USUAL_LOOKS + self.looks[at])
+        if directions != ARMS:
+            raise InvalidArgumentError(f"arms: expected the arms {ARMS}, got {directions}")
 
 
 def with_pass(street: LearnedStreet, one: StreetPass) -> LearnedStreet:
@@ -146,30 +131,11 @@ def watched(street: LearnedStreet, time_s: float) -> LearnedStreet:
     return replace(street, arms=(left, right))
 
 
-def with_looks(
-    street: LearnedStreet, found_rad: Iterable[float], missed_rad: Iterable[float]
-) -> LearnedStreet:
-    """Return the street after looks at vehicles in view, by the azimuths where these stood."""
-    looks, missed = list(street.looks), list(street.missed)
-    for azimuth_rad in found_rad:
-        looks[_bin(azimuth_rad)] += 1.0
-    for azimuth_rad in missed_rad:
-        looks[_bin(azimuth_rad)] += 1.0
-        missed[_bin(azimuth_rad)] += 1.0
-    return replace(street, looks=tuple(looks), missed=tuple(missed))
-
-
 def forgotten(street: LearnedStreet, time_s: float) -> LearnedStreet:
     """Return the street some time later: everything counts less, and means stay where they are."""
     factor = math.exp(-in_range("time_s", time_s, 0.0, 1e12) / FORGETTING_S)
     left, right = (arm.faded(factor) for arm in street.arms)
-    looks, missed = (tuple(factor * one for one in many) for many in (street.looks, street.missed))
-    patterns = street.patterns.faded(factor)
-    return replace(street, arms=(left, right), looks=looks, missed=missed, patterns=patterns)
-
-
-def _bin(azimuth_rad: float) -> int:
-    return min(max(math.floor(azimuth_rad / BIN_RAD) + BINS // 2, 0), BINS - 1)
+    return replace(street, arms=(left, right), patterns=street.patterns.faded(factor))
 
 
 def context_of(street: LearnedStreet) -> Context:

@@ -1,9 +1,8 @@
 """`worldstate street learn`: what the vehicles that passed tell of a street.
 
 Join the camera's boxes into passes, smooth them, and learn from each vehicle that came out of hiding: where
-the edge stands past which it came into view, how fast it was there, what either arm sounded like before, how
-many come from either side in which time, and how often the camera misses a vehicle in view, by azimuth. For a
-standing ego.
+the edge stands past which it came into view, how fast it was there, what either arm sounded like before, and
+how many come from either side in which time. For a standing ego.
 
 INPUT is a recording with boxes of a camera, as `worldstate street label` takes it. --known goes on from a
 street that was learned before. `worldstate run --street` takes what --out writes.

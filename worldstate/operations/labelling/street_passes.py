@@ -19,10 +19,10 @@ from worldstate.adapters.source import Source
 from worldstate.adapters.source_files import open_source
 from worldstate.ground import NotUsable, OutOfDomainError, seconds
 from worldstate.ground.typing import FloatArray
-from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_looks, with_pass
+from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_pass
 
-from .box_tracks import BoxTrack, box_tracks
-from .pass_labels import HOP_S, PassLabel, label_passes
+from .box_tracks import box_tracks
+from .pass_labels import PassLabel, label_passes
 
 # No vehicle comes out of an arm nearer to the axis: one that turns there has overtaken, or was two.
 _LEAST_EDGE_RAD = math.radians(5.0)
@@ -77,21 +77,17 @@ class HeardStreet:
 class WatchedRecording:
     """What a camera saw of a street in one recording, and what was heard."""
 
-    tracks: Sequence[BoxTrack]
     passes: Sequence[PassLabel]
     duration_s: float
-    image_s: float  # Between images
     heard: HeardStreet | None = None  # Meanwhile, where there is sound
 
 
 def watched_recording(
     log: DetectionLog, camera: PinholeCamera, keep: DetectionFilter, duration_s: float
 ) -> WatchedRecording:
-    """Return the passes of a recording, smoothed, with the boxes that they were made of."""
-    tracks = box_tracks(log, camera, keep)
-    passes = label_passes(tracks, camera.position_m[0])
-    image_s = float(np.median(np.diff(log.stamps_ns))) * 1e-9 if len(log.stamps_ns) > 1 else HOP_S
-    return WatchedRecording(tracks, passes, duration_s, image_s)
+    """Return the passes of a recording, smoothed."""
+    passes = label_passes(box_tracks(log, camera, keep), camera.position_m[0])
+    return WatchedRecording(passes, duration_s)
 
 
 def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterator[LearnedStreet]:
@@ -104,25 +100,7 @@ def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterato
         street = with_pass(watched(street, now_s - before_s), told)
         before_s = now_s
         yield street
-    for track in recording.tracks:
-        street = with_looks(street, *looks_at(track, recording.image_s))
     yield watched(street, recording.duration_s - before_s)
-
-
-def looks_at(track: BoxTrack, image_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return the azimuths at which a vehicle was found, and those where images between had no box of it.
-
-    Before the first box and after the last one it is not known whether it was in view.
-    """
-    middle = 0.5 * (track.left_rad + track.right_rad)
-    whole = np.isfinite(middle)
-    time_s, middle = track.time_s[whole], middle[whole]
-    if time_s.size < 2:
-        return middle, np.zeros(0)
-    images = np.round((time_s - time_s[0]) / image_s)
-    every = np.arange(images[-1] + 1.0)
-    missing = every[~np.isin(every, images)]
-    return middle, np.interp(missing, images, middle)
 
 
 def heard_street(source: Source, model: Model) -> HeardStreet | None:
