@@ -24,11 +24,11 @@ _LEAST_HEARD = 0.2
 
 
 def hop_end(index: int, sample_rate_hz: float) -> int:
-    """Sample at which hop k, `index`, ends: ``n_k = floor(k fs / r + 1/2)`` with r hops a second.
+    """Sample at which hop k, `index`, ends: ``n_k = floor(k fs / r + 1/2)`` with r = 10 hops a second.
 
     Examples
     --------
-    >>> [hop_end(k, 47_998, 10) for k in (0, 1, 2, 10)]
+    >>> [hop_end(k, 47_998) for k in (0, 1, 2, 10)]
     [0, 4800, 9600, 47998]
     """
     return math.floor(index * sample_rate_hz / HOP_RATE_HZ + 0.5)

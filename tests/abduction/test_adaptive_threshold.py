@@ -198,9 +198,9 @@ def test_in_the_filter_a_loud_hazard_is_announced_after_any_number_of_false_alar
     assert heard == 1
 
 
-def test_off_by_default_and_then_a_checkpoint_of_before_still_reads():
+def test_it_is_off_by_default_here_and_in_a_policy_of_before():
     _, world = listen(WorldFilter(), BURST)
     assert world.gamma == world.policy.gamma
     old = world.to_dict()
-    del old["memory"]["threshold"], old["policy"]["adaptive"]
+    del old["policy"]["adaptive"]
     assert WorldFilter.from_dict(old).gamma == world.policy.gamma
