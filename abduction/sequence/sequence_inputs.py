@@ -126,39 +126,6 @@ _ORDER = (_of_side("left", "right"), _of_side("right", "left"))
 _MIRRORED = np.where(np.isin(INPUTS, ("bearing", "bearing_1s", "lean", "lean_1s", "lean_3s")), -1.0, 1.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Columns:
-    """What inputs are made of: columns now and before, and what is usual in the street, one row a hop."""
-
-    now: FloatArray  # shape (n, 13): `columns_of`
-    second: FloatArray  # The same one, two and three seconds before
-    two: FloatArray
-    three: FloatArray
-    highest: FloatArray  # shape (n, 3): Of both sides and the visible, over three seconds
-    swing: FloatArray  # shape (n,): Of the bearing, over one
-    mean_1s: FloatArray  # shape (n, 2): Of the sides, over one second and over three
-    mean_3s: FloatArray
-    usual: FloatArray  # shape (n, 9): Levels of the quiet street, then usual evidence, as `USUAL`
-    bands: FloatArray  # shape (3, n, 4): Levels of the bands now, one and two seconds before
-
-    def inputs(self) -> FloatArray:
-        """Return the inputs of both sides, shape (n, 2, inputs)."""
-        now, second = self.now, self.second
-        spread = now[:, _SPREAD]
-        rest = [now[:, _PROMINENCE], second[:, _PROMINENCE], now[:, _RATE] / spread, np.log(spread)]
-        rest += [now[:, _BEARING], now[:, _BEARING] - second[:, _BEARING], self.swing]
-        changes = [(now - one)[:, :_CHANGING] for one in (second, self.two)]
-        before = (second - self.three)[:, : len(SIDES)]
-        above = (streets_own(now) - self.usual)[:, BANDS:]
-        leans = [side[:, :1] - side[:, 1:2] for side in (now, self.mean_1s, self.mean_3s)]
-        parts = [now[:, :_HIGHEST], above, *changes, before, self.highest, np.stack(rest, axis=1)]
-        bands = [self.bands[0] - self.usual[:, :BANDS], *(self.bands[0] - self.bands[1:])]
-        parts += [self.mean_3s, *leans, *bands]
-        every = np.concatenate(parts, axis=1)
-        left, right = (every[:, order] for order in _ORDER)
-        return np.stack([left, right * _MIRRORED], axis=1)
-
-
 def columns_of(evidence: HopEvidence) -> FloatArray:
     """Return evidence as columns without gaps, shape (n, 13), as `COLUMNS` names them."""
     # Where nothing could be read the rate is 0 and its deviation that of knowing nothing.
@@ -185,21 +152,10 @@ def sequence_inputs(evidence: HopEvidence) -> FloatArray:
     True
     """
     columns = columns_of(evidence)
-    shares = [QUIET_SHARE] * _LEVELS + [USUAL_SHARE] * (len(USUAL) - _LEVELS)
-    usual = [running(one, share) for one, share in zip(streets_own(columns).T, shares, strict=True)]
-    azimuth, bands = columns[:, _BEARING], mean(columns[:, _BAND_COLUMNS], _BAND_HOPS)
-    return _Columns(
-        now=columns,
-        second=ago(columns, _SECOND),
-        two=ago(columns, _TWO),
-        three=ago(columns, _THREE),
-        highest=np.stack([highest(one, _THREE) for one in columns[:, :_HIGHEST].T], axis=1),
-        swing=highest(azimuth, _SECOND) + highest(-azimuth, _SECOND),
-        mean_1s=mean(evidence.sides, _SECOND),
-        mean_3s=mean(evidence.sides, _THREE),
-        usual=np.stack(usual, axis=1),
-        bands=np.stack([bands, ago(bands, _SECOND), ago(bands, _TWO)]),
-    ).inputs()
+    own, ends = streets_own(columns), range(1, len(columns) + 1)
+    # Each hop as a reader reads it: a model is trained on what it is given later, to the bit.
+    rows = [last_inputs(columns[max(n - MEMORY_HOPS, 0) : n], own[max(n - QUIET_HOPS, 0) : n]) for n in ends]
+    return np.concatenate(rows) if rows else np.zeros((0, len(SIDES), len(INPUTS)))
 
 
 def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
@@ -207,90 +163,33 @@ def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
 
     Shapes: recent (up to 31, 13), minute (up to 600, 9).
     """
-    now = len(recent) - 1
 
-    def before(hops: int) -> FloatArray:
-        at = max(now - hops, 0)
-        return recent[at : at + 1]
+    def before(hops: int) -> int:
+        return max(len(recent) - 1 - hops, 0)
 
     def bands(hops: int) -> FloatArray:
-        at = max(now - hops, 0)
+        at = before(hops)
         return np.asarray(recent[max(at - _BAND_HOPS, 0) : at + 1, _BAND_COLUMNS].mean(axis=0))
 
-    swing = recent[-1 - _SECOND :, _BEARING]
+    now, second, two, three = (recent[before(hops)] for hops in (0, _SECOND, _TWO, _THREE))
+    last_second, this_bands = recent[-1 - _SECOND :], bands(0)
+    swing, spread = last_second[:, _BEARING], now[_SPREAD]
+    mean_1s, mean_3s = (rows[:, : len(SIDES)].mean(axis=0) for rows in (last_second, recent))
     usual = [_ranked(minute[:, :_LEVELS], QUIET_SHARE), _ranked(minute[:, _LEVELS:], USUAL_SHARE)]
-    return _Columns(
-        now=recent[-1:],
-        second=before(_SECOND),
-        two=before(_TWO),
-        three=before(_THREE),
-        highest=recent[:, :_HIGHEST].max(axis=0)[None],
-        swing=(swing.max() + (-swing).max())[None],
-        mean_1s=recent[-1 - _SECOND :, : len(SIDES)].mean(axis=0)[None],
-        mean_3s=recent[:, : len(SIDES)].mean(axis=0)[None],
-        usual=np.concatenate(usual)[None],
-        bands=np.stack([bands(0), bands(_SECOND), bands(_TWO)])[:, None],
-    ).inputs()
+    usual_bands, usual_rest = np.split(np.concatenate(usual), [BANDS])
+    rest = [now[_PROMINENCE], second[_PROMINENCE], now[_RATE] / spread, np.log(spread)]
+    rest += [now[_BEARING], now[_BEARING] - second[_BEARING], swing.max() + (-swing).max()]
+    parts = [now[:_HIGHEST], now[_OWN[BANDS:]] - usual_rest]
+    parts += [(now - one)[:_CHANGING] for one in (second, two)]
+    parts += [(second - three)[: len(SIDES)], recent[:, :_HIGHEST].max(axis=0), np.array(rest), mean_3s]
+    parts += [side[:1] - side[1:2] for side in (now, mean_1s, mean_3s)]
+    parts += [this_bands - one for one in (usual_bands, bands(_SECOND), bands(_TWO))]
+    every = np.concatenate(parts)
+    left, right = (every[order] for order in _ORDER)
+    return np.stack([left, right * _MIRRORED])[None]
 
 
 def _ranked(values: FloatArray, share: float) -> FloatArray:
     """Return the value of each column that a share of its rows stays below."""
     rank = int(share * (len(values) - 1))
     return np.asarray(np.partition(values, rank, axis=0)[rank])
-
-
-def ago(values: FloatArray, hops: int) -> FloatArray:
-    """Return what each value was so many hops before; the first one where there is none.
-
-    Examples
-    --------
-    >>> ago(np.array([1.0, 2.0, 3.0]), 1)
-    array([1., 1., 2.])
-    """
-    before = np.maximum(np.arange(len(values)) - hops, 0)
-    return np.asarray(values[before])
-
-
-def mean(values: FloatArray, hops: int) -> FloatArray:
-    """Return the means of each row and those up to so many hops before it, of fewer where there are fewer.
-
-    Examples
-    --------
-    >>> mean(np.array([[3.0], [1.0], [2.0]]), 1).ravel()
-    array([3. , 2. , 1.5])
-    """
-    padded = np.concatenate([np.zeros((hops, values.shape[1])), values])
-    sums = np.lib.stride_tricks.sliding_window_view(padded, hops + 1, axis=0).sum(axis=-1)
-    return np.asarray(sums / np.minimum(np.arange(len(values)) + 1, hops + 1)[:, None])
-
-
-def highest(values: FloatArray, hops: int) -> FloatArray:
-    """Return the largest of each value and those up to so many hops before it.
-
-    Examples
-    --------
-    >>> highest(np.array([3.0, 1.0, 2.0, 0.0]), 1)
-    array([3., 3., 2., 2.])
-    """
-    padded = np.concatenate([np.full(hops, -np.inf), values])
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, hops + 1).max(axis=1))
-
-
-def running(values: FloatArray, share: float) -> FloatArray:
-    """Return the value that a share of the last minute stays below, hop by hop.
-
-    Examples
-    --------
-    >>> running(np.array([3.0, 1.0, 2.0]), 0.5)
-    array([3., 1., 2.])
-    """
-    padded = np.concatenate([np.full(QUIET_HOPS - 1, np.nan), values])
-    found = np.empty(len(values))
-    heard = np.minimum(np.arange(len(values)) + 1, QUIET_HOPS)
-    # NaN sorts last: the rank counts what was heard.
-    rank = np.floor(share * (heard - 1)).astype(np.intp)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, QUIET_HOPS)
-    for begin in range(0, len(values), 1000):
-        block = np.sort(windows[begin : begin + 1000], axis=1)
-        found[begin : begin + 1000] = np.take_along_axis(block, rank[begin : begin + 1000, None], 1)[:, 0]
-    return found

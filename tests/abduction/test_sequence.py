@@ -12,7 +12,6 @@ from worldstate.abduction.sequence.sequence_inputs import (
     INPUTS,
     MEMORY_HOPS,
     HopEvidence,
-    running,
     sequence_inputs,
 )
 from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S, BoostedTrees, SequencePosterior
@@ -51,11 +50,13 @@ def test_three_seconds_are_all_that_is_kept_but_for_the_streets_own_level(seed: 
 
 @given(SEEDS, st.integers(1, 900))
 def test_what_is_usual_in_a_street_is_a_quantile_of_the_last_minute(seed: int, hops: int) -> None:
-    values = np.random.default_rng(seed).normal(size=hops)
-    found = running(values, 0.2)
+    heard = evidence_of(np.random.default_rng(seed), hops)
+    found = sequence_inputs(heard)[:, 0, [INPUTS.index("level"), INPUTS.index("visible_above")]]
     for at in {0, hops // 2, hops - 1}:
-        heard = values[max(at - 599, 0) : at + 1]
-        assert found[at] == np.quantile(heard, 0.2, method="lower")
+        pairs = (heard.level, 0.2), (heard.visible, 0.5)
+        for value, (values, share) in zip(found[at], pairs, strict=True):
+            usual = np.quantile(values[max(at - 599, 0) : at + 1], share, method="lower")
+            assert value == values[at] - usual
 
 
 @given(SEEDS)
