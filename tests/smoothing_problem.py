@@ -68,8 +68,8 @@ def hidden_errors_m(seed: int) -> tuple[float, float]:
         if hop < HIDDEN_HOPS:
             belief = motion.predict(belief, HOP_S, PSD) if hop else belief
             bearing, approach = observed
-            belief = motion.update_azimuth(belief, bearing.azimuth_rad, bearing.std_rad, 1.0)
-            belief = motion.update_approach(belief, approach.inverse_tta_hz, approach.std_hz, 1.0)
+            belief = motion.update(belief, motion.AZIMUTH, bearing.azimuth_rad, bearing.std_rad, 1.0)
+            belief = motion.update(belief, motion.RADIAL_RATE, -approach.inverse_tta_hz, approach.std_hz, 1.0)
             filtered.append(np.exp(belief.mean[3] + 1j * belief.mean[0]))
     z = np.array(filtered)
     true = problem.places_m[:HIDDEN_HOPS]

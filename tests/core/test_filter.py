@@ -15,6 +15,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import statistic
+from worldstate.belief.site_geometry import HIDDEN_BIAS_STD
 from worldstate.belief.track import after_empty_look, after_sighting
 from worldstate.core.acoustic_update import acoustic_update
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError
@@ -148,8 +149,7 @@ def test_looming_becomes_time_to_arrival_and_its_lack_is_unknown():
 
 
 def test_an_assumed_approach_is_not_published():
-    world = start(settings=FilterSettings(hidden_std=(0.15, 0.1, 0.6)))
-    world, _ = run(world, [measured(t, LEFT) for t in hops(1.0, 4.0)])
+    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
     (entity,) = world.state.entities
     assert (entity.inverse_tta_hz, entity.tta_s, world.state.cues[0].horizon_s) == (None, None, None)
 
@@ -168,9 +168,8 @@ def test_a_hidden_azimuth_says_that_it_may_be_biased():
     peak = Bearing(0.6, 0.06, 1.4)
     world, _ = run(start(), [measured(t, LEFT, bearing=peak) for t in hops(1.0, 6.0)])
     spread = world.memory.tracks[0].motion.azimuth_std_rad
-    bias = world.settings.hidden_bias_std_rad
-    assert world.state.entities[0].azimuth_std_rad == pytest.approx(math.hypot(spread, bias))
-    assert world.state.cues[0].azimuth_std_rad == pytest.approx(math.hypot(spread, bias))
+    assert world.state.entities[0].azimuth_std_rad == pytest.approx(math.hypot(spread, HIDDEN_BIAS_STD))
+    assert world.state.cues[0].azimuth_std_rad == pytest.approx(math.hypot(spread, HIDDEN_BIAS_STD))
 
 
 def test_the_sound_from_before_a_hand_over_brings_forth_nobody():
@@ -364,7 +363,7 @@ def test_empty_looks_move_existence_as_bernoulli_says(miss_rate):
     (before,) = world.state.entities
     world = world.update(measured(1.1, FRONT, answer=Absent(miss_rate)))
     (after,) = world.state.entities
-    r = before.existence_probability * math.exp(-0.1 / settings_.visible_life_s)
+    r = before.existence_probability * math.exp(-0.1 / 10.0)
     pd = 1.0 - miss_rate
     assert after.existence_probability == pytest.approx(r * (1 - pd) / (1 - r * pd))
     assert after.visibility.answer == "absent"
@@ -582,9 +581,9 @@ def test_overlapping_bearings_are_not_counted_twice():
     world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
     m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
     (track,) = world.memory.tracks
-    once, often = acoustic_update(world.memory, m, 1.0, FilterSettings()), world.memory
+    once, often = acoustic_update(world.memory, m, 1.0), world.memory
     for _ in range(10):
-        often = acoustic_update(often, m, 0.1, FilterSettings())
+        often = acoustic_update(often, m, 0.1)
     for row, most in ((0, 0.35), (2, 0.2)):
         one, ten, none = (t.motion.covariance[row, row] for t in (once.tracks[0], often.tracks[0], track))
         assert ten == pytest.approx(one, rel=most)

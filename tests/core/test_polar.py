@@ -11,14 +11,15 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from worldstate.belief.kinematics.motion import (
+    AZIMUTH,
+    RADIAL_RATE,
     MotionBelief,
     jacobian,
     predict,
     process_noise,
     propagate,
     relax,
-    update_approach,
-    update_azimuth,
+    update,
 )
 from worldstate.ground.values import wrap_angle
 
@@ -96,7 +97,7 @@ def random_belief(seed):
 @given(st.integers(0, 10**6), st.floats(-3.1, 3.1), st.floats(0.01, 1.0))
 def test_an_update_is_the_kalman_update(seed, azimuth, std):
     belief = random_belief(seed)
-    got = update_azimuth(belief, azimuth, std, weight=1.0)
+    got = update(belief, AZIMUTH, azimuth, std, weight=1.0)
     H = np.array([[1.0, 0, 0, 0]])
     gain = belief.covariance @ H.T / (belief.covariance[0, 0] + std**2)
     residual = math.remainder(azimuth - belief.mean[0], 2 * math.pi)
@@ -107,8 +108,8 @@ def test_an_update_is_the_kalman_update(seed, azimuth, std):
 @given(st.integers(0, 10**6), st.floats(-1.0, 1.0), st.floats(0.01, 1.0), st.floats(0.0, 1.0))
 def test_association_mixes_the_two_outcomes(seed, rate, std, weight):
     """Mean and covariance are those of the mixture "mine with probability w, else not", by its moments."""
-    belief, sure = random_belief(seed), update_approach(random_belief(seed), rate, std, weight=1.0)
-    got = update_approach(belief, rate, std, weight)
+    belief, sure = random_belief(seed), update(random_belief(seed), RADIAL_RATE, -rate, std, weight=1.0)
+    got = update(belief, RADIAL_RATE, -rate, std, weight)
     mean = weight * sure.mean + (1 - weight) * belief.mean
     spread = sum(
         w * (part.covariance + np.outer(part.mean - mean, part.mean - mean))
@@ -127,7 +128,7 @@ def test_the_covariance_stays_symmetric_and_positive(seed, looks):
     belief, prior = random_belief(seed), MotionBelief.around((0.9, 0, -0.2, 3.2), (0.35, 0.15, 0.25, 0.6))
     for azimuth, rate, weight, time_s in looks:
         belief = relax(predict(belief, time_s, 2.0), prior, 0.97, 0.9)
-        belief = update_approach(update_azimuth(belief, azimuth, 0.1, weight), rate, 0.3, weight)
+        belief = update(update(belief, AZIMUTH, azimuth, 0.1, weight), RADIAL_RATE, -rate, 0.3, weight)
         assert (belief.covariance == belief.covariance.T).all()
         assert np.linalg.eigvalsh(belief.covariance)[0] > 0
         assert -math.pi < belief.azimuth_rad <= math.pi
@@ -137,7 +138,7 @@ def test_it_tracks_across_the_cut_behind_the_car():
     belief = MotionBelief.around((3.1, 0.2, 0.0, 3.0), (0.05, 0.05, 0.1, 0.5))
     for hop in range(1, 11):
         true = math.remainder(3.1 + 0.02 * hop, 2 * math.pi)
-        belief = update_azimuth(predict(belief, 0.1, 0.1), true, 0.02, weight=1.0)
+        belief = update(predict(belief, 0.1, 0.1), AZIMUTH, true, 0.02, weight=1.0)
     assert belief.azimuth_rad == pytest.approx(true, abs=0.02)
 
 
@@ -178,8 +179,8 @@ def mean_nees(runs, seed, steps=30):
             truth = propagate(truth, 0.1) + rng.multivariate_normal(np.zeros(4), noise)
             belief = predict(belief, 0.1, 0.5)
             azimuth = math.remainder(truth[0] + rng.normal(0, 0.07), 2 * math.pi)
-            belief = update_azimuth(belief, azimuth, 0.07, 1.0)
-            belief = update_approach(belief, -truth[2] + rng.normal(0, 0.25), 0.25, 1.0)
+            belief = update(belief, AZIMUTH, azimuth, 0.07, 1.0)
+            belief = update(belief, RADIAL_RATE, truth[2] - rng.normal(0, 0.25), 0.25, 1.0)
         error = wrapped(truth - belief.mean)
         nees.append(error @ np.linalg.solve(belief.covariance, error))
     return float(np.mean(nees))
@@ -218,7 +219,7 @@ def test_many_entities_at_once_are_each_by_itself(seed, n):
 
     def moved(belief, value, std, weight, bearing_kept):
         after = relax(predict(belief, 0.1, 2.0), beliefs[0], bearing_kept, 0.9)
-        return update_approach(update_azimuth(after, value, std, weight), value, std, weight)
+        return update(update(after, AZIMUTH, value, std, weight), RADIAL_RATE, -value, std, weight)
 
     at_once = moved(MotionBelief.stacked(beliefs), values, stds, weights, kept).each()
     for *one, together in zip(beliefs, values, stds, weights, kept, at_once, strict=True):
@@ -251,6 +252,6 @@ def test_update_is_that_of_an_extended_kalman_filter(state, spread, seed, value,
         R=np.array([[std**2]]),
         residual=(lambda z, x: wrap_angle(z - x)) if row == 0 else np.subtract,
     )
-    after = update_azimuth(belief, value, std, 1.0) if row == 0 else update_approach(belief, -value, std, 1.0)
+    after = update(belief, row, value, std, 1.0)
     assert wrapped(after.mean - kalman.x) == pytest.approx(0.0, abs=1e-12)
     assert after.covariance == pytest.approx(kalman.P, abs=1e-12)

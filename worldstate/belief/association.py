@@ -11,7 +11,6 @@ from worldstate.abduction.road_users import SEEN_AS
 from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
 from worldstate.measurement import Sector, Sighting
 
-from .settings import FilterSettings
 from .site_geometry import SiteGeometry, normal_share
 from .track import Track
 
@@ -27,6 +26,18 @@ _LEAST = 1e-300  # Keeps logarithms finite
 _MOST_EVENTS = 2000
 _ROUNDS = 30  # After these messages of twenty tracks that stand abreast change by less than 1e-3
 _MOST_NATS = 25.0  # Sums that leave one term out keep their digits
+# Deviations and radians of a sighting of an entity in view. The second bounds the first: four deviations of
+# an entity unseen for a second are most of the view.
+_GATE_SIGMA, _GATE_RAD = 4.0, 0.35
+# Of first sightings about the edge that they come past: corners of real junctions stand within 6 degrees of
+# the default; missed once or twice, a vehicle moves on by 3 to 6 degrees an image.
+EDGE_STD_RAD = 0.15
+# P(the signature names the wrong side): rarely on junctions that its model was trained on, often on others.
+_SIDE_CONFUSION = 0.2
+# P(a new sighting was not heard before): most vehicles from a side street are.
+UNHEARD = 0.05
+# Of P(hidden), left by a hand-over: at zero, a second vehicle behind the corner would have to be found anew.
+HANDOVER_RESIDUAL = 0.02
 # As detectors call them. What was heard drives: a detector has misread its label, or the ear the kind.
 _VEHICLES = frozenset().union(*SEEN_AS.values())
 _ON_FOOT, _MISREAD = frozenset({"person", "pedestrian"}), 0.1
@@ -39,12 +50,10 @@ class Association:
     found: dict[int, int]  # Measurement of a track; what is left over is new
     chances: list[float]  # Over all joint events, shape (tracks,)
 
-    def handed_over(
-        self, before: Sequence[Track], after: Sequence[Track], settings: FilterSettings
-    ) -> dict[int, float]:
+    def handed_over(self, before: Sequence[Track], after: Sequence[Track]) -> dict[int, float]:
         """Return, by side of a hand-over, the share of P(hidden) to keep: P(it was another vehicle)."""
         emerged = (i for i in self.found if after[i].seen and not before[i].seen)
-        return {before[i].side: max(settings.handover_residual, 1.0 - self.chances[i]) for i in emerged}
+        return {before[i].side: max(HANDOVER_RESIDUAL, 1.0 - self.chances[i]) for i in emerged}
 
 
 def associated(
@@ -65,7 +74,7 @@ def associated(
     """
     if not tracks or not sightings:
         return Association({}, [0.0] * len(tracks))
-    unheard = math.log(site.settings.unheard_probability / (2.0 * view.half_width_rad))
+    unheard = math.log(UNHEARD / (2.0 * view.half_width_rad))
     detected = np.array([track.detected for track in tracks])
     scores = _scores(tracks, sightings, detected, site)
     return joint_association(np.where(scores > FORBIDDEN, scores - unheard, FORBIDDEN), detected)
@@ -192,7 +201,7 @@ def _scores(
     azimuth_rad = np.array([one.azimuth_rad for one in sightings])[:, None]
     std_rad = np.array([one.std_rad for one in sightings])[:, None]
     moving = np.array([one.moving for one in sightings])[:, None]
-    in_view = _in_view(tracks, azimuth_rad, std_rad, moving, site.settings)
+    in_view = _in_view(tracks, azimuth_rad, std_rad, moving)
     if detected.all():
         return in_view
     classes = np.log([[_shared_class(track, one.label) for track in tracks] for one in sightings])
@@ -202,11 +211,7 @@ def _scores(
 
 
 def _in_view(
-    tracks: tuple[Track, ...],
-    azimuth_rad: FloatArray,
-    std_rad: FloatArray,
-    moving: BoolArray,
-    settings: FilterSettings,
+    tracks: tuple[Track, ...], azimuth_rad: FloatArray, std_rad: FloatArray, moving: BoolArray
 ) -> FloatArray:
     existence = np.array([track.existence for track in tracks])
     residual = wrap_angle(azimuth_rad - np.array([track.motion.azimuth_rad for track in tracks]))
@@ -214,7 +219,7 @@ def _in_view(
     density = -0.5 * (residual**2 / variance + np.log(2.0 * math.pi * variance))
     expected = np.log(np.maximum(_FOUND * existence, _LEAST)) - np.log1p(-existence * _FOUND)
     mismatch = np.where(moving == np.array([track.moving for track in tracks]), 0.0, _PARKED_MISMATCH)
-    outside = (np.abs(residual) > settings.gate_rad) | (residual**2 > settings.gate_sigma**2 * variance)
+    outside = (np.abs(residual) > _GATE_RAD) | (residual**2 > _GATE_SIGMA**2 * variance)
     return np.where(outside, FORBIDDEN, density + expected + mismatch)
 
 
@@ -231,7 +236,7 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
 
     A vehicle believed seconds away from the edge is not the one that appears now.
     """
-    side, near_rad = site.sides[track.side], site.settings.edge_std_rad
+    side, near_rad = site.sides[track.side], EDGE_STD_RAD
     outwards = math.copysign(1.0, side.edge_azimuth_rad)
 
     def near(azimuth_rad: float, std_rad: float) -> float:
@@ -244,14 +249,12 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
 
 def emergence_density(tracks: Sequence[Track], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
     """Return the density of first sightings of hidden entities, 1/rad, shape (sightings, tracks)."""
-    settings = site.settings
     edges_rad = np.array([side.edge_azimuth_rad for side in site.sides])
-    deviations = wrap_angle(azimuth_rad - edges_rad) / settings.edge_std_rad
+    deviations = wrap_angle(azimuth_rad - edges_rad) / EDGE_STD_RAD
     # Of first sightings about the edge that they come past, 1/rad.
-    near = np.exp(-0.5 * deviations**2) / (settings.edge_std_rad * math.sqrt(2.0 * math.pi))
+    near = np.exp(-0.5 * deviations**2) / (EDGE_STD_RAD * math.sqrt(2.0 * math.pi))
     heard = np.empty_like(near)
     for side in range(len(edges_rad)):
         others = np.delete(near, side, axis=1).max(axis=1) if len(edges_rad) > 1 else near[:, side]
-        confused = settings.side_confusion
-        heard[:, side] = (1.0 - confused) * near[:, side] + confused * others
+        heard[:, side] = (1.0 - _SIDE_CONFUSION) * near[:, side] + _SIDE_CONFUSION * others
     return np.asarray(heard[:, [track.side for track in tracks]])

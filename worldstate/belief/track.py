@@ -14,7 +14,6 @@ from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief, pred
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 
-from .settings import FilterSettings
 from .side_belief import SideBelief
 from .site_geometry import SiteGeometry
 
@@ -25,8 +24,12 @@ _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
 LABEL_GAIN = 0.3
 # Hops share nineteen twentieths of the two seconds that they are classified by.
 _HEARD_GAIN = 0.2
-# m^2/s^3 where moving vehicles have 2: a parked one must not drift with its boxes, but stay updatable.
-PARKED_ACCELERATION = 1e-4
+# White acceleration, m^2/s^3: 1.4 m/s of speed in a second, as braking and turning in town have. A parked one
+# must not drift with its boxes, but stay updatable.
+_ACCELERATION, _PARKED_ACCELERATION = 2.0, 1e-4
+# To the prior, of components that are not measured: one window; what its sound did not confirm fades.
+_RELAXATION_S = 1.0
+_VISIBLE_LIFE_S = 10.0  # Mean, of a seen entity without looks
 # Prior of a vehicle in view, of which only the azimuth is measured: neither closing nor receding, within .5
 # 1/s, at exp(3.2) = 25 m within a factor of 1.8.
 _IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
@@ -126,7 +129,7 @@ def turned(track: Track, faster_rad_s: float) -> Track:
 
 def _driven_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> tuple[Track, ...]:
     """Return the tracks with their places a step later, or without those that are lost."""
-    placed = [(i, one.place, _acceleration(one, site.settings)) for i, one in enumerate(tracks) if one.place]
+    placed = [(i, one.place, acceleration_psd(one)) for i, one in enumerate(tracks) if one.place]
     if not placed:
         return tuple(tracks)
     stacked = CartesianBelief.stacked([place for _, place, _ in placed])
@@ -139,33 +142,31 @@ def _driven_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> tu
             # No life time here: a sender that keeps sending is there, a silent one is lost within seconds.
             moved[i] = replace(track, place=place)
         else:
-            motion = track.motion if track.seen else site.prior(track.side)
+            motion = track.motion if track.seen else site.sides[track.side].prior()
             moved[i] = replace(track, place=None, behind=1.0, motion=motion)
     return follow_places(moved, site)
 
 
-def _acceleration(track: Track, settings: FilterSettings) -> float:
-    return settings.acceleration_psd if track.moving else PARKED_ACCELERATION
+def acceleration_psd(track: Track) -> float:
+    """Return the density of the white acceleration that a track moves by, m^2/s^3."""
+    return _ACCELERATION if track.moving else _PARKED_ACCELERATION
 
 
 def _relaxed(
     tracks: list[Track], hidden_shares: list[float], step_s: float, site: SiteGeometry
 ) -> Iterator[Track]:
     """Yield tracks without a place after a step, drawn to what is expected of vehicles in view or hidden."""
-    settings = site.settings
-    accelerations = np.array([_acceleration(track, settings) for track in tracks])
+    accelerations = np.array([acceleration_psd(track) for track in tracks])
     motion = predict(MotionBelief.stacked([track.motion for track in tracks]), step_s, accelerations)
     # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle still hidden has not passed the
     # corner, whatever its last rates said.
-    kept = np.exp(
-        -step_s * np.where([track.seen for track in tracks], 0.0, hidden_shares) / settings.relaxation_s
-    )
-    towards = MotionBelief.stacked([_IN_VIEW if one.seen else site.prior(one.side) for one in tracks])
-    relaxed = relax(motion, towards, kept, math.exp(-step_s / settings.relaxation_s))
+    kept = np.exp(-step_s * np.where([track.seen for track in tracks], 0.0, hidden_shares) / _RELAXATION_S)
+    towards = MotionBelief.stacked([_IN_VIEW if one.seen else site.sides[one.side].prior() for one in tracks])
+    relaxed = relax(motion, towards, kept, math.exp(-step_s / _RELAXATION_S))
     for track, moved in zip(tracks, relaxed.each(), strict=True):
         existence = track.existence
         if track.seen:
-            existence *= math.exp(-step_s / settings.visible_life_s)
+            existence *= math.exp(-step_s / _VISIBLE_LIFE_S)
         yield replace(track, motion=moved, existence=existence)
 
 

@@ -6,19 +6,27 @@ from functools import partial
 from operator import itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.association import Association
+from worldstate.belief.association import EDGE_STD_RAD, Association
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track, entity_id, heard_as
 from worldstate.belief.window_belief import ExplanationBelief
-from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, wrap_angle
+from worldstate.ground.values import nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Event
 from worldstate.state.entity import EventKind
 
 from .memory import Memory
 
+# After a hand-over no birth on its side: the window still holds the sound from before it.
+_REARM_NS = nanoseconds(1.0)
+# A moving entity out of sight for so long may be the one now heard hidden nearby: more than one image at
+# 10 Hz, since a single miss is no occlusion, and less than a following vehicle takes, which would get its id.
+REOCCLUSION_NS, _REOCCLUSION_END_NS = nanoseconds(0.15), nanoseconds(3.0)
+# From the edge that it was last seen near: less than the 64 degrees between the edges of a default junction.
+_REOCCLUSION_RAD = 0.8
+_LOST_RAD = 0.8  # Standard deviation; beyond, the azimuth is known to no more than half of the view
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
 
@@ -31,7 +39,6 @@ def birth_death(
     Shapes: alarmed (K,).
     """
     settings, sides, kept, counts = site.settings, memory.sides, list(memory.tracks), list(memory.births)
-    rearm_ns = settings.rearm_s * NANOSECONDS_PER_SECOND
     for k, before_ns in enumerate(memory.handover_ns):
         current, existence = hidden_on(kept, k), sides.existence(k)
         if current is not None:
@@ -43,7 +50,7 @@ def birth_death(
             elif existence >= settings.death_probability or alarmed[k]:
                 kept.append(replace(current, existence=existence))
             continue
-        rearmed = before_ns is None or memory.stamp_ns - before_ns > rearm_ns
+        rearmed = before_ns is None or memory.stamp_ns - before_ns > _REARM_NS
         if rearmed and (sides.hidden[k] >= settings.birth_probability or alarmed[k]):
             # What came into view from here before was another vehicle: the new one starts without its mass.
             forget = partial(ExplanationBelief.forget_origin, direction=k)
@@ -103,15 +110,13 @@ def hidden_on(tracks: Iterable[Track], k: int) -> Track | None:
 
 def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -> Track | None:
     """Return the moving entity last seen near this side's edge within the reocclusion time, if any."""
-    side, settings = site.sides[k], site.settings
-    earliest_ns = stamp_ns - settings.reocclusion_s * NANOSECONDS_PER_SECOND
-    latest_ns = stamp_ns - settings.reocclusion_after_s * NANOSECONDS_PER_SECOND
+    side = site.sides[k]
     candidates = [
         track
         for track in tracks
         if track.seen and track.moving and track.last_seen_ns is not None
-        if earliest_ns <= track.last_seen_ns <= latest_ns
-        if side.distance_rad(track.motion.azimuth_rad) <= settings.reocclusion_gate_rad
+        if REOCCLUSION_NS <= stamp_ns - track.last_seen_ns <= _REOCCLUSION_END_NS
+        if side.distance_rad(track.motion.azimuth_rad) <= _REOCCLUSION_RAD
     ]
     return min(candidates, key=lambda track: side.distance_rad(track.motion.azimuth_rad), default=None)
 
@@ -125,7 +130,7 @@ def _hidden_again(
         seen=False,
         was_hidden=True,
         existence=existence,
-        motion=site.prior(k),
+        motion=site.sides[k].prior(),
         updated_ns=measurement.stamp_ns,
         place=None,
         behind=1.0,
@@ -138,7 +143,7 @@ def _born(k: int, number: int, existence: float, measurement: Measurement, site:
         side=k,
         seen=False,
         existence=existence,
-        motion=site.prior(k),
+        motion=site.sides[k].prior(),
         # A detector adds to it at the hand-over.
         labels=measurement.kinds or ((UNKNOWN, 1.0),),
         moving=True,
@@ -183,16 +188,16 @@ def after_look(
     memory: Memory, tracks: Sequence[Track], whose: Association, stamp_ns: int, site: SiteGeometry
 ) -> Memory:
     """Return the memory with the tracks after a look: those of before in their order, then the new ones."""
-    before, settings = memory.tracks, site.settings
-    handed_over = whose.handed_over(before, tracks[: len(before)], settings)
+    before = memory.tracks
+    handed_over = whose.handed_over(before, tracks[: len(before)])
     # First seen near an edge, it came past it unheard.
     unheard = {
         track.side
         for track in tracks[len(before) :]
         if track.seen and track.moving
-        if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * settings.edge_std_rad
+        if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * EDGE_STD_RAD
     }
-    memory = replace(memory, tracks=surviving(tracks, settings))
+    memory = replace(memory, tracks=surviving(tracks, site.settings))
     return past_edges(memory, handed_over, unheard, stamp_ns)
 
 
@@ -226,9 +231,9 @@ def past_edges(
 
 def surviving(tracks: Sequence[Track], settings: FilterSettings) -> tuple[Track, ...]:
     """Return the tracks without seen entities of too little existence or too uncertain azimuth."""
-    least, widest_rad = settings.delete_existence, settings.lost_std_rad
+    least = settings.delete_existence
     return tuple(
         track
         for track in tracks
-        if not track.seen or (track.existence >= least and track.motion.azimuth_std_rad <= widest_rad)
+        if not track.seen or (track.existence >= least and track.motion.azimuth_std_rad <= _LOST_RAD)
     )

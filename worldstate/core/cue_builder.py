@@ -61,7 +61,7 @@ def _cue(
     evidence: EvidenceTerms,
 ) -> RiskCue:
     track = hidden_on(memory.tracks, k)
-    motion = model.site.prior(k) if track is None else track.motion
+    motion = model.site.sides[k].prior() if track is None else track.motion
     azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
     if track is None or track.place is None:
         azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, model.site)

@@ -7,7 +7,13 @@ from operator import attrgetter
 import numpy as np
 
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.association import FORBIDDEN, emergence_density, joint_association
+from worldstate.belief.association import (
+    EDGE_STD_RAD,
+    FORBIDDEN,
+    UNHEARD,
+    emergence_density,
+    joint_association,
+)
 from worldstate.belief.kinematics.cartesian import (
     CartesianBelief,
     at_position,
@@ -16,7 +22,7 @@ from worldstate.belief.kinematics.cartesian import (
     update_position,
 )
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
-from worldstate.belief.site_geometry import SiteGeometry, normal_share
+from worldstate.belief.site_geometry import HIDDEN_BIAS_STD, SiteGeometry, normal_share
 from worldstate.belief.track import (
     Track,
     after_empty_look,
@@ -26,10 +32,10 @@ from worldstate.belief.track import (
     merged,
     relabelled,
 )
-from worldstate.ground import NANOSECONDS_PER_SECOND, FloatArray, wrap_angle
+from worldstate.ground import FloatArray, wrap_angle
 from worldstate.measurement.position import Position, PositionScan, SearchedSector
 
-from .birth_death import after_look
+from .birth_death import REOCCLUSION_NS, after_look
 from .memory import Memory
 
 # m/s, of a velocity that was not measured: wide, so that it decides nothing.
@@ -104,7 +110,7 @@ def _log_ratios(
     area_m2 = _RADIO_AREA_M2
     if scan.searched is not None:
         area_m2 = max(scan.searched.sector.half_width_rad * scan.searched.range_m**2, 1.0)
-    log_new = math.log(site.settings.unheard_probability / area_m2)
+    log_new = math.log(UNHEARD / area_m2)
     ratios = scores + np.log(existence * (found or 1.0)) - np.log1p(-existence * found) - log_new
     return np.where(scores > FORBIDDEN, ratios, FORBIDDEN)
 
@@ -138,14 +144,14 @@ def _polar(
     turned = wrap_angle(azimuth[:, None] - means[:, AZIMUTH])
     # The sound of a hidden one may come from the edge instead.
     hidden = np.array([not track.seen for track in tracks])
-    bias = np.where(hidden, site.settings.hidden_bias_std_rad, 0.0)
+    bias = np.where(hidden, HIDDEN_BIAS_STD, 0.0)
     variance = variances[:, AZIMUTH] + bias**2 + (noises[0] / range_m**2)[:, None]
     farther = np.log(range_m)[:, None] - means[:, LOG_RANGE]
     range_variance = variances[:, LOG_RANGE] + (noises[1] / range_m**2)[:, None]
     distance, log_azimuth = turned**2 / variance, -0.5 * np.log(2.0 * math.pi * variance)
     if line_of_sight:
         # An entity that was only heard is found where it comes into view.
-        peak = 1.0 / (site.settings.edge_std_rad * math.sqrt(2.0 * math.pi))
+        peak = 1.0 / (EDGE_STD_RAD * math.sqrt(2.0 * math.pi))
         near = np.maximum(emergence_density(tracks, azimuth[:, None], site) / peak, 1e-300)
         distance = np.where(hidden, -2.0 * np.log(near), distance)
         log_azimuth = np.where(hidden, math.log(peak), log_azimuth)
@@ -192,7 +198,7 @@ def _at_side(track: Track, site: SiteGeometry) -> Track:
     x, y = track.place.mean[:2].tolist()
     side, behind = site.hiding_side(math.atan2(y, x), _SHARP_RAD)
     unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
-    unseen = not track.seen or unseen_ns > site.settings.reocclusion_after_s * NANOSECONDS_PER_SECOND
+    unseen = not track.seen or unseen_ns > REOCCLUSION_NS
     hidden = behind >= 0.5 and unseen
     return replace(track, side=side, seen=False, was_hidden=True) if hidden else track
 
@@ -265,7 +271,7 @@ def _born(
         side=side if hidden else site.nearest_side(math.atan2(y, x)),
         seen=False,
         existence=min(position.existence_probability, _MOST_EXISTENCE),
-        motion=site.prior(side),
+        motion=site.sides[side].prior(),
         labels=position.classes or ((UNKNOWN, 1.0),),
         moving=_moving(position, before=True),
         sources=(scan.source,),

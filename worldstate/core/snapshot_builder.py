@@ -20,10 +20,9 @@ from worldstate.belief.kinematics.motion import (
     RADIAL_RATE,
     MotionBelief,
 )
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
-from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import PARKED_ACCELERATION, Track, hidden_share
+from worldstate.belief.site_geometry import HIDDEN_BIAS_STD, SiteGeometry
+from worldstate.belief.track import Track, acceleration_psd, hidden_share
 from worldstate.ground import FloatArray, seconds
 from worldstate.state import (
     Classification,
@@ -46,9 +45,7 @@ _NAMES = tuple(f"{after_s:g}" for after_s in _AFTER_S)
 Forecast: TypeAlias = dict[str, tuple[float, float]]
 
 
-def forecasts(
-    tracks: tuple[Track, ...], means: FloatArray, covariances: FloatArray, settings: FilterSettings
-) -> list[Forecast]:
+def forecasts(tracks: tuple[Track, ...], means: FloatArray, covariances: FloatArray) -> list[Forecast]:
     r"""Return where entities will be, one forecast a track: constant velocity, all of them at once.
 
     With the state :math:`(\theta, \dot\theta, \rho, \log r)` and its covariance P, after t seconds
@@ -66,7 +63,7 @@ def forecasts(
     q = np.maximum(a * a + b * b, LEAST_Q)
     gradient = np.stack([np.ones_like(a), a * _AFTER_S / q, -b * _AFTER_S / q], axis=-1)
     known = (gradient @ covariances[:, :LOG_RANGE, :LOG_RANGE] * gradient).sum(axis=-1)
-    density = np.array([settings.acceleration_psd if one.moving else PARKED_ACCELERATION for one in tracks])
+    density = np.array([acceleration_psd(one) for one in tracks])
     range_m = np.exp(np.minimum(np.maximum(log_range, math.log(NEAREST_M)), math.log(FARTHEST_M)))
     variance = known + density[:, None] * _CUBES / (range_m**2 * q)
     azimuth_rad = theta + np.arctan2(b, a)
@@ -101,7 +98,7 @@ def entities_of(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -
     covariances = np.array([track.motion.covariance for track in tracks])
     stds = np.sqrt(covariances.diagonal(axis1=1, axis2=2))
     lists = (array.round(_DIGITS).tolist() for array in (means, stds, covariances[:, *_UPPER]))
-    moments = zip(*lists, forecasts(tracks, means, covariances, site.settings), strict=True)
+    moments = zip(*lists, forecasts(tracks, means, covariances), strict=True)
     build = partial(_entity, memory, memory.sides, site)
     return tuple(map(build, tracks, moments))
 
@@ -183,7 +180,7 @@ def hidden_azimuth(
         return hidden_bearing(kept.coming[side], site.sides[side])
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
     # that.
-    return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, site.settings.hidden_bias_std_rad)
+    return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, HIDDEN_BIAS_STD)
 
 
 def _place(track: Track, range_m: float | None, hidden: bool, site: SiteGeometry) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.belief.association import HANDOVER_RESIDUAL
 from worldstate.belief.hidden_bearing import announced, hidden_motion
 from worldstate.belief.kinematics.cartesian import corrected, driven
 from worldstate.belief.settings import FilterSettings
@@ -114,23 +115,23 @@ def _places_passed(before: Sequence[Track], memory: Memory, model: FilterModel) 
         others = [one for one in memory.tracks if not one.seen and one.place is None and one.side == old.side]
         if now[old.id] in others and (len(others) > 1 or not heard[old.side]):
             memory = replace(memory, tracks=tuple(one for one in memory.tracks if one.id != old.id))
-    left = dict.fromkeys(emerged, model.site.settings.handover_residual)
+    left = dict.fromkeys(emerged, HANDOVER_RESIDUAL)
     return past_edges(memory, left, (), memory.stamp_ns)
 
 
 def update_evidence(memory: Memory, measurement: Measurement, weight: float, model: FilterModel) -> Memory:
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
-    settings, windows = model.site.settings, memory.windows
+    windows = memory.windows
     memory = replace(memory, predicted=memory.sides.hypotheses)
     if windows is not None and measurement.heard.usable:
         source, stamp_ns = measurement.source, measurement.stamp_ns
-        window_ns, rates_hz = nanoseconds(settings.window_s), model.context.rates.values_hz
+        window_ns, rates_hz = nanoseconds(model.site.settings.window_s), model.context.rates.values_hz
         looked = log_co_evidence(measurement.co_evidence, len(model.site.sides))
         said = masked_by(measurement.signature, measurement.heard.share)
         signature = _with_hand_overs(said, memory.handover_ns, stamp_ns - window_ns)
         windows, prior = windows.update(source, stamp_ns, signature, looked, rates_hz, window_ns)
         memory = replace(memory, windows=windows, predicted=prior.sides.hypotheses)
-    return acoustic_update(memory, measurement, weight, settings)
+    return acoustic_update(memory, measurement, weight)
 
 
 def masked_by(signature: SignatureEvidence, share: float) -> SignatureEvidence:

@@ -11,14 +11,14 @@ from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unquer
 from worldstate.belief.association import associated
 from worldstate.belief.kinematics.cartesian import update_bearing
 from worldstate.belief.kinematics.motion import (
+    AZIMUTH,
     AZIMUTH_RATE,
     LOG_RANGE,
     RADIAL_RATE,
     MotionBelief,
-    update_azimuth,
+    update,
 )
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.site_geometry import CLUTTER_RATE, SiteGeometry
 from worldstate.belief.track import (
     Track,
     after_empty_look,
@@ -42,6 +42,8 @@ _PARKED_RATE_STD = (1e-3, 1e-3)
 _BY_ALL = attrgetter("azimuth_rad", "label", "score", "std_rad", "width_rad", "moving")
 # A detection by a channel said to miss everything would carry no information; its miss rate is capped here.
 _MOST_MISSES = 0.99
+# Of an object before its first sighting is counted: indifferent, that one decides.
+_FIRST_EXISTENCE = 0.5
 # A crowded street shows some forty; at 600 a step took .3 s.
 MOST_BOXES = 64
 _OUTSIDE = Unqueried("outside the field of view")
@@ -75,13 +77,13 @@ def vision_update(
     sightings, view = tuple(sorted(seen.sightings, key=_BY_ALL)), site.view(seen.look)
     tracks, whose = memory.tracks, associated(memory.tracks, sightings, view, site)
     found, after, others = whose.found, list[Track](), _other_views(memory, seen.look)
-    turned, rates = _turned(tracks, sightings, found, site), _rates(measurement.co_evidence, site.settings)
+    turned, rates = _turned(tracks, sightings, found, site), _rates(measurement.co_evidence)
     for i, track in enumerate(tracks):
         answer = _searched(track, measurement, seen.look, view)
         existence = _existence(track, whose.chances[i], answer, weight, rates)
         if i in found:
             if not track.seen:
-                known = max(track.existence, site.settings.sighting_existence)
+                known = max(track.existence, _FIRST_EXISTENCE)
                 existence = after_sighting(known, *rates)
             after.append(_found(turned[i], sightings[found[i]], existence, measurement, site))
         elif answer is _OUTSIDE and any(one.touches(track.motion.azimuth_rad) for one in others):
@@ -91,7 +93,7 @@ def vision_update(
             left = _has_left(track, answer, measurement.stamp_ns, site)
             after.append(_not_sighted(track, existence, _OUTSIDE if left else answer))
     unheard = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
-    existence = after_sighting(site.settings.sighting_existence, *rates)
+    existence = after_sighting(_FIRST_EXISTENCE, *rates)
     for number, one in enumerate(unheard, start=memory.sighted):
         fresh = Track(
             id=entity_id(site.settings.stream, "visible", number),
@@ -118,19 +120,19 @@ def _other_views(memory: Memory, look: Look) -> list[Sector]:
     return [Sector.between(*one.sector_rad) for one in recent if one.sector_rad is not None]
 
 
-def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
+def _rates(answer: CoEvidence) -> tuple[float, float]:
     """Return the miss and clutter rate of a look."""
     if isinstance(answer, Unqueried):
         # Sightings outside the sector asked about: found without a stated miss rate.
-        return 0.0, settings.clutter_rate
-    return min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or settings.clutter_rate
+        return 0.0, CLUTTER_RATE
+    return min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or CLUTTER_RATE
 
 
 def _found(
     track: Track, sighting: Sighting, existence: float, measurement: Measurement, site: SiteGeometry
 ) -> Track:
     """Return a track after a sighting of its own; one that was not seen before takes its side and class."""
-    miss, _ = _rates(measurement.co_evidence, site.settings)
+    miss, _ = _rates(measurement.co_evidence)
     seen_as = ((sighting.label, sighting.score),)
     return replace(
         track,
@@ -167,7 +169,7 @@ def _turned(
         motion = MotionBelief.stacked([tracks[i].motion for i in usual])
         azimuth_rad = np.array([sightings[found[i]].azimuth_rad for i in usual])
         std_rad = np.array([sightings[found[i]].std_rad for i in usual])
-        after = update_azimuth(motion, azimuth_rad, std_rad, weight=1.0)
+        after = update(motion, AZIMUTH, azimuth_rad, std_rad, weight=1.0)
         turned |= {i: replace(tracks[i], motion=one) for i, one in zip(usual, after.each(), strict=True)}
     return turned
 

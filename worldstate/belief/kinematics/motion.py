@@ -23,7 +23,7 @@ Aidala and Hammel, "Utilization of modified polar coordinates for bearings-only 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated, Self, TypeAlias
 
 import numpy as np
 
@@ -34,6 +34,7 @@ AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(4)
 
 # q = 0 is a vehicle at the array itself, where the coordinates are singular; 1e-3 is 3 % of the first range.
 LEAST_Q = 1e-3
+_Numbers: TypeAlias = float | FloatArray  # Of one belief, or of each of many
 
 
 def propagate(state: FloatArray, step_s: float) -> FloatArray:
@@ -75,9 +76,7 @@ def jacobian(state: FloatArray, step_s: float) -> FloatArray:
     return slope
 
 
-def process_noise(
-    acceleration_psd: float | FloatArray, range_m: float | FloatArray, step_s: float
-) -> FloatArray:
+def process_noise(acceleration_psd: _Numbers, range_m: _Numbers, step_s: float) -> FloatArray:
     r"""Return Q, shape (..., 4, 4), of a white acceleration: at range r it turns and closes by a/r."""
     twice, once, rate = step_s**3 / 3.0, step_s**2 / 2.0, step_s
     unit = np.array(
@@ -161,7 +160,7 @@ class MotionBelief(GaussianBelief):
         return math.sqrt(self.covariance[RADIAL_RATE, RADIAL_RATE])
 
 
-def predict(belief: MotionBelief, step_s: float, acceleration_psd: float | FloatArray) -> MotionBelief:
+def predict(belief: MotionBelief, step_s: float, acceleration_psd: _Numbers) -> MotionBelief:
     r"""Return the belief after `step_s` of constant velocity and white acceleration (m^2/s^3).
 
     .. math:: m \leftarrow f(m), \quad P \leftarrow F P F^T + Q
@@ -178,10 +177,7 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: float | Float
 
 
 def relax(
-    belief: MotionBelief,
-    towards: MotionBelief,
-    bearing_kept: float | FloatArray,
-    radial_kept: float | FloatArray,
+    belief: MotionBelief, towards: MotionBelief, bearing_kept: _Numbers, radial_kept: _Numbers
 ) -> MotionBelief:
     r"""Return the belief drawn towards another, as an Ornstein-Uhlenbeck process draws it.
 
@@ -201,26 +197,6 @@ def relax(
     return _belief(towards.mean + phi * offset, covariance)
 
 
-def update_azimuth(
-    belief: MotionBelief,
-    azimuth_rad: float | FloatArray,
-    std_rad: float | FloatArray,
-    weight: float | FloatArray,
-) -> MotionBelief:
-    """Return the belief after a bearing that is this entity's with probability `weight`."""
-    return _update(belief, AZIMUTH, azimuth_rad, std_rad, weight)
-
-
-def update_approach(
-    belief: MotionBelief,
-    inverse_tta_hz: float | FloatArray,
-    std_hz: float | FloatArray,
-    weight: float | FloatArray,
-) -> MotionBelief:
-    """Return the belief after an approach rate, 1/s, that is this entity's with probability `weight`."""
-    return _update(belief, RADIAL_RATE, -inverse_tta_hz, std_hz, weight)
-
-
 def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: float) -> float:
     """Return log N(z; theta, P_theta + R) of a bearing, residual wrapped, nats per rad."""
     variance = float(belief.covariance[AZIMUTH, AZIMUTH]) + std_rad**2
@@ -228,14 +204,10 @@ def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: fl
     return -0.5 * (residual**2 / variance + math.log(2.0 * math.pi * variance))
 
 
-def _update(
-    belief: MotionBelief,
-    row: int,
-    value: float | FloatArray,
-    std: float | FloatArray,
-    weight: float | FloatArray,
-) -> MotionBelief:
-    r"""Probabilistic data association with one measurement, linear in one component.
+def update(belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weight: _Numbers) -> MotionBelief:
+    r"""Return the belief after one component was measured, of this entity with probability `weight`.
+
+    Probabilistic data association: a bearing is one of AZIMUTH, an approach rate -1/TTA one of RADIAL_RATE.
 
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
