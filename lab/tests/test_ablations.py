@@ -12,13 +12,13 @@ from worldstate_lab.cli.ablations import (
     evaluate_ablation,
     presence_statistic,
 )
+from worldstate_lab.metrics.stream_statistic import StatisticSwitches
 
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import abduce
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.recordings.hop_table import ABSENT, PRESENT
-from worldstate.operations.recordings.stream_statistic import StatisticSwitches
 
 PRIOR = (0.25, 0.25, 0.25, 0.25)
 BETA = {0.0: 0.05, 0.5: 0.5, 1.0: 0.97}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import poisson
 
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.co_evidence import Absent, Unqueried
 from worldstate.abduction.cueing.cueing_policy import sustained_statistic
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap, fit_risk_map
 from worldstate.abduction.evidence import SignatureEvidence
@@ -24,17 +24,15 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Measurement, Sighting
-from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
+from worldstate.operations.calibration.cueing_calibration import (
+    CueingSettings,
+    calibrate_cueing,
+    statistic_at,
+)
 from worldstate.operations.metrics.approach_table import ApproachTable
 from worldstate.operations.recordings.hop_table import hop_stream, load_streams, save_tables
-from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 
 PRIOR = (0.3, 0.3, 0.2, 0.2)
-answers = st.one_of(
-    st.just(Unqueried("-")),
-    st.builds(Absent, st.floats(0.01, 1.0), st.floats(0.0, 0.5)),
-    st.builds(Present, st.floats(0.0, 0.99), st.floats(0.01, 0.5)),
-)
 nats = st.floats(-8.0, 8.0)
 
 
@@ -49,30 +47,15 @@ def street(rng, label="none", hops=291, level=-1.5, phi=0.9):
     return stream.replace(label=label, t0_s=t0_s, log_likelihoods=heard)
 
 
-@given(st.lists(st.tuples(st.tuples(nats, nats, nats, nats), answers), min_size=1, max_size=8))
-def test_over_a_stream_the_statistic_is_that_of_every_hop(rows):
+@given(st.lists(st.tuples(nats, nats, nats, nats), min_size=1, max_size=8), st.floats(0.0, 1.0))
+def test_over_a_stream_the_statistic_is_that_of_every_hop(rows, beta):
+    heard = [SignatureEvidence(("left", "right"), row[:2], row[2], row[3]) for row in rows]
+    silent = NotUsable("-")
     measured = [
-        Measurement(
-            (i + 10) * 10**8, SignatureEvidence(("left", "right"), row[:2], row[2], row[3]), answer,
-            NotUsable("-"), NotUsable("-"),
-        )
-        for i, (row, answer) in enumerate(rows)
-    ]  # fmt: skip
-    stream = hop_stream(measured, name="x")
-    expected = [statistic(m.signature, m.co_evidence, PRIOR) for m in measured]
-    assert stream_statistic(stream, PRIOR) == pytest.approx(expected, rel=1e-9)
-    alone = [statistic(m.signature, Unqueried("-"), PRIOR) for m in measured]
-    switched = stream_statistic(stream, PRIOR, StatisticSwitches(use_absence=False))
-    assert switched == pytest.approx(alone, rel=1e-9)
-
-
-def test_the_approach_term_moves_the_log_odds_by_its_weight_and_only_where_usable():
-    stream = street(np.random.default_rng(0), hops=4).replace(approach=np.array([np.nan, 0.0, 1.5, -9.0]))
-    plain, looming = (
-        stream_statistic(stream, PRIOR, StatisticSwitches(approach_weight=w)) for w in (0.0, 0.4)
-    )
-    shift = np.log(looming / (1 - looming)) - np.log(plain / (1 - plain))
-    assert shift == pytest.approx([0.0, 0.0, 0.6, -1.2], abs=1e-9)
+        Measurement((i + 10) * 10**8, one, Unqueried("-"), silent, silent) for i, one in enumerate(heard)
+    ]
+    expected = [statistic(one, Absent(beta), PRIOR) for one in heard]
+    assert statistic_at(hop_stream(measured, name="x"), PRIOR, beta) == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_stream_keeps_what_was_measured():
@@ -116,9 +99,7 @@ def test_calibration_keeps_its_budget_on_fresh_recordings_of_the_same_street():
         rng = np.random.default_rng(seed)
         done = calibrate_cueing([street(rng) for _ in range(40)], PRIOR, kept, settings_)
         gamma = done.policies.for_alpha(0.05, 0.0).gamma
-        fresh = [
-            stream_statistic(street(rng), PRIOR, StatisticSwitches(fixed_miss_rate=0.0)) for _ in range(40)
-        ]
+        fresh = [statistic_at(street(rng), PRIOR, 0.0) for _ in range(40)]
         rates.append(np.mean([np.mean(sustained_statistic(one, 3) >= gamma) for one in fresh]))
         assert done.risk == "kept"
         assert done.policies.for_alpha(0.05, 0.0).risk_map == kept.for_alpha(0.02, 0.0).risk_map
@@ -142,9 +123,8 @@ def test_a_rate_to_keep_is_bounded_by_what_half_of_the_approaches_reach():
     chosen = CueingSettings(alphas=(0.05,), keep_per_hour=12.0)
     policy = calibrate_cueing(streams, PRIOR, read_model().policies, chosen).policies.for_alpha(0.05, 0.0)
     assert policy.adaptive.rate_per_hour == 12.0
-    switches = StatisticSwitches(fixed_miss_rate=0.0)
     peaks = [
-        sustained_statistic(stream_statistic(s, PRIOR, switches)[s.before_sight()], 3).max()
+        sustained_statistic(statistic_at(s, PRIOR, 0.0)[s.before_sight()], 3).max()
         for s in streams
         if not s.hazard_free
     ]

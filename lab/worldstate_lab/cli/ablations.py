@@ -33,13 +33,13 @@ from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, alarm_outcome
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.operations.recordings.stream_statistic import (
+from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS
+from worldstate_lab.metrics.intervals import deal_folds
+from worldstate_lab.metrics.stream_statistic import (
     StatisticSwitches,
     log_joint,
     stream_statistic,
 )
-from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS
-from worldstate_lab.metrics.intervals import deal_folds
 from worldstate_lab.report.table import figure_lines
 
 

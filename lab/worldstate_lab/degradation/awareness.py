@@ -18,8 +18,8 @@ from worldstate.operations.metrics.approach_table import (
     rising_edges,
 )
 from worldstate.operations.recordings.hop_table import HOP_S, UNQUERIED, HopTable
-from worldstate.operations.recordings.stream_statistic import stream_statistic
 from worldstate_lab.metrics.intervals import deal_folds, middle, ratio
+from worldstate_lab.metrics.stream_statistic import stream_statistic
 
 from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions
 

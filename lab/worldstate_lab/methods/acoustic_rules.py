@@ -11,7 +11,7 @@ from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.metrics.approach_table import onset_outcome, rising_edges
 from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
+from worldstate_lab.metrics.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate_lab.trials.classification import SIDE_COLUMNS, posteriors
 from worldstate_lab.trials.trial import LEFT, RIGHT, Decide, Decisions, Trial
 

@@ -34,9 +34,9 @@ from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream
-from worldstate.operations.recordings.stream_statistic import stream_statistic
 from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.state import RiskCue, WorldState
+from worldstate_lab.metrics.stream_statistic import stream_statistic
 
 from .takes import Take
 from .trial import (

@@ -22,7 +22,6 @@ from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, caution, poisson_interval
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable
-from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate.operations.training.window_calibration import MISS_RATES
 
 ThresholdKind = Literal["conformal", "plain"]
@@ -272,9 +271,25 @@ def cut(stream: FloatArray, block_hops: int) -> list[FloatArray]:
     return np.split(stream, [i * block_hops for i in range(1, count)])
 
 
+def statistic_at(stream: HopTable, prior: Sequence[float], miss_rate: float) -> FloatArray:
+    r"""Return the statistic of every hop with absence at a fixed miss rate, shape (n,).
+
+    .. math:: s = \frac{\sum_k \pi_k \ell_k}
+              {\sum_k \pi_k \ell_k + \beta\, \pi_{vis} \ell_{vis} + \pi_0 \ell_0}
+
+    It is `abduction.posterior.statistic` with the same answer at every hop.
+
+    Shapes: prior (K + 2,).
+    """
+    with np.errstate(divide="ignore"):
+        weighed = np.log(np.array([*prior[:-2], prior[-2] * miss_rate, prior[-1]]))
+    joint = stream.log_likelihoods + weighed
+    hidden, others = (np.logaddexp.reduce(part, axis=1) for part in (joint[:, :-2], joint[:, -2:]))
+    return np.asarray(np.exp(-np.logaddexp(0.0, others - hidden)))
+
+
 def _statistics(streams: Sequence[HopTable], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
-    switches = StatisticSwitches(fixed_miss_rate=beta)
-    return [stream_statistic(stream, prior, switches) for stream in streams]
+    return [statistic_at(stream, prior, beta) for stream in streams]
 
 
 def _counted(calm: Sequence[FloatArray], gamma: float, settings: CueingSettings) -> ApproachTable:

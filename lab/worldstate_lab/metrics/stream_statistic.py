@@ -7,8 +7,7 @@ import numpy as np
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import FloatArray
-
-from .hop_table import ABSENT, PRESENT, HopTable
+from worldstate.operations.recordings.hop_table import ABSENT, PRESENT, HopTable
 
 # An approach score beyond this many standard deviations says no more than one at it.
 LARGEST_SCORE = 3.0
