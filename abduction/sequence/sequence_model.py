@@ -167,14 +167,8 @@ class SequenceAlarm:
 
     def raised(self, posterior: SequencePosterior) -> BoolArray:
         """Return whether each side is in alarm at every hop of a stream, shape (n, 2)."""
-        over = self.over(smoothed_log_odds(posterior), posterior.groups)
-        return np.stack([held(side) for side in over.T], axis=1)
-
-    def over(
-        self, log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
-    ) -> BoolArray:
-        """Return which sides are in alarm by their mean log-odds, shapes as in `deciding`."""
-        return self.deciding(log_odds, groups, learned_nats) >= self.threshold_nats
+        deciding = self.deciding(smoothed_log_odds(posterior), posterior.groups)
+        return np.stack([held(side) for side in (deciding >= self.threshold_nats).T], axis=1)
 
     def deciding(
         self, log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
@@ -206,15 +200,10 @@ class SequenceAlarm:
         return np.asarray(np.where(likelier, log_odds, np.minimum(log_odds, least)))
 
 
-def soon_log_odds(posterior: SequencePosterior) -> FloatArray:
-    """Return the log-odds of coming into view within three seconds at every hop, shape (n, 2)."""
-    within = np.clip(posterior.within()[..., HORIZONS_S.index(3.0)], _SMALLEST, 1.0 - _SMALLEST)
-    return np.asarray(np.log(within) - np.log1p(-within))
-
-
 def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
     """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
-    log_odds = soon_log_odds(posterior)
+    within = np.clip(posterior.within()[..., HORIZONS_S.index(3.0)], _SMALLEST, 1.0 - _SMALLEST)
+    log_odds = np.log(within) - np.log1p(-within)
     padded = np.concatenate([np.repeat(log_odds[:1], SMOOTHED_HOPS - 1, axis=0), log_odds])
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, SMOOTHED_HOPS, axis=0).mean(axis=-1))
 

@@ -54,7 +54,7 @@ class StreetSides:
 
     Examples
     --------
-    >>> sides = StreetSides(np.linspace(1.0, -1.0, SECTORS), 0.0, certainty=0.8, heard_by="roof")
+    >>> sides = StreetSides(np.linspace(1.0, -1.0, SECTORS), 0.0, certainty=0.8)
     >>> left = np.exp(np.linspace(1.0, -1.0, 60))[None]
     >>> bool(sides.log_ratio(left)[0] > 1.0)
     True
@@ -63,7 +63,6 @@ class StreetSides:
     weights: FloatArray  # shape (12,): Per nat of a sector
     offset: float
     certainty: float  # In [0, 1]: of few passes, less
-    heard_by: str  # Array and feature that the patterns were heard with
 
     def __post_init__(self) -> None:
         freeze_arrays(self, weights=(SECTORS,))
@@ -107,7 +106,7 @@ class PassSound:
 
     patterns: FloatArray  # shape (n, 12)
     weights: FloatArray  # shape (n,): Probability that a vehicle was heard to come
-    heard_by: str
+    heard_by: str  # Array and feature that the patterns were heard with
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +178,7 @@ class SidePatterns:
             (1.0 - _ROUND) * scatter + _ROUND * even * np.eye(SECTORS), means[0] - means[1]
         )
         offset, certainty = -0.5 * direction @ means.sum(axis=0), 1.0 / (1.0 + _DOUBT * (1.0 / weights).sum())
-        return StreetSides(direction, float(offset), float(certainty), self.heard_by)
+        return StreetSides(direction, float(offset), float(certainty))
 
 
 # A vehicle that comes is heard for some three seconds; with one in the other arm the sound has no known side.
@@ -212,29 +211,6 @@ class StreetHearing:
         """Number of hops that are kept."""
         return len(self.recent)
 
-    def heard(self, groups: FloatArray, feature: FloatArray) -> "StreetHearing":
-        """Return it one hop on; shapes: groups (2, groups), feature (azimuths,)."""
-        now = np.append(arrival_pattern(feature[None])[0], somebody_comes(groups))
-        left, right = (min(one + 1, HEARD_HOPS) for one in self.since)
-        return StreetHearing(
-            self.known, np.concatenate([self.recent[1 - HEARD_HOPS :], now[None]]), (left, right)
-        )
-
-    def interrupted(self) -> "StreetHearing":
-        """Return it without the last seconds, as after sound that was lost."""
-        return StreetHearing(self.known, since=self.since)
-
-    def passed(self, arm: str) -> "StreetHearing":
-        """Return it after a vehicle came into view out of an arm."""
-        own = SIDES.index(arm)
-        alone = self.since[1 - own] >= HEARD_HOPS
-        left, right = (0 if k == own else hops for k, hops in enumerate(self.since))
-        known = self.known
-        if alone and self.hops:
-            sound = PassSound(self.recent[:, :SECTORS], self.recent[:, SECTORS], known.heard_by)
-            known = known.with_pass(arm, sound)
-        return StreetHearing(known, self.recent, (left, right))
-
 
 class StreetListener:
     """Moves vehicles to the side of the street's patterns, hop by hop, and learns these from each that comes.
@@ -260,16 +236,25 @@ class StreetListener:
 
         Shapes: groups (2, groups), feature (azimuths,), positive.
         """
-        self.hearing = self.hearing.heard(groups, feature)
+        before, now = self.hearing, np.append(arrival_pattern(feature[None])[0], somebody_comes(groups))
+        left, right = (min(one + 1, HEARD_HOPS) for one in before.since)
+        recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now[None]])
+        self.hearing = StreetHearing(before.known, recent, (left, right))
         if self._sides is None:
             return groups
         return np.asarray(self._sides.turned(groups[None], feature[None])[0])
 
     def interrupt(self) -> None:
         """Forget the last seconds; what is known of the street stays."""
-        self.hearing = self.hearing.interrupted()
+        self.hearing = StreetHearing(self.hearing.known, since=self.hearing.since)
 
     def passed(self, arm: str) -> None:
         """Learn from a vehicle that came into view out of an arm just now."""
-        self.hearing = self.hearing.passed(arm)
+        known, recent, since = self.hearing.known, self.hearing.recent, self.hearing.since
+        own = SIDES.index(arm)
+        if since[1 - own] >= HEARD_HOPS and len(recent):
+            sound = PassSound(recent[:, :SECTORS], recent[:, SECTORS], known.heard_by)
+            known = known.with_pass(arm, sound)
+        left, right = (0 if k == own else hops for k, hops in enumerate(since))
+        self.hearing = StreetHearing(known, recent, (left, right))
         self._sides = self.hearing.known.sides()

@@ -176,7 +176,7 @@ def test_patterns_of_other_sectors_are_refused():
     with pytest.raises(InvalidArgumentError, match="12 sectors"):
         SidePatterns(sums=((0.0,), (0.0,)))
     with pytest.raises(InvalidArgumentError):
-        StreetSides(np.zeros(3), 0.0, 1.0, "roof")
+        StreetSides(np.zeros(3), 0.0, 1.0)
 
 
 def test_a_pattern_does_not_know_how_loud_it_was():

@@ -163,7 +163,7 @@ def test_the_alarm_is_that_of_the_stream_side_by_side(seed: int) -> None:
     alarm = SequenceAlarm(0.5, 15.0)
     said = drawn(np.random.default_rng(seed), 40, alarm)
     stream = SequencePosterior(np.stack([one.groups for one in said]), 0.1)
-    over = alarm.over(smoothed_log_odds(stream), stream.groups)
+    over = alarm.deciding(smoothed_log_odds(stream), stream.groups) >= alarm.threshold_nats
     # A mean over three hops needs three, and an alarm of the two before is held for a second.
     worlds = run(WorldFilter(), [heard(hop, one) for hop, one in enumerate(said, 1)])
     raised = [[cue.advisory is not None for cue in world.state.cues] for world in worlds]
