@@ -8,7 +8,7 @@ chain adds is whether a source in view is the one that was heard while hidden.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from operator import attrgetter
 from typing import Annotated, TypeAlias
 
@@ -77,8 +77,8 @@ class ExplanationBelief:
     Examples
     --------
     >>> start = ExplanationBelief.settled(2, (0.05, 0.3, 0.1, 0.05, 0.05, 0.3))
-    >>> round(start.hidden_total, 3), round(start.visible, 3), round(start.none, 3)
-    (0.176, 0.235, 0.588)
+    >>> [round(one, 3) for one in start.sides.hypotheses]
+    [0.176, 0.235, 0.588]
     """
 
     log_probabilities: tuple[float, ...]  # In the order of the chain, length 2K + 2, nats
@@ -86,10 +86,7 @@ class ExplanationBelief:
     @classmethod
     def settled(cls, k: int, rates_hz: RatesHz) -> "ExplanationBelief":
         """Return the equilibrium of the rates for K sides, all visible mass from elsewhere."""
-        belief = cls(_logs(equilibrium(rates_hz, k)))
-        for side in range(k):
-            belief = belief.forget_origin(side)
-        return belief
+        return reduce(cls.forget_origin, range(k), cls(_logs(equilibrium(rates_hz, k))))
 
     @classmethod
     def from_priors(cls, k: int, hidden: float, visible: float, none: float) -> "ExplanationBelief":
@@ -108,37 +105,14 @@ class ExplanationBelief:
         probabilities.flags.writeable = False
         return probabilities
 
-    @property
-    def hidden(self) -> tuple[float, ...]:
-        """P(hidden in direction k)."""
-        return tuple(self.probabilities[: self.k].tolist())
-
-    @property
-    def emerged(self) -> tuple[float, ...]:
-        """P(in view, having come from direction k)."""
-        return tuple(self.probabilities[self.k : 2 * self.k].tolist())
-
-    @property
-    def hidden_total(self) -> float:
-        """P(hidden) over all directions, as in eq. (6)."""
-        return float(self.probabilities[: self.k].sum())
-
-    @property
-    def visible(self) -> float:
-        """P(visible)."""
-        return float(self.probabilities[self.k : -1].sum())
-
-    @property
-    def none(self) -> float:
-        """P(none)."""
-        return float(np.exp(self.log_probabilities[-1]))
-
     @cached_property
     def sides(self) -> SideBelief:
         """The belief of the sides, which exclude each other here; whether and when one comes is not told."""
         # A sum of exponentials may exceed one by rounding, which readers of a snapshot refuse.
-        hidden, visible, none = (min(one, 1.0) for one in (self.hidden_total, self.visible, self.none))
-        return SideBelief(self.hidden, self.emerged, self.hidden, hidden, (hidden, visible, none))
+        k, sums = self.k, np.split(self.probabilities, [self.k, -1])
+        hidden, visible, none = (min(float(one.sum()), 1.0) for one in sums)
+        each = tuple(self.probabilities.tolist())
+        return SideBelief(each[:k], each[k : 2 * k], each[:k], hidden, (hidden, visible, none))
 
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "ExplanationBelief":
         """Return the belief after a time step without a measurement."""
@@ -212,9 +186,12 @@ class WindowBelief:
 
     Examples
     --------
-    >>> belief = WindowBelief.starting(ExplanationBelief.from_priors(2, 0.2, 0.3, 0.5), 0)
-    >>> belief.base("acoustic", 10**9, window_ns=10**9)[0]
-    0
+    >>> start = ExplanationBelief.from_priors(2, 0.2, 0.3, 0.5)
+    >>> heard = SignatureEvidence(("left", "right"), (2.0, 0.0), 0.0, 0.0)
+    >>> said = "acoustic", 10**9, heard, np.zeros(4), (0.05, 0.3, 0.1, 0.05, 0.05, 0.3)
+    >>> belief, predicted = WindowBelief(start, ((0, start),)).update(*said, window_ns=10**9)
+    >>> [round(one.sides.hidden[0], 2) for one in (predicted, belief.now)]
+    [0.09, 0.43]
     """
 
     # A window of 1 s every 0.1 s repeats nine tenths of its samples. Multiplying in every window would count
@@ -227,29 +204,9 @@ class WindowBelief:
     past: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
     heard: tuple[SourceEvidence, ...] = ()  # Most recent evidence of each source, sorted by its name
 
-    @classmethod
-    def starting(cls, belief: ExplanationBelief, start_ns: int) -> "WindowBelief":
-        """Return the first belief, before any window."""
-        return cls(belief, ((start_ns, belief),))
-
-    @property
-    def sides(self) -> SideBelief:
-        """The belief of the sides now."""
-        return self.now.sides
-
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "WindowBelief":
         """Return the belief after a time step without a window."""
         return replace(self, now=self.now.predict(rates_hz, step_ns))
-
-    def base(self, source: str, stamp_ns: int, window_ns: int) -> tuple[int, ExplanationBelief, FloatArray]:
-        """Return the newest belief that is a window old, its time, ns, and the evidence of others since."""
-        old = [past for past in self.past if past[0] <= stamp_ns - window_ns + SLACK_NS]
-        since_ns, belief = old[-1] if old else self.past[0]
-        others = np.zeros(belief.k + 2)
-        for other in self.heard:
-            if other.source != source and other.stamp_ns > since_ns:
-                others += other.log_likelihoods
-        return since_ns, belief, others
 
     def update(
         self,
@@ -264,22 +221,23 @@ class WindowBelief:
 
         Shapes: log_co_evidence (K + 2,).
         """
-        base_ns, belief, others = self.base(source, stamp_ns, window_ns)
+        old = sum(past_ns <= stamp_ns - window_ns + SLACK_NS for past_ns, _ in self.past)
+        first, others = max(old - 1, 0), np.zeros_like(log_co_evidence)
+        # The newest belief that is a window old, and the evidence of others since.
+        base_ns, belief = self.past[first]
+        sources = [other for other in self.heard if other.source != source]
+        for other in sources:
+            if other.stamp_ns > base_ns:
+                others += other.log_likelihoods
         prior = belief.predict(rates_hz, stamp_ns - base_ns)
         after = prior.update(evidence, log_co_evidence + others)
         # -inf would stay for the length of the window and cannot be written as JSON.
         own = np.maximum(evidence.log_likelihoods + log_co_evidence, LOG_FLOOR)
         heard = SourceEvidence(source, stamp_ns, tuple(own.tolist()))
-        sources = [other for other in self.heard if other.source != source]
         # Beliefs that no later window needs are left out.
         latest = [past for past in self.past if past[0] < stamp_ns]
-        old = sum(past_ns <= stamp_ns - window_ns + SLACK_NS for past_ns, _ in latest)
-        past = (*latest[max(old - 1, 0) :], (stamp_ns, after))
+        past = (*latest[first:], (stamp_ns, after))
         return WindowBelief(after, past, tuple(sorted([*sources, heard], key=attrgetter("source")))), prior
-
-    def heard_since(self, since_ns: int) -> "WindowBelief":
-        """Return the belief without the evidence of sources that are silent since then."""
-        return replace(self, heard=tuple(one for one in self.heard if one.stamp_ns >= since_ns))
 
     def map(self, change: Callable[[ExplanationBelief], ExplanationBelief]) -> "WindowBelief":
         """Return the belief with a function applied to it and to its past, which later windows build on."""

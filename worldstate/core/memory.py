@@ -111,10 +111,6 @@ class Memory:
         if not self.advised_ns:
             object.__setattr__(self, "advised_ns", (None,) * len(self.births))
 
-    def stamp_of(self, source: str, start_ns: int) -> int:
-        """Return when a source last measured, or the start where it has not."""
-        return next((one.stamp_ns for one in self.rules if one.source == source), start_ns)
-
     def with_rule(self, rule: SourceRule) -> "Memory":
         """Return the memory with what a source said last."""
         others = (one for one in self.rules if one.source != rule.source)
@@ -126,7 +122,7 @@ class Memory:
         if self.sequence is not None:
             return self.sequence.sides
         assert self.windows is not None
-        return self.windows.sides
+        return self.windows.now.sides
 
 
 def first_memory(context: Context, start_ns: int) -> Memory:
@@ -140,7 +136,7 @@ def first_memory(context: Context, start_ns: int) -> Memory:
         belief = ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)
     return Memory(
         stamp_ns=start_ns,
-        windows=WindowBelief.starting(belief, start_ns),
+        windows=WindowBelief(belief, ((start_ns, belief),)),
         births=(0,) * k,
         handover_ns=(None,) * k,
     )
@@ -152,9 +148,11 @@ def without_forgotten(memory: Memory) -> Memory:
     stamps_ns = [one.stamp_ns for one in memory.rules] + [one.stamp_ns for one in memory.looks]
     if min(stamps_ns, default=since_ns) >= since_ns:  # Nearly always: what else is kept has their names
         return memory
+    windows = memory.windows
     return replace(
         memory,
         rules=tuple(one for one in memory.rules if one.stamp_ns >= since_ns),
         looks=tuple(one for one in memory.looks if one.stamp_ns >= since_ns),
-        windows=memory.windows and memory.windows.heard_since(since_ns),
+        windows=windows
+        and replace(windows, heard=tuple(one for one in windows.heard if one.stamp_ns >= since_ns)),
     )

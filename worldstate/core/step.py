@@ -44,7 +44,8 @@ def sound_weight(memory: Memory, measurement: Measurement, start_ns: int, settin
 
     .. math:: \kappa = \min(dt / T, 1), \quad T = window
     """
-    before_ns = memory.stamp_of(measurement.source, start_ns)
+    stamps_ns = (one.stamp_ns for one in memory.rules if one.source == measurement.source)
+    before_ns = next(stamps_ns, start_ns)
     return min(max(seconds(measurement.stamp_ns - before_ns), 0.0) / settings.window_s, 1.0)
 
 
