@@ -31,7 +31,8 @@ class SideAdvisory:
     """The advisory of a side: until when it stands without news, and whether it is only held."""
 
     ends_ns: int
-    held: bool  # Below its threshold by now
+    held: bool = False  # Below its threshold by now
+    announced: bool = False  # By messages, not by what is heard
 
 
 def claimed_nats(probability: float) -> float:
@@ -95,15 +96,22 @@ def advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None,
     The rule names the likeliest side, or all in a tie; the alarm of a sequence model and messages name each
     side by itself. None stands beside a risk below .1.
     """
-    pairs = zip(heard_advisories(memory, model), announced_advisories(memory, model.policy), strict=True)
-    both = tuple(min(filter(None, pair), key=attrgetter("held"), default=None) for pair in pairs)
-    if not any(both):
-        return both
+    every = raised_advisories(memory, model)
+    if not any(every):
+        return every
     risks = published_belief(memory, model).risks
-    return tuple(one if risk >= LEAST_RISK else None for one, risk in zip(both, risks, strict=True))
+    return tuple(one if risk >= LEAST_RISK else None for one, risk in zip(every, risks, strict=True))
 
 
-def heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
+def raised_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
+    """Return the advisory of each side at any risk: that by messages where what is heard raises none."""
+    ends_ns = (_rule_ends_ns(memory, model.policy, k) for k in range(len(memory.births)))
+    told = (None if end_ns is None else SideAdvisory(end_ns, announced=True) for end_ns in ends_ns)
+    pairs = zip(_heard_advisories(memory, model), told, strict=True)
+    return tuple(min(filter(None, pair), key=attrgetter("held"), default=None) for pair in pairs)
+
+
+def _heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
     """Return the advisory of each side by what is heard and seen.
 
     None before the first sequence: the first second of single windows was counted in no budget.
@@ -118,14 +126,8 @@ def heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory |
             None if end_ns is None else SideAdvisory(end_ns, decided < threshold) for end_ns, decided in pairs
         )
     rule, least = _rule_ends_ns(memory, model.policy), max(hidden) * (1.0 - _TIE)
-    named = None if rule is None else SideAdvisory(rule, held=False)
+    named = None if rule is None else SideAdvisory(rule)
     return tuple(named if p >= least else None for p in hidden)
-
-
-def announced_advisories(memory: Memory, policy: CueingPolicy) -> tuple[SideAdvisory | None, ...]:
-    """Return the advisory of each side by messages."""
-    ends_ns = (_rule_ends_ns(memory, policy, k) for k in range(len(memory.births)))
-    return tuple(None if end_ns is None else SideAdvisory(end_ns, held=False) for end_ns in ends_ns)
 
 
 def decided_log_odds(memory: Memory, policy: CueingPolicy) -> float:

@@ -1,7 +1,6 @@
 """Build the cues of a snapshot: risk, times, advisories, and what these are raised by."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
@@ -13,51 +12,42 @@ from .advisories import (
     MOST_NATS,
     SideAdvisory,
     advisories,
-    announced_advisories,
     bounded_log_odds,
     claimed_nats,
     decided_log_odds,
-    heard_advisories,
+    raised_advisories,
     why_none,
 )
 from .birth_death import hidden_on
-from .memory import Memory
+from .memory import Instant, Memory
 from .sequence_memory import SequenceMemory
 from .site_model import FilterModel, published_belief
 from .snapshot_builder import hidden_azimuth, sector, time_to_arrival, visible_in
 
-_Times = tuple[dict[str, float], tuple[float, float, float] | None]
+_Times = tuple[dict[str, float] | None, tuple[float, float, float] | None]
 
 
 def cues_of(memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...]) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
-    instant = memory.instant
-    if instant is None:
+    if memory.instant is None:
         return ()
-    sides, told = published_belief(memory, model), advisories(memory, model)
-    rested_on = tuple(one for one in sensors if one.condition != "silent")
-    times = _times(memory.sequence, [one is not None for one in told])
-    evidence = _evidence(memory, model)
+    told, evidence = advisories(memory, model), _evidence(memory, model)
     # All sides together: what is taken out of arrays once.
-    shared = partial(
-        RiskCue,
-        statistic=instant.statistic,
-        log_lambda=instant.log_lambda,
-        hypotheses=Priors(*sides.hypotheses),
-    )
-    build = partial(_cue, memory, model, shared, sides, rested_on)
+    times = _times(memory.sequence, [one is not None for one in told])
+    rested_on = tuple(one for one in sensors if one.condition != "silent")
+    build = partial(_cue, memory, memory.instant, model, published_belief(memory, model), rested_on)
     return tuple(map(build, range(len(told)), told, times, evidence))
 
 
 def _cue(
     memory: Memory,
+    instant: Instant,
     model: FilterModel,
-    shared: Callable[..., RiskCue],
     sides: SideBelief,
     sensors: tuple[SensorHealth, ...],
     k: int,
     told: SideAdvisory | None,
-    times: _Times | None,
+    times: _Times,
     evidence: EvidenceTerms,
 ) -> RiskCue:
     track = hidden_on(memory.tracks, k)
@@ -65,7 +55,7 @@ def _cue(
     azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
     if track is None or track.place is None:
         azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, model.site)
-    within, interval_s = (None, None) if times is None else times
+    within, interval_s = times
     closing_hz = motion.inverse_tta_hz if track is not None and track.approach_heard else None
     arrival_s = time_to_arrival(closing_hz, motion.inverse_tta_std_hz)
     # Distance and speed of an announced vehicle tell more than the sound.
@@ -75,8 +65,11 @@ def _cue(
     if told is not None:
         advisory = Advisory(memory.stamp_ns if since_ns is None else since_ns, told.ends_ns, sensors)
         held = Held(entity_id, told.ends_ns) if told.held else None
-    return shared(
+    return RiskCue(
         direction=model.site.sides[k].label,
+        statistic=instant.statistic,
+        log_lambda=instant.log_lambda,
+        hypotheses=Priors(*sides.hypotheses),
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
         risk=sides.risks[k],
@@ -94,10 +87,10 @@ def _cue(
     )
 
 
-def _times(kept: SequenceMemory | None, advised: list[bool]) -> list[_Times | None]:
+def _times(kept: SequenceMemory | None, advised: list[bool]) -> list[_Times]:
     """Return the probabilities of coming into view, and the time to it where a vehicle is expected."""
     if kept is None:
-        return [None] * len(advised)
+        return [(None, None)] * len(advised)
     posterior = kept.posterior
     within = posterior.within()[0].tolist()
     soon = posterior.groups[0, :, :STATED].sum(axis=1) > 0.5
@@ -113,15 +106,12 @@ def _times(kept: SequenceMemory | None, advised: list[bool]) -> list[_Times | No
 
 def _evidence(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
     """Return what raises the advisory of each side: the sound, or messages where they alone do."""
-    heard, by_messages = _heard(memory, model), announced_advisories(memory, model.policy)
-    if not any(by_messages):
+    heard, raised = _heard(memory, model), raised_advisories(memory, model)
+    by_message = [one is not None and one.announced for one in raised]
+    if not any(by_message):
         return heard
     told = _announced(memory, model)
-    sides = zip(heard, heard_advisories(memory, model), by_messages, strict=True)
-    return [
-        told if by_message and (by_sound is None or by_sound.held) else own
-        for own, by_sound, by_message in sides
-    ]
+    return [told if named else own for own, named in zip(heard, by_message, strict=True)]
 
 
 def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:

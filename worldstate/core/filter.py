@@ -1,6 +1,6 @@
 """The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
-from collections.abc import Sequence, Sized
+from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -265,8 +265,6 @@ class WorldFilter:
         kept = decode(FilterRecord, value, "checkpoint")
         past, latest = kept.past, kept.memory
         world = cls(kept.context, kept.policy, kept.settings, kept.start_ns, latest)
-        if past is None:
-            return world
         world = replace(world, lag=restored(latest, past, world._step))
         return world if past.stamp_ns <= latest.stamp_ns else world.predict_to(past.stamp_ns)
 
@@ -294,38 +292,33 @@ class FilterRecord:
     settings: FilterSettings
     start_ns: int
     memory: Memory
-    past: LagRecord | None = None
+    past: LagRecord
 
     def __post_init__(self) -> None:
-        self._check(self.memory)
-        if self.past is not None:
-            self._check(self.past.base)
+        for memory in (self.memory, self.past.base):
+            self._check(memory)
 
     def _check(self, memory: Memory) -> None:
-        k = len(self.context.directions)
-        windows = [] if memory.windows is None else [memory.windows.now, *(b for _, b in memory.windows.past)]
-        heard = () if memory.windows is None else memory.windows.heard
-        lengths: dict[str, tuple[Sequence[Sized], int]] = {
-            "windows": ([belief.log_probabilities for belief in windows], 2 * k + 2),
-            "windows.heard": ([one.log_likelihoods for one in heard], k + 2),
-            "births": ([memory.births], k),
-            "handover_ns": ([memory.handover_ns], k),
-            "advised_ns": ([memory.advised_ns], k),
-        }
-        for name, (rows, length) in lengths.items():
-            for row in rows:
-                if len(row) != length:
-                    raise InvalidArgumentError(f"memory.{name}: expected {length} numbers, got {len(row)}")
+        k, windows = len(self.context.directions), memory.windows
+        rows: list[tuple[str, Sized, int]] = [
+            (name, getattr(memory, name), k) for name in ("births", "handover_ns", "advised_ns")
+        ]
+        if windows is not None:
+            beliefs = (windows.now, *(belief for _, belief in windows.past))
+            rows += [("windows", one.log_probabilities, 2 * k + 2) for one in beliefs]
+            rows += [("windows.heard", one.log_likelihoods, k + 2) for one in windows.heard]
+        for name, row, length in rows:
+            if len(row) != length:
+                raise InvalidArgumentError(f"memory.{name}: expected {length} numbers, got {len(row)}")
         if memory.sequence is not None:
             memory.sequence.check()
-        if len(windows) < 2 and memory.sequence is None:
+        elif windows is None or not windows.past:
             raise InvalidArgumentError("memory.windows: expected a belief and its past, or a sequence")
         if any(len(one.statistic) > self.policy.sustain_hops for one in memory.rules):
             raise InvalidArgumentError("memory.rules: expected statistics of the policy's rule")
-        if any(side >= k for one in memory.rules for side in one.announced):
-            raise InvalidArgumentError("memory.rules: expected known sides")
-        if any(track.side >= k for track in memory.tracks):
-            raise InvalidArgumentError("memory.tracks: expected known sides")
+        announced = [side for one in memory.rules for side in one.announced]
+        if max((*announced, *(track.side for track in memory.tracks)), default=0) >= k:
+            raise InvalidArgumentError("memory: expected known sides")
 
 
 def _with_likeliest(memory: Memory) -> Memory:
