@@ -12,10 +12,10 @@ from functools import partial
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, add_vehicle
+from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.presets import Ambience, Preset, recording_ambience, site_ambience

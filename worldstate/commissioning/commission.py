@@ -19,13 +19,13 @@ from worldstate.abduction.signature.window_classes import CLASSES, side_ratios, 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of
 from worldstate.adapters.files.model_file import Model
-from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
+from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.stream.settings import StreamSettings
 
 from .guard_training import train_guard

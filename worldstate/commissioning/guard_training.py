@@ -10,7 +10,6 @@ import scipy.signal
 
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble_training import standardisation
-from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES, SoundCharacter
 from worldstate.ground.blas_threads import one_blas_thread
@@ -18,6 +17,7 @@ from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.ground.values import NotUsable, significant
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
+from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SimulationSettings, with_sounds
 from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.simulation.sound.receiver import standing_m

@@ -18,7 +18,6 @@ from worldstate.abduction.signature.site_estimate import HOP_S, SiteEstimate, Si
 from worldstate.abduction.signature.site_reference import KINDS, log_levels, site_reference
 from worldstate.abduction.signature.window_classes import BOTH, DIRECT
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
-from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
@@ -27,6 +26,7 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.operations.training.site_references import simulated_beside, with_site_references
 from worldstate.operations.training.training import fit_ensemble
+from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import open_road
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS

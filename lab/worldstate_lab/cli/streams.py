@@ -13,9 +13,9 @@ from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.parallel import in_processes
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
+from worldstate.simulation.parallel import in_processes
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import pass_figures
 from worldstate_lab.report.table import figure_lines

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.adapters.datasets.traffic_clips import BACKGROUND, CLIP_S, ClipLabels
-from worldstate.adapters.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
+from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import site
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA

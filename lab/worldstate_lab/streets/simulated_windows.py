@@ -16,7 +16,6 @@ import scipy.signal
 from worldstate.adapters.datasets.feature_extraction import WINDOW_S, window_ends_s
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.array.steering import cross_spectra
 from worldstate.frontend.direction.feature import (
@@ -33,6 +32,7 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 from worldstate.simulation.dataset.recording import simulate_recording
+from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import SITES
 from worldstate.simulation.scene.presets import Preset, preset
 from worldstate.simulation.scene.settings import SimulationSettings, draw_settings

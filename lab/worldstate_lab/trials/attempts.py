@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-from worldstate.adapters.parallel import in_processes
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import WorldstateError
+from worldstate.simulation.parallel import in_processes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
