@@ -47,8 +47,9 @@ _ON_FOOT, _MISREAD = frozenset({"person", "pedestrian"}), 0.1
 class Association:
     """Whose a look's measurements are: the likeliest assignment, and P(one of them is its) of every track."""
 
-    found: dict[int, int]  # Measurement of a track; what is left over is new
+    found: dict[int, int]  # Measurement of a track
     chances: list[float]  # Over all joint events, shape (tracks,)
+    new: list[int]  # Measurements of no track
 
     def handed_over(self, before: Sequence[Track], after: Sequence[Track]) -> dict[int, float]:
         """Return, by side of a hand-over, the share of P(hidden) to keep: P(it was another vehicle)."""
@@ -73,7 +74,7 @@ def associated(
     else take the first sighting of the next one.
     """
     if not tracks or not sightings:
-        return Association({}, [0.0] * len(tracks))
+        return Association({}, [0.0] * len(tracks), list(range(len(sightings))))
     unheard = math.log(UNHEARD / (2.0 * view.half_width_rad))
     detected = np.array([track.detected for track in tracks])
     scores = _scores(tracks, sightings, detected, site)
@@ -91,7 +92,8 @@ def joint_association(log_ratios: FloatArray, detected: BoolArray) -> Associatio
     scores = np.where(gated & detected, np.logaddexp(log_ratios, 0.0), log_ratios)
     found = _likeliest(scores)
     chances = association_probabilities(log_ratios).sum(axis=0)
-    return Association(found, np.minimum(chances, 1.0).tolist())
+    new = [j for j in range(len(log_ratios)) if j not in found.values()]
+    return Association(found, np.minimum(chances, 1.0).tolist(), new)
 
 
 def association_probabilities(log_ratios: FloatArray) -> FloatArray:

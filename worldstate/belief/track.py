@@ -8,7 +8,7 @@ from uuid import UUID, uuid5
 
 import numpy as np
 
-from worldstate.abduction.road_users import ClassShares
+from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, predict_place
 from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief, predict, relax
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
@@ -81,6 +81,22 @@ def entity_id(stream: str, kind: str, number: int) -> str:
     True
     """
     return str(uuid5(_NAMESPACE, f"{stream}/{kind}/{number}"))
+
+
+def born(kind: str, number: int, existence: float, stamp_ns: int, site: SiteGeometry) -> Track:
+    """Return the n-th entity of a kind, of which nothing else is known: what has found it follows."""
+    return Track(
+        id=entity_id(site.settings.stream, kind, number),
+        side=0,
+        seen=False,
+        existence=existence,
+        motion=_IN_VIEW,
+        labels=((UNKNOWN, 1.0),),
+        moving=True,
+        sources=(),
+        created_ns=stamp_ns,
+        updated_ns=stamp_ns,
+    )
 
 
 def after_empty_look(existence: float, miss_rate: float) -> float:

@@ -10,7 +10,7 @@ from worldstate.belief.association import EDGE_STD_RAD, Association
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import Track, entity_id, heard_as
+from worldstate.belief.track import Track, born, heard_as
 from worldstate.belief.window_belief import ExplanationBelief
 from worldstate.ground.values import nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
@@ -57,11 +57,16 @@ def birth_death(
             memory = replace(memory, windows=memory.windows and memory.windows.map(forget))
             returning = _returning(kept, k, measurement.stamp_ns, site)
             if returning is None:
-                kept.append(_born(k, counts[k], min(sides.hidden[k], 1.0), measurement, site))
+                one = born(site.sides[k].label, counts[k], 0.0, measurement.stamp_ns, site)
+                # A detector adds to the kinds at the hand-over.
+                labels = measurement.kinds or one.labels
+                one = replace(one, labels=labels, sources=(measurement.source,))
                 counts[k] += 1
             else:
-                kept.remove(returning)
-                kept.append(_hidden_again(returning, k, min(sides.hidden[k], 1.0), measurement, site))
+                kept.remove(one := returning)
+            one = replace(one, side=k, seen=False, was_hidden=True, existence=min(sides.hidden[k], 1.0))
+            stamp_ns, motion = measurement.stamp_ns, site.sides[k].prior()
+            kept.append(replace(one, motion=motion, updated_ns=stamp_ns, place=None, behind=1.0))
     return replace(memory, tracks=tuple(kept), births=tuple(counts))
 
 
@@ -119,39 +124,6 @@ def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -
         if side.distance_rad(track.motion.azimuth_rad) <= _REOCCLUSION_RAD
     ]
     return min(candidates, key=lambda track: side.distance_rad(track.motion.azimuth_rad), default=None)
-
-
-def _hidden_again(
-    track: Track, k: int, existence: float, measurement: Measurement, site: SiteGeometry
-) -> Track:
-    return replace(
-        track,
-        side=k,
-        seen=False,
-        was_hidden=True,
-        existence=existence,
-        motion=site.sides[k].prior(),
-        updated_ns=measurement.stamp_ns,
-        place=None,
-        behind=1.0,
-    )
-
-
-def _born(k: int, number: int, existence: float, measurement: Measurement, site: SiteGeometry) -> Track:
-    return Track(
-        id=entity_id(site.settings.stream, site.sides[k].label, number),
-        side=k,
-        seen=False,
-        existence=existence,
-        motion=site.sides[k].prior(),
-        # A detector adds to it at the hand-over.
-        labels=measurement.kinds or ((UNKNOWN, 1.0),),
-        moving=True,
-        sources=(measurement.source,),
-        created_ns=measurement.stamp_ns,
-        updated_ns=measurement.stamp_ns,
-        was_hidden=True,
-    )
 
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.

@@ -6,7 +6,6 @@ from operator import attrgetter
 
 import numpy as np
 
-from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.association import (
     EDGE_STD_RAD,
     FORBIDDEN,
@@ -27,7 +26,7 @@ from worldstate.belief.track import (
     Track,
     after_empty_look,
     after_sighting,
-    entity_id,
+    born,
     follow_places,
     merged,
     relabelled,
@@ -64,22 +63,22 @@ def position_update(memory: Memory, scan: PositionScan, weight: float, site: Sit
     whose = joint_association(
         _log_ratios(tracks, positions, scan, site), np.array([track.detected for track in tracks], bool)
     )
-    found, after = whose.found, list[Track]()
-    for i, (track, chance) in enumerate(zip(tracks, whose.chances, strict=True)):
+    births, sighted = list(memory.births), memory.sighted
+    for j in whose.new:
+        track = _born(positions[j], scan, births, sighted, site)
+        births[track.side] += track.was_hidden
+        sighted += not track.was_hidden
+        tracks = (*tracks, track)
+    found = whose.found | dict(enumerate(whose.new, start=len(memory.tracks)))
+    after, chances = list[Track](), (*whose.chances, *[1.0] * len(whose.new))
+    for i, (track, chance) in enumerate(zip(tracks, chances, strict=True)):
         existence = track.existence
         if scan.searched is not None:
-            existence = _existence(track, chance, scan.searched, weight, site)
+            existence = _existence(track, chance, scan.searched, weight)
         if i in found:
             after.append(_found(track, positions[found[i]], existence, scan, site))
         else:
             after.append(_missed(track, existence, scan.searched))
-    births, sighted = list(memory.births), memory.sighted
-    unknown = [one for j, one in enumerate(positions) if j not in found.values()]
-    for position in unknown:
-        track = _born(position, scan, births, sighted, site)
-        births[track.side] += track.was_hidden
-        sighted += not track.was_hidden
-        after.append(track)
     memory = replace(memory, births=tuple(births), sighted=sighted)
     return after_look(memory, follow_places(after, site), whose, scan.stamp_ns, site)
 
@@ -178,9 +177,10 @@ def _found(
         approach_heard=True,
         place=_placed(track, position),
     )
-    if scan.searched is not None:
-        return _sighted(changed, scan.stamp_ns, scan.searched)
-    return _at_side(changed, site)
+    if scan.searched is None:
+        return _at_side(changed, site)
+    miss_rate = 1.0 - scan.searched.detection_probability
+    return replace(changed, seen=True, last_seen_ns=scan.stamp_ns, answer="visible", miss_rate=miss_rate)
 
 
 def _placed(track: Track, position: Position) -> CartesianBelief:
@@ -203,11 +203,6 @@ def _at_side(track: Track, site: SiteGeometry) -> Track:
     return replace(track, side=side, seen=False, was_hidden=True) if hidden else track
 
 
-def _sighted(track: Track, stamp_ns: int, searched: SearchedSector) -> Track:
-    miss_rate = 1.0 - searched.detection_probability
-    return replace(track, seen=True, last_seen_ns=stamp_ns, answer="visible", miss_rate=miss_rate)
-
-
 def _told(track: Track, position: Position, scan: PositionScan) -> float:
     """Return the existence after a message."""
     # A sender that lies in one message lies in the next: what a source repeats counts once.
@@ -218,35 +213,30 @@ def _told(track: Track, position: Position, scan: PositionScan) -> float:
     return min(before * odds / (before * odds + 1.0 - before), _MOST_EXISTENCE)
 
 
-def _detected(existence: float, searched: SearchedSector) -> float:
-    return after_sighting(existence, 1.0 - searched.detection_probability, searched.clutter_rate)
-
-
 def _moving(position: Position, before: bool) -> bool:
     velocity = position.velocity_mps
     return before if velocity is None else math.hypot(*velocity) > _PARKED_MPS
 
 
-def _existence(
-    track: Track, chance: float, searched: SearchedSector, weight: float, site: SiteGeometry
-) -> float:
+def _existence(track: Track, chance: float, searched: SearchedSector, weight: float) -> float:
     r"""Return the existence after a scan, with the chance c that one of its positions is of the track.
 
     .. math:: r \leftarrow c\, r_+ + (1 - c)\, \frac{r (1 - p)}{1 - r p}, \qquad
               p = p_D\, P_{range}\, (1 - P_{hidden})
     """
+    miss_rate, missed = 1.0 - searched.detection_probability, track.existence
+    found = after_sighting(track.existence, miss_rate, searched.clutter_rate)
     if not track.detected:
-        return _detected(track.existence, searched)
-    missed = track.existence
+        return found
     if searched.sector.touches(track.motion.azimuth_rad):
         mean, variance = track.motion.mean[LOG_RANGE], track.motion.covariance[LOG_RANGE, LOG_RANGE]
         in_range = normal_share((math.log(searched.range_m) - mean) / math.sqrt(variance))
         in_sight = 1.0 if track.seen else 1.0 - track.behind
-        miss = 1.0 - in_range * in_sight * (1.0 - (1.0 - searched.detection_probability) ** weight)
+        miss = 1.0 - in_range * in_sight * (1.0 - miss_rate**weight)
         missed = after_empty_look(missed, miss)
         if not track.seen:
             missed = max(missed, _LEAST_EXISTENCE)
-    return missed + chance * (_detected(track.existence, searched) - missed)
+    return missed + chance * (found - missed)
 
 
 def _missed(track: Track, existence: float, searched: SearchedSector | None) -> Track:
@@ -261,27 +251,12 @@ def _missed(track: Track, existence: float, searched: SearchedSector | None) -> 
 def _born(
     position: Position, scan: PositionScan, births: list[int], sighted: int, site: SiteGeometry
 ) -> Track:
-    """Return a new entity, hidden where a message places it behind an occluder."""
-    x, y = position.position_m
-    side, behind = site.hiding_side(math.atan2(y, x), _SHARP_RAD)
+    """Return a new entity before its position counts, hidden where a message places it behind an occluder."""
+    azimuth_rad = math.atan2(position.position_m[1], position.position_m[0])
+    side, behind = site.hiding_side(azimuth_rad, _SHARP_RAD)
     hidden = scan.searched is None and behind >= 0.5
-    stream, label = site.settings.stream, site.sides[side].label
-    track = Track(
-        id=entity_id(stream, label, births[side]) if hidden else entity_id(stream, "visible", sighted),
-        side=side if hidden else site.nearest_side(math.atan2(y, x)),
-        seen=False,
-        existence=min(position.existence_probability, _MOST_EXISTENCE),
-        motion=site.sides[side].prior(),
-        labels=position.classes or ((UNKNOWN, 1.0),),
-        moving=_moving(position, before=True),
-        sources=(scan.source,),
-        created_ns=scan.stamp_ns,
-        updated_ns=scan.stamp_ns,
-        approach_heard=True,
-        was_hidden=hidden,
-        place=at_position(position),
-    )
-    if scan.searched is not None:
-        existence = _detected(track.existence, scan.searched)
-        track = _sighted(replace(track, existence=existence), scan.stamp_ns, scan.searched)
-    return track
+    kind, number = (site.sides[side].label, births[side]) if hidden else ("visible", sighted)
+    existence = min(position.existence_probability, _MOST_EXISTENCE)
+    one = born(kind, number, existence, scan.stamp_ns, site)
+    side = side if hidden else site.nearest_side(azimuth_rad)
+    return replace(one, side=side, sources=(scan.source,), was_hidden=hidden)

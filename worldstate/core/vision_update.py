@@ -23,7 +23,7 @@ from worldstate.belief.track import (
     Track,
     after_empty_look,
     after_sighting,
-    entity_id,
+    born,
     follow_places,
     merged,
     relabelled,
@@ -75,41 +75,28 @@ def vision_update(
     """Return the memory after one look: detections, missed detections and hand-overs."""
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
     sightings, view = tuple(sorted(seen.sightings, key=_BY_ALL)), site.view(seen.look)
-    tracks, whose = memory.tracks, associated(memory.tracks, sightings, view, site)
-    found, after, others = whose.found, list[Track](), _other_views(memory, seen.look)
+    whose, stamp_ns = associated(memory.tracks, sightings, view, site), measurement.stamp_ns
+    numbers = range(memory.sighted, memory.sighted + len(whose.new))
+    fresh = [born("visible", number, _FIRST_EXISTENCE, stamp_ns, site) for number in numbers]
+    tracks, chances = (*memory.tracks, *fresh), (*whose.chances, *[1.0] * len(fresh))
+    found = whose.found | dict(enumerate(whose.new, start=len(memory.tracks)))
     turned, rates = _turned(tracks, sightings, found, site), _rates(measurement.co_evidence)
-    for i, track in enumerate(tracks):
+    after, others = list[Track](), _other_views(memory, seen.look)
+    for i, (track, chance) in enumerate(zip(tracks, chances, strict=True)):
         answer = _searched(track, measurement, seen.look, view)
-        existence = _existence(track, whose.chances[i], answer, weight, rates)
+        existence = _existence(track, chance, answer, weight, rates)
         if i in found:
             if not track.seen:
-                known = max(track.existence, _FIRST_EXISTENCE)
-                existence = after_sighting(known, *rates)
+                existence = after_sighting(max(track.existence, _FIRST_EXISTENCE), *rates)
             after.append(_found(turned[i], sightings[found[i]], existence, measurement, site))
         elif answer is _OUTSIDE and any(one.touches(track.motion.azimuth_rad) for one in others):
             # Where only other cameras have looked, their answer holds.
             after.append(track)
         else:
-            left = _has_left(track, answer, measurement.stamp_ns, site)
+            left = _has_left(track, answer, stamp_ns, site)
             after.append(_not_sighted(track, existence, _OUTSIDE if left else answer))
-    unheard = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
-    existence = after_sighting(_FIRST_EXISTENCE, *rates)
-    for number, one in enumerate(unheard, start=memory.sighted):
-        fresh = Track(
-            id=entity_id(site.settings.stream, "visible", number),
-            side=0,
-            seen=False,
-            existence=existence,
-            motion=_motion_at(one, None),
-            labels=(),
-            moving=one.moving,
-            sources=(),
-            created_ns=measurement.stamp_ns,
-            updated_ns=measurement.stamp_ns,
-        )
-        after.append(_found(fresh, one, existence, measurement, site))
-    memory = replace(memory, sighted=memory.sighted + len(unheard))
-    return after_look(memory, after, whose, measurement.stamp_ns, site)
+    memory = replace(memory, sighted=memory.sighted + len(fresh))
+    return after_look(memory, after, whose, stamp_ns, site)
 
 
 def _other_views(memory: Memory, look: Look) -> list[Sector]:
@@ -230,11 +217,11 @@ def _not_sighted(track: Track, existence: float, answer: CoEvidence) -> Track:
     return replace(track, existence=existence, answer="unqueried", miss_rate=None)
 
 
-def _motion_at(sighting: Sighting, before: MotionBelief | None) -> MotionBelief:
+def _motion_at(sighting: Sighting, before: MotionBelief) -> MotionBelief:
     """Return the motion belief at a sighting, with approach rate and range of an earlier belief."""
     rate_std, radial_std = _NEW_RATE_STD if sighting.moving else _PARKED_RATE_STD
     mean, std = [sighting.azimuth_rad, 0.0, 0.0, 3.2], [sighting.std_rad, rate_std, radial_std, 0.6]
-    if before is not None and sighting.moving:
+    if sighting.moving:
         mean[2:] = before.mean[RADIAL_RATE:].tolist()
         std[2:] = np.sqrt(np.diag(before.covariance)[RADIAL_RATE : LOG_RANGE + 1]).tolist()
     return MotionBelief.around((mean[0], mean[1], mean[2], mean[3]), (std[0], std[1], std[2], std[3]))
