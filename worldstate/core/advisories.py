@@ -72,7 +72,9 @@ def ruled(
     log_prior = np.log(model.policy.reference_prior)
     posterior = posterior_of(log_prior, said, answer)
     heard = posterior if isinstance(answer, Unqueried) else posterior_of(log_prior, said, NO_LOOK)
-    instant = Instant.of(posterior, heard)
+    ratio = posterior.log_lambda
+    statistic, bounded = min(posterior.hidden_total, 1.0), ratio if math.isfinite(ratio) else None
+    instant = Instant(statistic, bounded, heard.log_lambda)
     before = next((one.statistic for one in memory.rules if one.source == rule.source), ())
     kept = (*before, instant.statistic)[-model.policy.sustain_hops :]
     return replace(memory.with_rule(replace(rule, statistic=kept)), instant=instant)

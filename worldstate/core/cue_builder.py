@@ -3,6 +3,8 @@
 import math
 from functools import partial
 
+import numpy as np
+
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.side_belief import SideBelief
@@ -115,15 +117,20 @@ def _evidence(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
 
 
 def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
-    """Return for each side what the alarm of a sequence goes by, or the rule of all sides together."""
+    r"""Return for each side what the alarm of a sequence goes by, or the rule of all sides together.
+
+    With L the log-odds of a sequence after the prior, what was heard, and every look,
+
+    .. math:: t_j = L_j - L_{j-1}
+    """
     kept, instant = memory.sequence, memory.instant
     assert instant is not None
     if kept is not None and kept.alarm is not None:
-        terms = kept.log_odds_terms(model.context)
-        threshold = kept.alarm.threshold_nats
+        after, threshold = kept.log_odds(model.context), kept.alarm.threshold_nats
+        terms = np.diff(list(after.values()), axis=0, prepend=0.0).T.tolist()
         return [
-            EvidenceTerms("coming", {name: both[k] for name, both in terms.items()}, decides, threshold)
-            for k, decides in enumerate(kept.decided)
+            EvidenceTerms("coming", dict(zip(after, own, strict=True)), decides, threshold)
+            for own, decides in zip(terms, kept.decided, strict=True)
         ]
     prior, threshold = _rule_log_odds(memory, model)
     looked_nats = math.inf if instant.log_lambda is None else instant.log_lambda

@@ -1,6 +1,5 @@
 """The state that the filter carries from one call to the next."""
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
@@ -8,7 +7,6 @@ from typing import Annotated, TypeAlias
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
-from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.side_belief import SideBelief
@@ -67,13 +65,6 @@ class Instant:
     statistic: Probability  # P(hidden), all directions together
     log_lambda: float | None  # None for a ratio without bound
     heard_nats: float  # Log-odds of hidden by sound alone
-
-    @classmethod
-    def of(cls, posterior: Posterior, heard: Posterior) -> "Instant":
-        """Return what is kept of the posterior of a window, and of its sound alone."""
-        ratio = posterior.log_lambda
-        statistic = min(posterior.hidden_total, 1.0)
-        return cls(statistic, ratio if math.isfinite(ratio) else None, heard.log_lambda)
 
 
 # No slots: the belief of the sides is computed once.

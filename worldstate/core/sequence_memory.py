@@ -26,7 +26,7 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.side_belief import SideBelief
-from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, seconds
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, seconds
 from worldstate.ground.serialisation import Probability
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
@@ -217,10 +217,9 @@ class SequenceMemory:
         told = tuple(comes.tolist())
         return SideBelief(told, tuple(emerged.tolist()), told, 1.0 - none, hypotheses)
 
-    def masked(self) -> BoolArray:
-        """Return the sides whose sound is that of a vehicle just come into view, shape (2,)."""
-        ages_ns = [math.inf if ns is None else self.stamp_ns - ns for ns in self.emerged_ns]
-        return np.array(ages_ns) <= _MASKED_NS
+    def since_emerged_ns(self, stamp_ns: int) -> list[float]:
+        """Return how long before a time a vehicle last came into view from each side."""
+        return [math.inf if ns is None else stamp_ns - ns for ns in self.emerged_ns]
 
     def handed_over(
         self, kept: Mapping[int, float], apart: Collection[int], stamp_ns: int
@@ -252,8 +251,7 @@ class SequenceMemory:
             belief[k] = (1.0 - residual) * now + residual * belief[k]
             # The sound of before told of the vehicle that is in view now.
             alone[k], unseen[k] = belief[k], 0.0
-        since_ns = [math.inf if ns is None else stamp_ns - ns for ns in self.emerged_ns]
-        pairs = zip(self.arrivals, since_ns, strict=True)
+        pairs = zip(self.arrivals, self.since_emerged_ns(stamp_ns), strict=True)
         return replace(
             self,
             states=SequenceBelief(belief, alone),
@@ -280,17 +278,6 @@ class SequenceMemory:
         ends_ns = (None if over_ns is None else over_ns + _HELD_NS + _SLACK_NS for over_ns in self.over_ns)
         return tuple(None if end_ns is None or end_ns < stamp_ns else end_ns for end_ns in ends_ns)
 
-    def log_odds_terms(self, context: Context) -> dict[str, list[float]]:
-        r"""Return what each piece of evidence adds to the log-odds of coming into view within three seconds.
-
-        .. math:: t_j = L_j - L_{j-1}
-
-        with L of both sides after the prior, the sequence, and every look.
-        """
-        after = self.log_odds(context)
-        terms = np.diff(list(after.values()), axis=0, prepend=np.zeros((1, len(SIDES))))
-        return dict(zip(after, terms.tolist(), strict=True))
-
     def log_odds(self, context: Context) -> dict[str, FloatArray]:
         """Return the log-odds of coming into view within three seconds after each piece of evidence.
 
@@ -307,19 +294,6 @@ class SequenceMemory:
         weights = np.concatenate([before[None], self.states.belief * np.exp(told)])
         soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
         return dict(zip(("prior", "sequence", *pieces), np.log(soon) - np.log(later), strict=True))
-
-    def _deciding(self, context: Context) -> FloatArray:
-        """Return what is held against the alarm's threshold, nats, shape (2,).
-
-        The mean log-odds of coming into view within three seconds over the last .3 s, or since a vehicle came
-        into view from that side, and of the less likely side no more than that two come.
-        """
-        since_ns = [0 if ns is None else ns for ns in self.emerged_ns]
-        rows = [[row[1 + k] for row in self.recent if row[0] >= ns] for k, ns in enumerate(since_ns)]
-        mean = np.array([float(np.mean(row)) for row in rows])
-        if self.alarm is None:
-            return mean
-        return self.alarm.deciding(mean, self.posterior.groups[0], np.array(self.learned_nats(context)))
 
 
 def _as_few(chances: FloatArray) -> FloatArray:
@@ -363,7 +337,8 @@ def informed(
         said = states_of(at_prior(reading.groups, reading.share, kept.prior(context)), reading.share)
         # By whatever else is heard, and by a vehicle just come into view on that side.
         said = _as_heard(kept.states.alone, said, measurement.heard.share)
-        said = np.where(kept.masked()[:, None], kept.states.alone, said)
+        masked = np.array(kept.since_emerged_ns(kept.stamp_ns)) <= _MASKED_NS
+        said = np.where(masked[:, None], kept.states.alone, said)
     if kept is None:
         return None
     # The chain of the hops since then was taken when the belief was carried here.
@@ -399,17 +374,21 @@ def _as_heard(alone: FloatArray, said: FloatArray, share: float) -> FloatArray:
 
 
 def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
-    """Return the memory with the mean log-odds of the last .3 s held against the threshold."""
+    """Return the memory with what decides held against the alarm's threshold.
+
+    The mean log-odds of coming into view within three seconds over the last .3 s, or since a vehicle came
+    into view from that side, and of the less likely side no more than that two come.
+    """
     left, right = list(kept.log_odds(context).values())[-1].tolist()
     since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
-    kept = replace(kept, recent=recent)
-    decided = kept._deciding(context)
-    kept = replace(kept, decided=tuple(decided.tolist()))
-    if kept.alarm is None:
-        return kept
-    over = decided >= kept.alarm.threshold_nats
-    # A risk that denies an alarm ends it: it is not held, and does not come back by itself.
-    sides = zip(over, kept.over_ns, kept.sides.risks, strict=True)
-    over_ns = (None if risk < LEAST_RISK else kept.stamp_ns if now else ns for now, ns, risk in sides)
-    return replace(kept, over_ns=tuple(over_ns))
+    rows = [[row[1 + k] for row in recent if row[0] >= (ns or 0)] for k, ns in enumerate(kept.emerged_ns)]
+    decided, over_ns, alarm = np.array([float(np.mean(row)) for row in rows]), kept.over_ns, kept.alarm
+    if alarm is not None:
+        decided = alarm.deciding(decided, kept.posterior.groups[0], np.array(kept.learned_nats(context)))
+        sides = zip(decided >= alarm.threshold_nats, over_ns, kept.sides.risks, strict=True)
+        # A risk that denies an alarm ends it: it is not held, and does not come back by itself.
+        over_ns = tuple(
+            None if risk < LEAST_RISK else kept.stamp_ns if over else ns for over, ns, risk in sides
+        )
+    return replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns)
