@@ -9,9 +9,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
 
+from worldstate.commissioning.stream_outcomes import visible_errors
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import wrap_angle
-from worldstate.operations.metrics.approach_table import visible_errors
 
 few = settings(max_examples=40)
 bearings = st.lists(st.floats(-4, 4), max_size=4)

@@ -32,16 +32,15 @@ from worldstate.operations.metrics.approach_table import (
     ApproachTable,
     Figures,
     StreamApproach,
-    hop_outcome,
     mean_of,
     rising_edges,
-    visible_errors,
 )
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HOP_S
 
 from .heard_stream import HeardStream
 from .sequence_training import QUIET_KINDS, ROW_S, StreamTruth
+from .stream_outcomes import hop_outcome, visible_errors
 
 TOGETHER_S, FOLLOWING_S = 4.0, 6.0
 # A junction counts for no more than so many times the onsets that are asked for. Up to 2, 3, 4 and 6 times at

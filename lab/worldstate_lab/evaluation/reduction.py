@@ -5,17 +5,12 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import BINS
+from worldstate.commissioning.stream_outcomes import visible_errors
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import wrap_angle
-from worldstate.operations.metrics.approach_table import (
-    LONGEST_LEAD_S,
-    SLACK_S,
-    onset_outcome,
-    rising_edges,
-    visible_errors,
-)
+from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, SLACK_S, onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
 from worldstate_lab.trials.trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial

@@ -14,6 +14,7 @@ from worldstate.abduction.cueing.calibration_error import brier_skill, expected_
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.stream_exam import alarm_outcomes, approaches, time_figures
+from worldstate.commissioning.stream_outcomes import shortly_before
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
     SLACK_S,
@@ -22,7 +23,6 @@ from worldstate.operations.metrics.approach_table import (
     Figures,
     StreamApproach,
     mean_of,
-    shortly_before,
 )
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.state import Entity

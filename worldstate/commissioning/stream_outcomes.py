@@ -1,0 +1,125 @@
+"""What an alarm makes of the approaches of a stream, and how far off stated times to visible are."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.ground.checks import check_shape
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.operations.metrics.approach_table import (
+    AFTER_S,
+    LONGEST_LEAD_S,
+    SLACK_S,
+    ApproachOutcome,
+    StreamApproach,
+    rising_edges,
+)
+
+
+def hop_outcome(approach: StreamApproach, time_s: FloatArray, raised: BoolArray) -> ApproachOutcome:
+    """Return the outcome of one approach of a stream: time_s (n,), alarm of either side (n, 2).
+
+    Examples
+    --------
+    >>> time_s = 0.1 * np.arange(100)
+    >>> left = np.column_stack([time_s > 5.55, np.zeros(100, bool)])
+    >>> found = hop_outcome(StreamApproach("single", (8.0,), (1,)), time_s, left)
+    >>> round(found.lead_s, 1), found.own_side, found.other_side
+    (2.4, False, True)
+    """
+    first_s, last_s = approach.entries_s[0], max(approach.entries_s)
+    before, any_side = shortly_before(time_s, first_s), np.asarray(raised.any(axis=1))
+    alarms_s, onsets_s = time_s[before & any_side], time_s[rising_edges(any_side)]
+    named = np.asarray(raised[before].any(axis=0))
+    pairs = zip(approach.entries_s, approach.sides, strict=True)
+    return ApproachOutcome(
+        lead_s=first_s - float(alarms_s[0]) if alarms_s.size else 0.0,
+        onsets=int(((onsets_s > first_s - LONGEST_LEAD_S) & (onsets_s < first_s)).sum()),
+        onsets_after=int(((onsets_s >= last_s) & (onsets_s < last_s + AFTER_S)).sum()),
+        own_side=bool(named[approach.sides[0]]),
+        other_side=bool(named[1 - approach.sides[0]]),
+        every_side=all(raised[shortly_before(time_s, entry_s), side].any() for entry_s, side in pairs),
+        approach=approach,
+    )
+
+
+def shortly_before(time_s: FloatArray, entry_s: float) -> BoolArray:
+    """Return the hops of the five seconds before a T0, shape (n,)."""
+    return np.asarray((time_s > entry_s - LONGEST_LEAD_S) & (time_s < entry_s - SLACK_S))
+
+
+@dataclass(frozen=True, slots=True)
+class VisibleErrors:
+    """Errors of stated times, and what the constants that fit these very truths best would reach.
+
+    Examples
+    --------
+    >>> stated = np.array([[0.5, 1.0, 1.5], [1.0, 2.0, 3.0], [2.0, 3.0, 4.0]])
+    >>> errors = visible_errors(stated, np.array([1.1, 2.5, 5.0]))
+    >>> errors.count, round(errors.median_s, 2), round(errors.coverage, 2), round(errors.constant_median_s, 2)
+    (3, 0.5, 0.67, 0.7)
+    >>> stated[:, [0, 2]] = np.nan
+    >>> without = visible_errors(stated, np.array([1.1, 2.5, 5.0]))
+    >>> round(without.median_s, 2), without.coverage
+    (0.5, nan)
+    """
+
+    count: int  # Times that were stated and can be checked
+    intervals: int  # Of these, with an interval
+    median_s: float  # Of the absolute error of the best value
+    rmse_s: float
+    coverage: float  # Share of truths within the stated interval
+    width_s: float  # Mean width of the stated interval
+    # Fitted to the truths themselves, so that no constant known beforehand does better.
+    constant_median_s: float
+    constant_rmse_s: float
+    constant_width_s: float  # Of the shortest fixed interval with the same coverage
+
+
+def visible_errors(stated: FloatArray, true_s: FloatArray) -> VisibleErrors:
+    """Compare stated times to visible, low, best and high (n, 3), with the true seconds (n,).
+
+    Rows without a best value, or that never come into view, are left out. Coverage and width are those of
+    the rows that have an interval, NaN where none has: a method may state a time alone.
+
+    Examples
+    --------
+    >>> visible_errors(np.full((2, 3), np.nan), np.ones(2)).count
+    0
+    """
+    check_shape("stated", np.shape(stated), (len(true_s), 3))
+    known = np.isfinite(stated[:, 1]) & np.isfinite(true_s)
+    if not known.any():
+        return VisibleErrors(0, 0, *[math.nan] * 7)
+    best, true = stated[known, 1], true_s[known]
+    bounded = known & np.isfinite(stated).all(axis=1)
+    low, high = stated[bounded][:, [0, 2]].T
+    inside = (low <= true_s[bounded]) & (true_s[bounded] <= high)
+    return VisibleErrors(
+        count=true.size,
+        intervals=inside.size,
+        # Of an even number the upper of the two middle errors, for which the shortest half is exact.
+        median_s=float(np.quantile(np.abs(best - true), 0.5, method="higher")),
+        rmse_s=float(np.sqrt(np.mean((best - true) ** 2))),
+        coverage=float(inside.mean()) if inside.size else math.nan,
+        width_s=float(np.mean(high - low)) if inside.size else math.nan,
+        constant_median_s=shortest_interval(true, true.size // 2 + 1) / 2.0,
+        constant_rmse_s=float(true.std()),
+        constant_width_s=shortest_interval(true_s[bounded], int(inside.sum())),
+    )
+
+
+def shortest_interval(values: FloatArray, count: int) -> float:
+    """Return the width of the shortest interval that holds `count` of the values.
+
+    Half the width of the shortest half is the least median absolute error of any constant, its middle.
+
+    Examples
+    --------
+    >>> shortest_interval(np.array([0.0, 4.0, 5.0, 9.0]), 3)
+    5.0
+    """
+    # P. J. Rousseeuw, "Least median of squares regression", JASA 79, 1984, in one dimension.
+    ordered = np.sort(values)
+    return float(np.min(ordered[count - 1 :] - ordered[: ordered.size - count + 1])) if count else 0.0
