@@ -51,11 +51,6 @@ class Association:
     chances: list[float]  # Over all joint events, shape (tracks,)
     new: list[int]  # Measurements of no track
 
-    def handed_over(self, before: Sequence[Track], after: Sequence[Track]) -> dict[int, float]:
-        """Return, by side of a hand-over, the share of P(hidden) to keep: P(it was another vehicle)."""
-        emerged = (i for i in self.found if after[i].seen and not before[i].seen)
-        return {before[i].side: max(HANDOVER_RESIDUAL, 1.0 - self.chances[i]) for i in emerged}
-
 
 def associated(
     tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], view: Sector, site: SiteGeometry

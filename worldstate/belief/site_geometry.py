@@ -18,6 +18,8 @@ _HIDDEN_MEAN, _HIDDEN_STD = (0.0, -0.2, math.log(25.0)), (0.15, 0.25, 0.6)
 HIDDEN_BIAS_STD = 0.17
 # P(a spurious sighting) where the co-evidence states none.
 CLUTTER_RATE = 0.01
+# Of an azimuth that is taken as it is: the side of an edge follows from the mean position.
+_SHARP_RAD = 1e-3
 # A vehicle in a crossing street stands ahead, not abeam: at the default corner, up to 92 degrees.
 _WIDEST_RAD = math.radians(60.0)
 
@@ -72,11 +74,11 @@ class SiteGeometry:
         """Return the index of the side whose edge is nearest to an azimuth."""
         return min(range(len(self.sides)), key=lambda k: self.sides[k].distance_rad(azimuth_rad))
 
-    def hiding_side(self, azimuth_rad: float, std_rad: float) -> tuple[int, float]:
-        """Return the side that most likely hides what stands at an azimuth, and with which probability."""
-        chances = [side.behind(azimuth_rad, std_rad) for side in self.sides]
+    def hiding_side(self, azimuth_rad: float) -> int | None:
+        """Return the side whose occluder hides what stands at an azimuth, if one does."""
+        chances = [side.behind(azimuth_rad, _SHARP_RAD) for side in self.sides]
         side = max(range(len(chances)), key=chances.__getitem__)
-        return side, chances[side]
+        return side if chances[side] >= 0.5 else None
 
     def past_edge(self, azimuth_rad: float, std_rad: float, way: float) -> float:
         """Return the chance that an azimuth lies past the edge on this way, 1 to the left and -1."""

@@ -126,11 +126,10 @@ def predict_tracks(
     """Return the tracks after a time step without a measurement; shares are P(hidden | exists)."""
     moved = list(_driven_on(tracks, step_s, site))
     polar = [i for i, track in enumerate(moved) if track.place is None]
-    if not polar:
-        return tuple(moved)
-    unplaced, shares = [moved[i] for i in polar], [hidden_shares[i] for i in polar]
-    for i, track in zip(polar, _relaxed(unplaced, shares, step_s, site), strict=True):
-        moved[i] = track
+    if polar:
+        relaxed = _relaxed([moved[i] for i in polar], [hidden_shares[i] for i in polar], step_s, site)
+        for i, track in zip(polar, relaxed, strict=True):
+            moved[i] = track
     return tuple(moved)
 
 

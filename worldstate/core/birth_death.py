@@ -6,7 +6,7 @@ from functools import partial
 from operator import itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.association import EDGE_STD_RAD, Association
+from worldstate.belief.association import EDGE_STD_RAD, HANDOVER_RESIDUAL, Association
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
@@ -161,7 +161,8 @@ def after_look(
 ) -> Memory:
     """Return the memory with the tracks after a look: those of before in their order, then the new ones."""
     before = memory.tracks
-    handed_over = whose.handed_over(before, tracks[: len(before)])
+    emerged = (i for i in whose.found if tracks[i].seen and not before[i].seen)
+    handed_over = {before[i].side: max(HANDOVER_RESIDUAL, 1.0 - whose.chances[i]) for i in emerged}
     # First seen near an edge, it came past it unheard.
     unheard = {
         track.side

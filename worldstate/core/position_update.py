@@ -48,8 +48,6 @@ _GATE = 21.0
 _RADIO_AREA_M2 = 0.5 * math.pi * 100.0**2
 # m/s: slower is parked, as far as a radar or a positioning receiver can tell.
 _PARKED_MPS = 0.5
-# The side of an edge follows from the mean position.
-_SHARP_RAD = 1e-3
 # No statement is certain, and a refuted claim that is repeated can still turn out to be true: what was taken
 # to be in view stood behind something that the context does not name.
 _MOST_EXISTENCE, _LEAST_EXISTENCE = 0.999, 1e-3
@@ -196,11 +194,11 @@ def _at_side(track: Track, site: SiteGeometry) -> Track:
     """Return a track that a message has placed on the side whose occluder hides it there, if one does."""
     assert track.place is not None
     x, y = track.place.mean[:2].tolist()
-    side, behind = site.hiding_side(math.atan2(y, x), _SHARP_RAD)
+    side = site.hiding_side(math.atan2(y, x))
     unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
-    unseen = not track.seen or unseen_ns > REOCCLUSION_NS
-    hidden = behind >= 0.5 and unseen
-    return replace(track, side=side, seen=False, was_hidden=True) if hidden else track
+    if side is None or (track.seen and unseen_ns <= REOCCLUSION_NS):
+        return track
+    return replace(track, side=side, seen=False, was_hidden=True)
 
 
 def _told(track: Track, position: Position, scan: PositionScan) -> float:
@@ -253,10 +251,10 @@ def _born(
 ) -> Track:
     """Return a new entity before its position counts, hidden where a message places it behind an occluder."""
     azimuth_rad = math.atan2(position.position_m[1], position.position_m[0])
-    side, behind = site.hiding_side(azimuth_rad, _SHARP_RAD)
-    hidden = scan.searched is None and behind >= 0.5
-    kind, number = (site.sides[side].label, births[side]) if hidden else ("visible", sighted)
+    side = site.hiding_side(azimuth_rad) if scan.searched is None else None
     existence = min(position.existence_probability, _MOST_EXISTENCE)
-    one = born(kind, number, existence, scan.stamp_ns, site)
-    side = side if hidden else site.nearest_side(azimuth_rad)
-    return replace(one, side=side, sources=(scan.source,), was_hidden=hidden)
+    kind, number = ("visible", sighted) if side is None else (site.sides[side].label, births[side])
+    one = replace(born(kind, number, existence, scan.stamp_ns, site), sources=(scan.source,))
+    if side is None:
+        return replace(one, side=site.nearest_side(azimuth_rad))
+    return replace(one, side=side, was_hidden=True)

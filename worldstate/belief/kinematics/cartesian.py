@@ -60,8 +60,7 @@ class CartesianBelief(GaussianBelief):
 
 def at_position(position: Position) -> CartesianBelief:
     """Return the belief of an object that a first measurement places."""
-    measured, noise = full_measurement(position, _UNKNOWN_SPEED_STD)
-    return CartesianBelief(measured, noise)
+    return CartesianBelief(*full_measurement(position, _UNKNOWN_SPEED_STD))
 
 
 def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArray, FloatArray]:
