@@ -81,11 +81,6 @@ class BoostedTrees:
         ):
             raise InvalidArgumentError(f"tree_class: expected {trees} numbers of classes")
 
-    @property
-    def inputs(self) -> int:
-        """Least number of inputs of a row."""
-        return int(self.split.max()) + 1
-
     def scores(self, X: FloatArray) -> FloatArray:
         """Return the sums before the softmax, shape (n, inputs) -> (n, classes)."""
         # A few rows at a time stay in the cache: thousands at once take three times as long.
@@ -237,10 +232,10 @@ class SequenceModel:
         # A posterior is moved to another prior by dividing by it.
         if (self.share <= 0.0).any():
             raise InvalidArgumentError(f"share: expected positive numbers, got {self.share.min()}")
-        if self.trees.inputs > len(INPUTS) or len(self.trees.baseline) != len(GROUPS):
+        got = int(self.trees.split.max()) + 1, len(self.trees.baseline)
+        if got[0] > len(INPUTS) or got[1] != len(GROUPS):
             raise InvalidArgumentError(
-                f"trees: expected {len(INPUTS)} inputs and {len(GROUPS)} groups, "
-                f"got {self.trees.inputs} and {len(self.trees.baseline)}"
+                f"trees: expected {len(INPUTS)} inputs and {len(GROUPS)} groups, got {got[0]} and {got[1]}"
             )
 
     def posterior(self, evidence: HopEvidence) -> SequencePosterior:

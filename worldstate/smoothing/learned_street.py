@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 from worldstate.abduction.sequence.street_sides import PassSound, SidePatterns
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import ADDED, Layout
-from worldstate.state.context import Context, Occluder, Rates
+from worldstate.state.context import Context, Occluder, Rates, hidden_behind
 
 from .learned_edge import LearnedEdge, Moments, NormalPrior
 
@@ -159,14 +159,13 @@ def _occluder(arm: LearnedArm, usual: Occluder) -> Occluder:
     sign = math.copysign(1.0, usual.edge_azimuth_rad)
     known = arm.edge.moments.weight >= _LEAST_WEIGHT
     edge_rad = arm.edge.mean_rad if known else abs(usual.edge_azimuth_rad)
-    slope, pace_hz = math.tan(edge_rad), arm.pace_hz
-    near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
+    hidden_rad, hidden_std = hidden_behind(1.0, sign * math.tan(edge_rad), arm.pace_hz)
     return replace(
         usual,
         edge_azimuth_rad=sign * edge_rad,
-        hidden_azimuth_rad=sign * middle,
-        hidden_std_rad=0.5 * (far - near),
+        hidden_azimuth_rad=hidden_rad,
+        hidden_std_rad=hidden_std,
         edge_std_rad=arm.edge.std_rad if known else usual.edge_std_rad,
-        pace_hz=pace_hz,
+        pace_hz=arm.pace_hz,
         assumed=not known,
     )

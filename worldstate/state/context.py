@@ -224,7 +224,7 @@ def corner_at(
     in_range("speed_mps", speed_mps, 0.0, 100.0, open_low=True)
     in_range("corner_std_m", corner_std_m, 0.0, 100.0, open_low=True)
     pace_hz = speed_mps / crossing_m
-    hidden_rad, hidden_std = _hidden_behind(x_m, y_m, pace_hz)
+    hidden_rad, hidden_std = hidden_behind(x_m, y_m, pace_hz)
     return Occluder(
         f"corner_{direction}",
         direction,
@@ -277,7 +277,7 @@ def seen_from(
     before_m, now_m = math.hypot(corner_x, corner_y), math.hypot(ahead_m, beside_m)
     std_m = math.hypot(occluder.edge_std_rad * before_m, position_std_m)
     pace_hz = occluder.pace_hz * occluder.crossing_m / (occluder.crossing_m - x)
-    hidden_rad, hidden_std = _hidden_behind(ahead_m, beside_m, pace_hz)
+    hidden_rad, hidden_std = hidden_behind(ahead_m, beside_m, pace_hz)
     return replace(
         occluder,
         edge_azimuth_rad=math.remainder(math.atan2(beside_m, ahead_m) - yaw, math.tau),
@@ -288,7 +288,7 @@ def seen_from(
     )
 
 
-def _hidden_behind(ahead_m: float, beside_m: float, pace_hz: float) -> tuple[float, float]:
+def hidden_behind(ahead_m: float, beside_m: float, pace_hz: float) -> tuple[float, float]:
     """Return azimuth and deviation of a vehicle that comes in two (+- 1) seconds, behind a corner."""
     slope = abs(beside_m) / ahead_m
     near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
