@@ -34,12 +34,10 @@ class SimulatedDetection:
 Frame = tuple[SimulatedDetection, ...]
 
 
-def visible_part(
-    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
-) -> tuple[FloatArray, FloatArray]:
+def visible_part(trajectory: Trajectory, site: Site, camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
     """Lateral limits (right, left) of what the camera sees of the vehicle, (T,); empty if right > left."""
     ahead, _ = trajectory.behind(0.0)
-    right_limit, left_limit = site.sights_m(ahead, (ego_x_m + camera.position_m[0], camera.position_m[1]))
+    right_limit, left_limit = site.sights_m(ahead, camera.position_m[:2])
     right, left = trajectory.footprint_y_m()
     return np.maximum(right, right_limit), np.minimum(left, left_limit)
 

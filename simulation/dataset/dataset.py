@@ -456,7 +456,7 @@ def camera_frames(
         yield _taken(image, rng)
 
 
-def write_video(path: str | Path, frames: Iterable[ImageArray], frame_rate_hz: float = FRAME_RATE_HZ) -> None:
+def write_video(path: str | Path, frames: Iterable[ImageArray]) -> None:
     """Write frames of one size as MPEG-4, whole or not at all.
 
     Shapes: frames (height, width, 3).
@@ -468,7 +468,7 @@ def write_video(path: str | Path, frames: Iterable[ImageArray], frame_rate_hz: f
         raise InvalidArgumentError("frames: expected at least one")
     with atomic_path(path) as temporary:
         code = cv2.VideoWriter_fourcc(*CODEC)
-        writer = cv2.VideoWriter(str(temporary), code, frame_rate_hz, (first.shape[1], first.shape[0]))
+        writer = cv2.VideoWriter(str(temporary), code, FRAME_RATE_HZ, (first.shape[1], first.shape[0]))
         if not writer.isOpened():
             raise InputFileError(path, f"expected to write a video of {first.shape[1]} x {first.shape[0]} px")
         try:

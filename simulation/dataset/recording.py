@@ -29,7 +29,7 @@ from worldstate.simulation.scene.settings import SimulationSettings, SoundSettin
 from worldstate.simulation.scene.vehicle import Trajectory
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.simulation.sound.ego_sound import add_ego_echo, ego_noise
+from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.static_field import StaticSources
 
@@ -260,17 +260,12 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     paths = trajectories(settings, _knots(settings))
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
         add_vehicle(static, settings.site, settings.preset, path, receiver, draws)
-    positions, rate = receiver.positions_m, settings.sample_rate_hz
     # Generators of their own, and only where something sounds: the rest stays what it is without.
     _add_sounds(static, settings, paths, receiver, rng)
     static.render()
     add_background(sound, receiver, settings.site, settings.preset, to_street)
     if not settings.ego.stands:
-        time, engine_db = np.arange(receiver.samples) / rate, settings.preset.ego_engine_db
-        to_ego, to_echo = to_channels.spawn(2)
-        speed, tyre_db = settings.ego.at_mps(time), settings.site.surface_db
-        sound += ego_noise(positions, speed, rate, to_ego, engine_db, tyre_db).T
-        add_ego_echo(sound, receiver, settings.site, engine_db, to_echo)
+        add_ego(sound, receiver, settings.site, settings.preset, to_channels)
     return _to_samples(sound, settings, to_channels)
 
 

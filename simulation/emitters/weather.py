@@ -106,4 +106,4 @@ def add_gusts(
         spans = bursts(sound.duration_s, GUST_S, LULL_S, draws)
         within = [(begin + a, begin + min(b, sound.duration_s)) for a, b in spans if a < sound.duration_s]
         blowing = gate(samples, rate, within, GUST_RAMP_S).astype(np.float32)
-        static.out[channel] += blowing * shaped_noise(density, samples, draws, 1)[0]
+        static.out[channel] += blowing * shaped_noise(density, samples, draws)

@@ -174,10 +174,6 @@ class Trajectory:
     # shape (T,): Distance of the front along the route.
     driven_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def axle_y_m(self, axle: int = 0) -> FloatArray:
-        """Lateral position of an axle, 0 the foremost, shape (T,)."""
-        return self.behind(self.kind.axles_m[axle])[1]
-
     def behind(self, distance_m: float) -> tuple[FloatArray, FloatArray]:
         """Position x, y of what is so far behind the front, shape (T,) each."""
         if self.route is None:

@@ -258,19 +258,16 @@ def _arm_images(site: Site, side: float) -> tuple[FloatArray, FloatArray]:
     return np.arctan2(ends, site.corner_ahead_m), np.array(power)
 
 
-def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator, channels: int) -> Float32Array:
-    """Gaussian noise with a given power spectral density.
+def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator) -> Float32Array:
+    """Gaussian noise with a given power spectral density, shape (samples,).
 
     Shapes: density (n // 2 + 1,).
     """
     n = next_fast_len(samples, real=True)
     shape = np.sqrt(density * n / 4.0).astype(np.float32)
-    noise = np.empty((channels, samples), np.float32)
-    for channel in noise:
-        # The transform of white noise is white noise.
-        white = rng.standard_normal(2 * len(shape), dtype=np.float32).view(np.complex64)
-        channel[:] = irfft(white * shape, n)[:samples]
-    return noise
+    # The transform of white noise is white noise.
+    white = rng.standard_normal(2 * len(shape), dtype=np.float32).view(np.complex64)
+    return np.asarray(irfft(white * shape, n)[:samples], np.float32)
 
 
 def noise_frequencies(samples: int, sample_rate_hz: float) -> FloatArray:

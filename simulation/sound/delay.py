@@ -16,6 +16,8 @@ from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.octave_bands import split_octaves
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
 
+from .diffraction import SPEED_OF_SOUND_MPS
+
 KNOT_SAMPLES = 128
 OVERSAMPLING = 2
 PHASES = 4  # of what is spread: linear between them, with an error below -50 dB up to 4 kHz
@@ -31,14 +33,12 @@ class SampledSignal:
     rate_hz: float  # Rate of the table, `OVERSAMPLING` times the sample rate
 
 
-def emission_times(
-    receive_s: FloatArray, emit_s: FloatArray, travel_m: FloatArray, speed_mps: float
-) -> FloatArray:
+def emission_times(receive_s: FloatArray, emit_s: FloatArray, travel_m: FloatArray) -> FloatArray:
     """Solve t = t_e + r(t_e) / c for the emission times t_e of given receive times.
 
     Shapes: receive_s (K,), emit_s, travel_m (T,).
     """
-    return np.interp(receive_s, emit_s + travel_m / speed_mps, emit_s, left=np.nan, right=np.nan)
+    return np.interp(receive_s, emit_s + travel_m / SPEED_OF_SOUND_MPS, emit_s, left=np.nan, right=np.nan)
 
 
 def add_delayed(out: Float32Array, table: SampledSignal, emit_s: FloatArray, gain: FloatArray) -> None:

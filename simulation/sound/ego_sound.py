@@ -24,6 +24,7 @@ from worldstate.simulation.scene.octave_bands import (
     octave_masks,
     split_octaves,
 )
+from worldstate.simulation.scene.presets import Preset
 from worldstate.simulation.scene.vehicle import (
     HARMONIC_SHARE,
     POWER_TO_1M_DB,
@@ -128,6 +129,20 @@ def ego_sound(
     _add_sources(out, positions, driven, firing, rate, to_noise, (engine_db, tyre_db))
     _add_wind(out, driven, rate, to_wind)
     return EgoSound(np.ascontiguousarray(out[:, lead:].T), firing[lead:])
+
+
+def add_ego(
+    out: Float32Array, receiver: Receiver, site: Site, preset: Preset, rng: np.random.Generator
+) -> None:
+    """Add the sound of a moving ego, and what the walls beside it give back.
+
+    Shapes: out (M, n).
+    """
+    to_ego, to_echo = rng.spawn(2)
+    rate, engine_db = receiver.sample_rate_hz, preset.ego_engine_db
+    speed = receiver.ego.at_mps(np.arange(out.shape[1]) / rate)
+    out += ego_noise(receiver.positions_m, speed, rate, to_ego, engine_db, site.surface_db).T
+    add_ego_echo(out, receiver, site, engine_db, to_echo)
 
 
 def add_ego_echo(
@@ -254,7 +269,7 @@ def _emission(firing: FloatArray, line_share: float, rate: float, rng: np.random
     # White noise divided by its own share of power per octave: unit pressure in each of them.
     shares = np.maximum((masks**2).mean(axis=1), 1e-6)
     shape = (masks / np.sqrt(shares)[:, None]).sum(axis=0)
-    noise: Float32Array = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng, 1)[0]
+    noise = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng)
     return noise + _lines(firing, line_share, rate, rng) if line_share > 0.0 else noise
 
 
@@ -305,4 +320,4 @@ def _add_wind(out: Float32Array, speed: FloatArray, rate: float, rng: np.random.
     shape = wind_density(WIND_AT_10_DB, frequencies) * rate
     gain = (np.maximum(speed, 0.1) / 10.0) ** (WIND_EXPONENT / 20.0)
     for channel in out:
-        channel += shaped_noise(shape, len(speed), rng, 1)[0] * gain.astype(np.float32)
+        channel += shaped_noise(shape, len(speed), rng) * gain.astype(np.float32)

@@ -96,7 +96,7 @@ def add_along(
     out: Float32Array, table: SampledSignal, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
 ) -> None:
     """Add what was emitted at the knots `emit_s` and has gone `travel_m`, weaker the longer the way."""
-    emit = emission_times(receive_s, emit_s, travel_m, SPEED_OF_SOUND_MPS)
+    emit = emission_times(receive_s, emit_s, travel_m)
     length = np.interp(np.nan_to_num(emit), emit_s, travel_m)
     add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
 

@@ -224,7 +224,7 @@ def _add_leg(
     receiver = around.receiver
     knots, first = emission.knots_s[span], leg.length_m[span]
     total, _ = receiver.arrivals(knots, lambda x: first + distance_m(patch_m, x, receiver.centre_m))
-    emit = emission_times(receiver.knots_s, knots, total, SPEED_OF_SOUND_MPS)
+    emit = emission_times(receiver.knots_s, knots, total)
     length = np.interp(np.nan_to_num(emit), knots, first)
     add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
 

@@ -22,7 +22,7 @@ from worldstate.simulation.scene.presets import Ambience, Preset, recording_ambi
 from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.simulation.sound.ego_sound import add_ego_echo, ego_noise
+from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.static_field import StaticSources
 
@@ -38,6 +38,10 @@ class Microphones:
     skew_s: FloatArray  # shape (M,): Phase mismatch as a delay
     gains: FloatArray  # shape (M,): About 1
     sample_rate_hz: float
+
+    def receiver(self, knots_s: FloatArray, ego: EgoMotion = STANDING) -> Receiver:
+        """Return these microphones, listening between knots, shape (K + 1,)."""
+        return Receiver(self.positions_m, self.skew_s, knots_s, ego)
 
 
 def draw_microphones(
@@ -74,9 +78,7 @@ def ambience_piece(
     # power stays the same. A fade of amplitudes would leave a dip of 3 dB in the middle.
     overlap = overlap_samples(settings)
     sound = np.zeros((len(microphones.positions_m), samples + overlap), np.float32)
-    receiver = Receiver(
-        microphones.positions_m, microphones.skew_s, np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz
-    )
+    receiver = microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz)
     add_background(sound, receiver, settings.site, settings.preset, rng, here)
     rise = np.sin(0.5 * np.pi * (np.arange(overlap) + 0.5) / overlap).astype(np.float32)
     if not begins:
@@ -135,7 +137,7 @@ def event_sound(
     blocks, before = event_blocks(event, rate, within_s), int(np.ceil(HEAD_START_S / knot_s))
     begin_s, _ = rendered_s(event, within_s)
     late_s, own = begin_s - event.start_s, ego.later(begin_s)
-    receiver = Receiver(microphones.positions_m, microphones.skew_s, np.arange(blocks + 1) * knot_s, own)
+    receiver = microphones.receiver(np.arange(blocks + 1) * knot_s, own)
     sound = np.zeros((len(microphones.positions_m), receiver.samples), np.float32)
     static = StaticSources(sound, rate)
     if isinstance(event, SoundEvent):
@@ -285,15 +287,7 @@ def _add_ambience(sound: Float32Array, scene: StreamScene, number: int) -> None:
 
 def _add_ego(sound: Float32Array, scene: StreamScene) -> None:
     """Add what the ego itself sounds like over a drive."""
-    settings, heard = scene.settings, scene.microphones
-    to_ego, to_echo = settings.generator(EGO_NOISE).spawn(2)
-    rate, engine_db, tyre_db = (
-        settings.sample_rate_hz,
-        settings.preset.ego_engine_db,
-        settings.site.surface_db,
-    )
-    speed = settings.ego.at_mps(np.arange(sound.shape[1]) / rate)
-    sound += ego_noise(heard.positions_m, speed, rate, to_ego, engine_db, tyre_db).T
-    knots = np.arange(2) * KNOT_SAMPLES / rate
-    receiver = Receiver(heard.positions_m, heard.skew_s, knots, settings.ego)
-    add_ego_echo(sound, receiver, settings.site, engine_db, to_echo)
+    settings = scene.settings
+    knots = np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz
+    receiver = scene.microphones.receiver(knots, settings.ego)
+    add_ego(sound, receiver, settings.site, settings.preset, settings.generator(EGO_NOISE))

@@ -93,7 +93,7 @@ def test_emission_times_solve_the_retarded_time_equation(speed, lane, y0):
     emit = np.linspace(-1.0, 2.0, 1200)
     travel = np.hypot(lane, y0 + speed * emit)
     receive = np.linspace(0.0, 1.5, 50)
-    found = emission_times(receive, emit, travel, C)
+    found = emission_times(receive, emit, travel)
     # Linear between knots: v^2 h^2 / (8 r c) is 0.6 us at the worst, 0.06 % of a period at 1 kHz.
     np.testing.assert_allclose(found + np.hypot(lane, y0 + speed * found) / C, receive, rtol=0.0, atol=6e-7)
 
@@ -110,7 +110,7 @@ def test_doppler_is_that_of_the_retarded_position():
     step = 480
     received = (phase[step:] - phase[:-step]) / (2 * np.pi * step / FS)
     centre = (np.arange(len(received)) + step / 2) / FS
-    emit = emission_times(centre, time, np.hypot(lane, -13.0 + speed * time), C)
+    emit = emission_times(centre, time, np.hypot(lane, -13.0 + speed * time))
     y = -13.0 + speed * emit
     radial = speed * y / np.hypot(lane, y)
     expected = f0 / (1.0 + radial / C)

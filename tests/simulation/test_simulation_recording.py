@@ -57,7 +57,7 @@ def pass_by(tone_hz: float, name: str, approach: str) -> np.ndarray:
     receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), np.arange(blocks + 1) * KNOT_SAMPLES / FS)
     out = np.zeros((1, blocks * KNOT_SAMPLES), np.float32)
     static = StaticSources(out, FS)
-    source = MovingSource(emission, lane, path.axle_y_m())
+    source = MovingSource(emission, lane, path.behind(path.kind.axles_m[0])[1])
     add_sources(static, [source], Surroundings(plan, receiver, 24.0))
     static.render()
     return out[0].astype(float)

@@ -22,6 +22,7 @@ from worldstate.adapters.files.model_file import Model
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
@@ -40,7 +41,7 @@ from .heard_stream import (
     mounting_streams,
     mountings,
 )
-from .road_user_training import train_road_users
+from .road_user_training import fit_road_users, road_user_rows
 from .sequence_training import LabelledStream, calibrated_margin_s, stream_truth, train_sequence
 from .simulated_windows import (
     N_OPEN,
@@ -117,20 +118,17 @@ def learn_sequence(
     `fit_windows` makes a window model of some of the streams. Evidence of a stream always comes from one that
     did not learn its junction: trained on evidence that is too good, trees trust it too much elsewhere.
     """
-    folds = _folds(streams)
     labelled: dict[int, LabelledStream] = {}
-    weights = _weights(streams)
-    for fold in sorted(set(folds)):
-        windows = fit_windows([one for one, at in zip(streams, folds, strict=True) if at != fold])
-        for number, (one, at) in enumerate(zip(streams, folds, strict=True)):
-            if at == fold:
-                evidence = stream_evidence(windows, one)
-                labelled[number] = LabelledStream(evidence, stream_truth(one), weights[number])
+    folds, weights = _folds(streams), _weights(streams)
+    for outside in folds:
+        windows = fit_windows([one for i, one in enumerate(streams) if i not in outside])
+        for i in outside:
+            evidence = stream_evidence(windows, streams[i])
+            labelled[i] = LabelledStream(evidence, stream_truth(streams[i]), float(weights[i]))
         on_step()
     margins, quiet = [], dict[str, list[SequencePosterior]]()
-    for fold in sorted(set(folds)):
-        model = train_sequence([labelled[i] for i, at in enumerate(folds) if at != fold], rng)
-        outside = [i for i, at in enumerate(folds) if at == fold]
+    for outside in folds:
+        model = train_sequence([labelled[i] for i in range(len(streams)) if i not in outside], rng)
         margins.append(calibrated_margin_s(model, [labelled[i] for i in outside]))
         for i in outside:
             if streams[i].hops.about["traffic"] == HAZARD_FREE:
@@ -142,22 +140,21 @@ def learn_sequence(
     return replace(final, margin_s=margin_s, alarm=alarm)
 
 
-def _folds(streams: Sequence[HeardStream]) -> list[int]:
-    """Deal junctions to folds in turn, pairs of both types where there are enough."""
+def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:
+    """Return the streams of every fold; junctions in turn, pairs of both types where there are enough."""
     names = sorted({one.site for one in streams}, key=lambda name: (name[2:], name))
     together = 2 if len(names) >= 2 * FOLDS else 1
-    return [names.index(one.site) // together % FOLDS for one in streams]
+    folds = [names.index(one.site) // together % FOLDS for one in streams]
+    return [[i for i, at in enumerate(folds) if at == fold] for fold in sorted(set(folds))]
 
 
-def _weights(streams: Sequence[HeardStream]) -> list[float]:
+def _weights(streams: Sequence[HeardStream]) -> FloatArray:
     """Return what a hop of each stream counts, so that hazard-free time has its share of use."""
-    free = [one.hops.about["traffic"] == HAZARD_FREE for one in streams]
-    hops = [
-        sum(len(one.hops) for one, f in zip(streams, free, strict=True) if f == kind)
-        for kind in (True, False)
-    ]
-    of_kind = {True: HAZARD_FREE_SHARE / max(hops[0], 1), False: (1.0 - HAZARD_FREE_SHARE) / max(hops[1], 1)}
-    return [of_kind[one] * sum(hops) for one in free]
+    free = np.array([one.hops.about["traffic"] == HAZARD_FREE for one in streams])
+    hops = np.array([len(one.hops) for one in streams])
+    quiet = HAZARD_FREE_SHARE / max(hops[free].sum(), 1)
+    approaching = (1.0 - HAZARD_FREE_SHARE) / max(hops[~free].sum(), 1)
+    return np.asarray(np.where(free, quiet, approaching) * hops.sum())
 
 
 def commission(
@@ -205,7 +202,7 @@ def commission(
     if not settings.quick:
         guard = train_guard(array, streams, rng, jobs)
         sites = list(dict.fromkeys(one.site for one in streams))
-        road_users = train_road_users(array, sites, rate_hz, rng, jobs)
+        road_users = fit_road_users(road_user_rows(array, sites, rate_hz, rng, jobs=jobs))
     provenance = replace(model.provenance, fit_for_use=not settings.quick)
     made = replace(model, provenance=provenance, sequence=sequence, guard=guard, road_users=road_users)
     return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made

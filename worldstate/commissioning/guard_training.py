@@ -1,6 +1,6 @@
 """Train a domain guard on what one microphone hears: streets against foreign sounds and warning signals."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Self
@@ -83,11 +83,6 @@ def fit_softmax(
     return slopes, fitted.intercept_ - slopes @ mean
 
 
-def street_rows(streams: Sequence[HeardStream]) -> SoundRows:
-    """Return every hop of streams that were listened to."""
-    return SoundRows.joined([_rows_of_street(stream) for stream in streams])
-
-
 def sound_rows(
     array: MicrophoneArray, site_name: str, sample_rate_hz: float, rng: np.random.Generator
 ) -> SoundRows:
@@ -104,8 +99,8 @@ def sound_rows(
 
 
 def _rows_of_street(stream: HeardStream) -> SoundRows:
-    middle = stream.hops.middle / np.float32(np.iinfo(np.int16).max)
-    measures, usable = characters(middle.ravel(), float(middle.shape[1] * HOPS_A_SECOND))
+    """Return every hop of a stream that was listened to."""
+    measures, usable = heard_characters(stream)
     labels = hop_labels(stream)
     kinds = np.where(np.isin(labels, ("left", "right", "both")), "hidden", labels)[usable]
     return SoundRows(measures[:, : len(MEASURES)], kinds, np.full(len(kinds), stream.site))
@@ -170,6 +165,12 @@ def characters(sound: AnyArray, sample_rate_hz: float) -> tuple[FloatArray, Bool
     ), usable
 
 
+def heard_characters(stream: HeardStream) -> tuple[FloatArray, BoolArray]:
+    """Return the `characters` of a stream that was listened to."""
+    middle = stream.hops.middle / np.float32(np.iinfo(np.int16).max)
+    return characters(middle.ravel(), float(middle.shape[1] * HOPS_A_SECOND))
+
+
 def loudness(sound: Float32Array, sample_rate_hz: float) -> FloatArray:
     """Mean square of every hop in the band that the guard hears, shape (hops,)."""
     band = scipy.signal.butter(4, BAND_HZ, "bandpass", fs=sample_rate_hz, output="sos")
@@ -205,7 +206,7 @@ def guard_rows(
     sites = sorted({stream.site for stream in streets})[:_SITES_OF_SOUNDS] * sounds_each
     draws = list(zip(sites, rng.spawn(len(sites)), strict=True))
     heard = in_processes(partial(_sounds_at, array, rate_hz), draws, jobs)
-    return SoundRows.joined([street_rows(streets), *heard])
+    return SoundRows.joined([*map(_rows_of_street, streets), *heard])
 
 
 def _sounds_at(array: MicrophoneArray, rate_hz: float, drawn: tuple[str, np.random.Generator]) -> SoundRows:
@@ -227,13 +228,13 @@ def threshold_of(excesses: Sequence[FloatArray]) -> float:
     return max(float(np.quantile(excess, 1.0 - FLAGGED)) for excess in excesses if len(excess))
 
 
-def street_excesses(rows: SoundRows, without: Collection[str] = ()) -> dict[str, FloatArray]:
+def street_excesses(rows: SoundRows) -> dict[str, FloatArray]:
     """Return the log-odds of the hops of streets, by label, from guards that never heard their site."""
     held_out: dict[str, list[FloatArray]] = {label: [] for label in STREET}
     names = np.unique(rows.sites)
     for fold in range(min(_FOLDS, len(names))):
         here = np.isin(rows.sites, names[fold::_FOLDS])
-        guard = fit_guard(rows.select(~here & ~np.isin(rows.kinds, list(without))))
+        guard = fit_guard(rows.select(~here))
         for label in STREET:
             held_out[label].append(guard.log_odds(rows.measures[here & (rows.kinds == label)]))
     return {label: np.concatenate(found) for label, found in held_out.items()}

@@ -6,6 +6,7 @@ The sound itself is not kept: an hour of 56 channels at 6 kHz is 5 GB, what is h
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import product
 from math import ceil
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import InvalidArgumentError, in_range
-from worldstate.ground.typing import AnyArray, Float32Array, FloatArray
+from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES, Site, drawn_site, ego_moves, site
 from worldstate.simulation.scene.settings import rate_for
@@ -107,28 +108,15 @@ def quick_settings(settings: CommissionSettings) -> CommissionSettings:
 
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams that a model learns from: drawn junctions, none of the five with a name."""
-    kinds = ((APPROACHES, settings.approach_minutes), (HAZARD_FREE, settings.hazard_free_minutes))
     motion = settings.sites[0][0]
-    return [
-        one
-        for i in range(settings.junctions)
-        for traffic, minutes in kinds
-        for one in _streams(
-            f"{motion}{'AB'[i % 2]}{101 + i // 2}", traffic, minutes, LEARNED_SEED + i, settings
-        )
-    ]
+    names = {i: f"{motion}{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
+    return _streams(names, LEARNED_SEED, settings.approach_minutes, settings.hazard_free_minutes, settings)
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams of an exam: the five junctions with a name, twenty singles of each and more."""
-    kinds = ((APPROACHES, 0.6 * settings.exam_minutes), (HAZARD_FREE, settings.exam_minutes))
-    chosen = (MOUNTING,) if settings.quick else range(len(settings.sites))
-    return [
-        one
-        for i in chosen
-        for traffic, minutes in kinds
-        for one in _streams(settings.sites[i], traffic, minutes, EXAM_SEED + i, settings)
-    ]
+    names = {i: name for i, name in enumerate(settings.sites) if i == MOUNTING or not settings.quick}
+    return _streams(names, EXAM_SEED, 0.6 * settings.exam_minutes, settings.exam_minutes, settings)
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
@@ -142,21 +130,27 @@ def junction_named(name: str) -> Site:
 
 
 def _streams(
-    name: str, traffic: str, minutes: float, seed: int, settings: CommissionSettings
+    names: Mapping[int, str],
+    first_seed: int,
+    approach_minutes: float,
+    hazard_free_minutes: float,
+    settings: CommissionSettings,
 ) -> list[StreamSettings]:
-    """Return the stream of a junction and traffic, or as many drives as last so long."""
-    own = seed + SEEDS_EACH * settings.seed
-    whole = StreamSettings(
-        junction_named(name),
-        DRIVES_S[traffic] / 60.0 if settings.moving_ego else minutes,
-        own,
-        traffic_named(traffic),
-        sample_rate_hz=rate_for(settings.bandwidth_hz),
-    )
-    if not settings.moving_ego:
-        return [whole]
-    drives = ceil(minutes / whole.minutes - 1e-9)
-    return [replace(whole, seed=own * DRIVES_EACH + i) for i in range(drives)]
+    """Return two streams of every numbered junction, or as many drives as last so long."""
+    found: list[StreamSettings] = []
+    kinds = ((APPROACHES, approach_minutes), (HAZARD_FREE, hazard_free_minutes))
+    for (number, name), (traffic, minutes) in product(names.items(), kinds):
+        own = first_seed + number + SEEDS_EACH * settings.seed
+        whole = StreamSettings(
+            junction_named(name),
+            DRIVES_S[traffic] / 60.0 if settings.moving_ego else minutes,
+            own,
+            traffic_named(traffic),
+            sample_rate_hz=rate_for(settings.bandwidth_hz),
+        )
+        drives = ceil(minutes / whole.minutes - 1e-9) if settings.moving_ego else 0
+        found += [replace(whole, seed=own * DRIVES_EACH + i) for i in range(drives)] or [whole]
+    return found
 
 
 # What a bracket and a tape measure leave: two degrees are 14 mm over the width of 40 cm.
@@ -183,6 +177,7 @@ def mountings(array: MicrophoneArray, rng: np.random.Generator) -> dict[str, Mic
 
 
 HOPS, VEHICLES, ROWS = "hops", "vehicles", "rows"
+ROW_S = 0.1
 _PCM = 32767.0
 
 
@@ -193,6 +188,16 @@ class HeardStream:
     hops: HopTable  # One row a hop: `AcousticFrame` by columns, NaN where something was refused
     vehicles: HopTable  # One row a vehicle: flow, kind, arm, T0 as `entry_s` (NaN: never comes into view)
     rows: HopTable  # One row a vehicle and tenth of a second: time, place, in view, loudness
+
+    def row_hops(self) -> tuple[IndexArray, BoolArray]:
+        """Return the number of the hop of every row of `rows`, and which of these hops there are."""
+        time_s = self.hops.time_s
+        numbers = np.round((self.rows.time_s - time_s[0]) / ROW_S).astype(np.intp)
+        return numbers, (numbers >= 0) & (numbers < len(time_s))
+
+    def in_view_within(self, distance_m: float) -> BoolArray:
+        """Tell of every row of `rows` whether the vehicle is in view and no farther away than this."""
+        return np.asarray(self.rows.in_view & (np.hypot(self.rows.x_m, self.rows.y_m) <= distance_m))
 
     @property
     def hazard_free(self) -> bool:
@@ -232,10 +237,8 @@ def hear_stream(
     with closing(stream.blocks()) as blocks:
         samples = _recorded(stream, blocks, loudness)
         told = _heard_hops(samples, believed or [array], settings.sample_rate_hz, settings.name, about)
-    return [
-        HeardStream(one, vehicle_table(stream.vehicles), vehicle_rows(stream.vehicles, loudness))
-        for one in told
-    ]
+    truth = _truth(stream.vehicles, loudness)
+    return [HeardStream(one, *truth) for one in told]
 
 
 def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
@@ -244,7 +247,7 @@ def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
         about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
         blocks = audio.blocks(round(audio.sample_rate_hz))
         (hops,) = _heard_hops(blocks, [array], audio.sample_rate_hz, sound.name, about)
-    return HeardStream(hops, vehicle_table(()), vehicle_rows((), {}))
+    return HeardStream(hops, *_truth((), {}))
 
 
 def _recorded(
@@ -309,11 +312,11 @@ def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
     return np.array([pcm[end - length : end] for end in ends], np.int16)
 
 
-def vehicle_table(every: Sequence[VehicleTruth]) -> HopTable:
-    """Return one row a vehicle, as `HeardStream.vehicles`."""
+def _truth(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> tuple[HopTable, HopTable]:
+    """Return one row a vehicle, and one a vehicle and tenth of a second, as in `HeardStream`."""
     # Typed column by column: of no vehicles at all rows would make columns of floats.
     motions = [one.event.manoeuvre for one in every]
-    return HopTable(
+    vehicles = HopTable(
         {
             "vehicle": np.array([one.number for one in every], np.int64),
             "flow": np.array([one.event.flow for one in every], np.str_),
@@ -323,12 +326,8 @@ def vehicle_table(every: Sequence[VehicleTruth]) -> HopTable:
             "hazard": np.array([one.hazard for one in every], np.bool_),
         }
     )
-
-
-def vehicle_rows(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> HopTable:
-    """Return one row a vehicle and tenth of a second, as `HeardStream.rows`."""
     azimuth, distance = (_joined([getattr(one, name) for one in every]) for name in ("axle_rad", "axle_m"))
-    return HopTable(
+    rows = HopTable(
         {
             "vehicle": np.repeat([one.number for one in every], [len(one.time_s) for one in every]),
             "time_s": _joined([one.time_s for one in every]),
@@ -338,6 +337,7 @@ def vehicle_rows(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatA
             "loudness_db": _joined([loudness_db[one.number] for one in every]),
         }
     )
+    return vehicles, rows
 
 
 def _joined(parts: Sequence[AnyArray]) -> AnyArray:

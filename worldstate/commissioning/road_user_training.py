@@ -69,17 +69,6 @@ class RoadUserRows(SoundRows):
         return np.asarray(shares * self.counts)
 
 
-def train_road_users(
-    array: MicrophoneArray,
-    sites: Sequence[str],
-    sample_rate_hz: float,
-    rng: np.random.Generator,
-    jobs: int = 1,
-) -> RoadUserModel:
-    """Train on one pass of every kind at every site."""
-    return fit_road_users(road_user_rows(array, sites, sample_rate_hz, rng, jobs=jobs))
-
-
 def road_user_rows(
     array: MicrophoneArray,
     sites: Sequence[str],

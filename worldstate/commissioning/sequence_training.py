@@ -17,7 +17,7 @@ from worldstate.ground.errors import WorldstateError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import significant
 
-from .heard_stream import HeardStream
+from .heard_stream import ROW_S, HeardStream
 
 # Hardly heard before they are seen: as hidden windows they would be wrong labels, as empty ones too.
 SILENT_KINDS = ("bicycle", "scooter")
@@ -26,7 +26,6 @@ QUIET_KINDS = (*SILENT_KINDS, "electric")
 # Below it a vehicle is lost in the background of the simulated streets, some 50 dB at the array.
 AUDIBLE_DB = 48.0
 OTHER_SIDE_S = 3.0
-ROW_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,18 +62,14 @@ def stream_truth(heard: HeardStream) -> StreamTruth:
     past_db, far_db = np.full((2, n, len(SIDES)), -np.inf)
     rises, seen = np.zeros((n, len(SIDES)), bool), np.zeros(n, bool)
     vehicles, rows = heard.vehicles, heard.rows
-    hop_of = np.round((rows.time_s - time_s[0]) / ROW_S).astype(np.intp)
-    inside = (hop_of >= 0) & (hop_of < n)
+    hop_of, inside = heard.row_hops()
     for i, number in enumerate(vehicles.vehicle):
         mine = inside & (rows.vehicle == number)
         hop, loudness = hop_of[mine], rows.loudness_db[mine]
         if not hop.size:
             continue
-        arm, entry_s, louder = (
-            SIDES.index(vehicles.arm[i]),
-            vehicles.entry_s[i],
-            np.diff(loudness, prepend=loudness[0]) > 0,
-        )
+        arm, entry_s = SIDES.index(vehicles.arm[i]), vehicles.entry_s[i]
+        louder = np.diff(loudness, prepend=loudness[0]) > 0
         before, in_view = ~(time_s[hop] > entry_s + ROW_S / 100), rows.in_view[mine]
         seen[hop[in_view]] = True
         if vehicles.hazard[i]:

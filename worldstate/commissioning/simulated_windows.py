@@ -137,7 +137,7 @@ def _in_view(stream: HeardStream, after_s: float, stays_s: float) -> BoolArray:
     """Tell from how long after a vehicle near by came into view to how long after it left, shape (n,)."""
     rows, time = stream.rows, stream.hops.time_s
     near = np.zeros(len(time), np.bool_)
-    seen = rows.in_view & (np.hypot(rows.x_m, rows.y_m) <= NEAR_M)
+    seen = stream.in_view_within(NEAR_M)
     for number in np.unique(rows.vehicle[seen]):
         mine = rows.time_s[seen & (rows.vehicle == number)]
         near |= (time >= mine[0] + after_s) & (time <= mine[-1] + stays_s)

@@ -38,8 +38,8 @@ from worldstate.operations.metrics.approach_table import (
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HOP_S
 
-from .heard_stream import HeardStream
-from .sequence_training import QUIET_KINDS, ROW_S, StreamTruth
+from .heard_stream import ROW_S, HeardStream
+from .sequence_training import QUIET_KINDS, StreamTruth
 from .stream_outcomes import hop_outcome, visible_errors
 
 TOGETHER_S, FOLLOWING_S = 4.0, 6.0
@@ -350,9 +350,9 @@ def in_view_bearings(streams: Sequence[HeardStream]) -> dict[str, float | None]:
 
 def _errors_rad(heard: HeardStream) -> FloatArray:
     """Return how far bearings are from the loudest vehicle in view near by, one a hop."""
-    rows, time_s = heard.rows, heard.hops.time_s
-    hop = np.round((rows.time_s - time_s[0]) / ROW_S).astype(np.intp)
-    seen = rows.in_view & (np.hypot(rows.x_m, rows.y_m) <= NEAR_M) & (hop >= 0) & (hop < len(time_s))
+    rows = heard.rows
+    hop, inside = heard.row_hops()
+    seen = heard.in_view_within(NEAR_M) & inside
     order = np.flatnonzero(seen)[np.lexsort((rows.loudness_db[seen], hop[seen]))]
     loudest = order[np.diff(hop[order], append=-1) != 0]
     true = np.arctan2(rows.y_m[loudest], rows.x_m[loudest])
@@ -362,7 +362,7 @@ def _errors_rad(heard: HeardStream) -> FloatArray:
 def _turn_rates(heard: HeardStream) -> FloatArray:
     """Return how fast vehicles in view near by turn round the array, rad/s, one a row and next."""
     rows = heard.rows
-    near = rows.in_view & (np.hypot(rows.x_m, rows.y_m) <= NEAR_M)
+    near = heard.in_view_within(NEAR_M)
     on = (np.diff(rows.vehicle) == 0) & near[1:] & near[:-1]
     return np.asarray(np.abs(wrap_angle(np.diff(np.arctan2(rows.y_m, rows.x_m)))[on]) / ROW_S)
 
@@ -375,14 +375,17 @@ def write_exam_figure(streams: Sequence[ExaminedStream], path: Path) -> None:
     sites = sorted({one.heard.site for one in streams})
     with figure_file(path, 9.0, 3.6) as figure:
         warned, ranked = figure.subplots(1, 2)
+
+        def draw(some: Sequence[ExaminedStream], **style: object) -> None:
+            warned.plot(-BEFORE_S, warned_before(some, BEFORE_S), **style)
+            ranked.plot(-BEFORE_S, auroc_before(some, BEFORE_S), **style)
+
         for site in sites:
             here = [one for one in streams if one.heard.site == site]
             onsets = examine(here)["onsets_per_hour"]
             told = site if onsets is None else f"{site}, {onsets:.0f} an hour"
-            warned.plot(-BEFORE_S, warned_before(here, BEFORE_S), linewidth=1.0, label=told)
-            ranked.plot(-BEFORE_S, auroc_before(here, BEFORE_S), linewidth=1.0, label=told)
-        warned.plot(-BEFORE_S, warned_before(streams, BEFORE_S), color="black", label="all")
-        ranked.plot(-BEFORE_S, auroc_before(streams, BEFORE_S), color="black", label="all")
+            draw(here, linewidth=1.0, label=told)
+        draw(streams, color="black", label="all")
         warned.set(ylim=(0.0, 1.0), xlabel="seconds to T0", ylabel="approaches in alarm by then")
         ranked.set(ylim=(0.5, 1.0), xlabel="seconds to T0", ylabel="AUROC against hazard-free hops")
         legend_beside(ranked, "alarms without vehicles")

@@ -18,7 +18,7 @@ import numpy as np
 
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
-from worldstate.commissioning.guard_training import characters
+from worldstate.commissioning.guard_training import heard_characters
 from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams
 from worldstate.commissioning.road_user_training import (
     CLASSES,
@@ -30,9 +30,8 @@ from worldstate.commissioning.road_user_training import (
     fit_road_users,
     road_user_rows,
 )
-from worldstate.commissioning.sequence_training import AUDIBLE_DB, ROW_S
+from worldstate.commissioning.sequence_training import AUDIBLE_DB
 from worldstate.frontend.array.microphone_array import ovad_array
-from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
@@ -69,12 +68,10 @@ def stream_exam(rows: RoadUserRows, streams: Sequence[HeardStream]) -> RoadUserE
 
 def stream_rows(stream: HeardStream) -> RoadUserRows:
     """Return the hops of a stream in which one vehicle that comes into view is heard alone."""
-    sound = stream.hops.middle / np.float32(np.iinfo(np.int16).max)
-    measures, usable = characters(sound.ravel(), float(sound.shape[1] * HOPS_A_SECOND))
+    measures, usable = heard_characters(stream)
     time_s, vehicles, rows = stream.hops.time_s, stream.vehicles, stream.rows
     levels = np.full((len(vehicles) + 1, len(time_s)), _SILENT_DB)
-    hop = np.round((rows.time_s - time_s[0]) / ROW_S).astype(np.intp)
-    inside = (hop >= 0) & (hop < len(time_s))
+    hop, inside = stream.row_hops()
     for number, vehicle in enumerate(vehicles.vehicle):
         mine = inside & (rows.vehicle == vehicle)
         levels[number, hop[mine]] = rows.loudness_db[mine]

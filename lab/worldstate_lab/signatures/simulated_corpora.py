@@ -20,7 +20,7 @@ from worldstate.simulation.scene.presets import Preset, preset
 from worldstate.simulation.scene.vehicle import SourceSignal, drive, emit
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, add_delayed, emission_times
-from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS, air_gain, ground_gain
+from worldstate.simulation.sound.diffraction import air_gain, ground_gain
 from worldstate.simulation.sound.receiver import NEAREST_M, Receiver
 
 from .clip_signatures import ClipSignatures, signature
@@ -230,7 +230,7 @@ def _add_heard(out: Float32Array, part: SourceSignal, knots_s: FloatArray, groun
     made = Emission.of(part.signal, knots_s[0], RATE_HZ).table(gain)
     if made is not None:
         table, span = made
-        emitted = emission_times(KNOTS_S, knots_s[span], length[span], SPEED_OF_SOUND_MPS)
+        emitted = emission_times(KNOTS_S, knots_s[span], length[span])
         travelled = np.interp(np.nan_to_num(emitted), knots_s[span], length[span])
         add_delayed(out, table, emitted, 1.0 / np.maximum(travelled, NEAREST_M))
 

@@ -26,9 +26,9 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.simulation import SimulationSettings, draw_settings, simulate_recording
-from worldstate.simulation.dataset import recording
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.sound import ego_sound
 from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.state import Context
 
@@ -108,9 +108,9 @@ def approaches(seed: int, array: MicrophoneArray, rate_hz: float) -> list[Scene]
         return np.zeros_like(overheard(*arguments))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recording, "ego_noise", muted)
+        patch.setattr(ego_sound, "ego_noise", muted)
         alone = simulate_recording(replace(drawn, preset=SILENT), rng, array)
-        patch.setattr(recording, "ego_noise", overheard)
+        patch.setattr(ego_sound, "ego_noise", overheard)
         empty: SimulationSettings = replace(drawn, approach="none", entry_s=0.0)
         first, second = (simulate_recording(empty, rng, array).audio * FULL_SCALE_PA for _ in range(2))
     vehicle, in_sight_s = alone.audio * FULL_SCALE_PA, alone.t0_frame / 10
