@@ -43,7 +43,7 @@ class WorldFilter:
     policy : CueingPolicy
         Threshold, sustained rule and risk map; a model file brings one.
     settings : FilterSettings
-        Noise levels, gates, births and deaths.
+        Windows, births and deaths.
     start_ns : int
         Time of the first belief, ns on the clock of the measurements.
     memory : Memory, optional

@@ -36,7 +36,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("stonesoup", "oracles") from error
 
-# A peak belongs to a hidden vehicle in one of four windows, as `FilterSettings` has it; the other three, and
+# A peak belongs to a hidden vehicle in one of four windows, as the filter has it; the other three, and
 # every peak of an empty street, lie anywhere ahead.
 PEAK_DETECTION, PEAK_CLUTTER = 0.25, 1.0 / np.pi
 BOX_DETECTION, BOX_CLUTTER = 0.94, 0.01
