@@ -58,7 +58,7 @@ from worldstate_lab.evaluation.evaluation import (
     lacking_data,
     whole_sweep,
 )
-from worldstate_lab.evaluation.figures import FIGURES
+from worldstate_lab.evaluation.figures import FIGURES, titles
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.degradation_section import (
     degradation_record,
@@ -338,5 +338,5 @@ def _warnings(found: Evaluation, protocol: str) -> Table:
             rate = Value(figures["false_alarms_per_hour"], *score.poisson(), digits=0)
             rows.append((method, *cells, rate, Value(score.poisson_upper(), digits=0)))
     run = found.runs[protocol]
-    heads = ("method", *(FIGURES[name].title for name in SHOWN), "false alarms (1/h)", "at most (90 %)")
+    heads = ("method", *titles(SHOWN), "false alarms (1/h)", "at most (90 %)")
     return Table("warnings", f"{run.protocol.title}: {run.basis}", heads, rows)

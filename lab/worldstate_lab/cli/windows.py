@@ -267,7 +267,11 @@ def comparison(
         "per_group": report_groups(table, chosen[row]),
         "rows": {name: rows[name] for name in others},
         "gains": {
-            name: _gains(rows[row], rows[name], paired_gains(drawn[row], drawn[name])) for name in others
+            name: {
+                figure: {"gain": rows[row][figure] - rows[name][figure], "low": low, "high": high}
+                for figure, (low, high) in paired_gains(drawn[row], drawn[name]).items()
+            }
+            for name in others
         },
     }
 
@@ -288,15 +292,6 @@ def _row_figures(
         **figures,
         "fpr_p_value": p_value,
         "intervals": {name: middle(one) for name, one in draws.items()},
-    }
-
-
-def _gains(
-    ours: Mapping[str, Any], theirs: Mapping[str, Any], intervals: Mapping[str, tuple[float, float]]
-) -> dict[str, dict[str, float]]:
-    return {
-        figure: {"gain": ours[figure] - theirs[figure], "low": low, "high": high}
-        for figure, (low, high) in intervals.items()
     }
 
 

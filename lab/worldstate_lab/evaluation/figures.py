@@ -8,6 +8,7 @@ one with a vehicle in view counts once. Every number of the paper's sections IV,
 
 import csv
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -47,6 +48,11 @@ def _kind(row: dict[str, Any]) -> FigureKind:
 
 
 FIGURES = {row["figure"]: _kind(row) for row in _rows("figures.csv")}
+
+
+def titles(figures: Iterable[str]) -> tuple[str, ...]:
+    """Return the titles of figures, as heads of columns."""
+    return tuple(FIGURES[name].title for name in figures)
 
 
 # What fills a number, by what it stands on: the positions of the microphones, this machine, OVAD's sound and

@@ -64,6 +64,7 @@ class Protocol:
 
 
 STATIC = Protocol("static", "Standing ego, five folds")
+STANDING = STATIC.name  # What most of the report is on
 DYNAMIC = Protocol("dynamic", "Moving ego, five folds", moving=True)
 FIXED = Protocol("junctions_fixed", "One junction out, classifier fixed", by_junction=True)
 RETRAINED = Protocol(

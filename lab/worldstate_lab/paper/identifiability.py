@@ -56,7 +56,9 @@ def entropy_bits(probabilities: ArrayLike) -> float:
     ----------
     C. E. Shannon, "A mathematical theory of communication", Bell Syst. Tech. J. 27, 1948.
     """
-    p = _distribution("probabilities", finite_array("probabilities", probabilities, (None,)))
+    p = finite_array("probabilities", probabilities, (None,))
+    if not p.size or (p < 0.0).any() or not math.isclose(float(p.sum()), 1.0, abs_tol=1e-6):
+        raise InvalidArgumentError("probabilities: expected probabilities that sum to one")
     positive = p[p > 0.0]
     return max(float(-(positive * np.log2(positive)).sum()), 0.0)
 
@@ -283,12 +285,6 @@ def _fano_function(error: float, states: int) -> float:
     return spread + error * math.log2(states - 1) if states > 2 else spread
 
 
-def _distribution(name: str, values: FloatArray) -> FloatArray:
-    if not values.size or (values < 0.0).any() or not math.isclose(float(values.sum()), 1.0, abs_tol=1e-6):
-        raise InvalidArgumentError(f"{name}: expected probabilities that sum to one")
-    return values
-
-
 def _checked(posteriors: ArrayLike, states: ArrayLike) -> tuple[FloatArray, IndexArray]:
     q = finite_array("posteriors", posteriors, (None, None))
     z = np.asarray(states)
@@ -474,11 +470,13 @@ def reach_of_array(
     )
     heard = np.divide(1.0, variance, out=np.zeros_like(variance), where=np.isfinite(variance))
     std = np.sqrt(variance)
+    with np.errstate(divide="ignore"):
+        together = 1.0 / np.sqrt(heard + seen)
     return ReachOfArray(
         azimuths_rad=azimuths,
         # Round-off leaves a sliver of information at endfire: a spread beyond half a turn is no bearing.
         std_rad=np.where(std > math.pi, math.inf, std),
-        with_vision_rad=_deviation(heard + seen),
+        with_vision_rad=together,
         endfire=endfire_information(array.positions_m, azimuths),
     )
 
@@ -487,11 +485,6 @@ def _vision_information(std_rad: float) -> float:
     if std_rad == math.inf:
         return 0.0
     return float(1.0 / in_range("vision_std_rad", std_rad, 0.0, math.inf, open_low=True) ** 2)
-
-
-def _deviation(information: FloatArray) -> FloatArray:
-    with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / np.sqrt(information))
 
 
 def _neighbours(features: ArrayLike, states: NDArray[np.int_]) -> float:

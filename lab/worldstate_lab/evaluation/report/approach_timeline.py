@@ -16,7 +16,7 @@ from worldstate.operations.figure_style import BLUE, GREEN, PURPLE, RED
 from worldstate.operations.metrics.approach_table import alarm_outcome
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.evaluation.evaluation import ALPHA, Evaluation
-from worldstate_lab.evaluation.protocols import STATIC
+from worldstate_lab.evaluation.protocols import STANDING
 from worldstate_lab.report.pages import Section
 from worldstate_lab.report.table import Figure
 from worldstate_lab.trials.trial import Decisions, Trial
@@ -48,7 +48,7 @@ class ApproachImage:
 
 def approach_section(found: Evaluation) -> Section:
     """Return the timeline of the detected approach whose lead is the median one, filmed ones preferred."""
-    title, run = "One approach end to end", found.runs[STATIC.name]
+    title, run = "One approach end to end", found.runs[STANDING]
     answers = run.decisions[PROPOSED][0]
     leads = leads_s(run.trials, [answers])
     pairs = [(t, s) for t, s in zip(run.trials, answers, strict=True) if not t.hazard_free]

@@ -11,8 +11,8 @@ import sklearn
 
 from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue
-from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STATIC, Protocol
+from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
+from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STANDING, Protocol
 from worldstate_lab.methods.table_rows import GROUNDED
 from worldstate_lab.report.pages import Document, Section
 from worldstate_lab.report.table import Cell, Figure, Table, Value
@@ -126,7 +126,7 @@ def transfer_section(measured: MeasuredValues) -> Section:
     """Return the protocols beyond the static folds, and every junction of all of them."""
     parts = []
     for name, run in measured.found.runs.items():
-        if name != STATIC.name:
+        if name != STANDING:
             told = f"Published classifier trained on: {run.trained_on}. Intervals as in Table I."
             methods, title = measured.methods(name), run.protocol.title
             table = measured.table(name, methods, _TRANSFER, f"protocol_{name}", title, told)
@@ -137,7 +137,7 @@ def transfer_section(measured: MeasuredValues) -> Section:
 def _junctions(found: Evaluation) -> Section:
     """Return the proposed method at every junction, by protocol."""
     sites = {name: site_values(scores[PROPOSED], found, name) for name, scores in found.scores.items()}
-    standing = [name for name in (STATIC.name, FIXED.name, RETRAINED.name) if name in sites]
+    standing = [name for name in (STANDING, FIXED.name, RETRAINED.name) if name in sites]
 
     def drawn(figure: str, name: str, title: str) -> Figure:
         by_protocol = {
@@ -166,7 +166,7 @@ def _junction_table(found: Evaluation, sites: Mapping[str, Mapping[str, Mapping[
     return Table(
         "junctions",
         f"Every junction, {PROPOSED}",
-        ("protocol", "junction", "recordings", *(FIGURES[name].title for name in _BY_SITE)),
+        ("protocol", "junction", "recordings", *titles(_BY_SITE)),
         rows,
         "Intervals over the recordings of the junction. A junction has few: one alarm is many an hour.",
     )
@@ -177,25 +177,25 @@ def ablation_section(measured: MeasuredValues) -> Section:
 
     def cell(row: str, figure: str) -> Value:
         # Beside the paper's value stands the row of Table I, not what is left of it here.
-        return replace(measured.at(STATIC.name, row, figure, note=_UNMEASURED), paper=None)
+        return replace(measured.at(STANDING, row, figure, note=_UNMEASURED), paper=None)
 
     shown = (*_ABLATED, "ece", "hazard_awareness")
     table = Table(
         "ablations",
         "Ablations, standing ego",
-        ("part", *(FIGURES[name].title for name in shown)),
+        ("part", *titles(shown)),
         [
             (part, *(cell(row, figure) for figure in (*_ABLATED, error, "hazard_awareness")))
             for part, row, error in _ABLATIONS
         ],
-        f"{measured.found.runs[STATIC.name].basis} One part off at a time, same folds; vision alone is aware "
+        f"{measured.found.runs[STANDING].basis} One part off at a time, same folds; vision alone is aware "
         f"in {cell('Vision-only', 'hazard_awareness').text}. Paper: (a) changes no entry of Table I with a "
         "clean camera; (b) ECE 0.167 raw, 0.034 calibrated; (c) is the section on degradation.",
     )
     names = {one.name for one in GROUNDED}
     grounded = measured.table(
-        STATIC.name,
-        [name for name in measured.methods(STATIC.name) if name in names],
+        STANDING,
+        [name for name in measured.methods(STANDING) if name in names],
         _TRANSFER,
         "grounded",
         "Bearing and approach rate in the likelihood, eq. (5)",
@@ -209,7 +209,15 @@ def paper_section(measured: MeasuredValues) -> Section:
     """Return every number of the paper beside ours, and the command that fills it on what it stands on."""
     simulated = measured.found.takes.simulated
     rows = [
-        (*_named(one), printed(one), one.unit, _ours(one, measured), _filled(one, simulated))
+        (
+            one.section,
+            one.group,
+            _label(one),
+            printed(one),
+            one.unit,
+            _ours(one, measured),
+            _filled(one, simulated),
+        )
         for one in PAPER_VALUES
     ]
     text = (
@@ -227,10 +235,6 @@ def paper_section(measured: MeasuredValues) -> Section:
     return Section("The paper's numbers, and what they need", (text,), (table,))
 
 
-def _named(one: PaperValue) -> tuple[str, str, str]:
-    return one.section, one.group, _label(one)
-
-
 def _filled(one: PaperValue, simulated: bool) -> str:
     if one.basis == "ovad" and not simulated:
         return "this run"
@@ -242,7 +246,7 @@ def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, st
     others = {} if found.degradation is None else sweep_values(found.degradation)
     measured = MeasuredValues.of(found, others)
     panels = () if found.degradation is None else awareness_figures(found.degradation)
-    static = STATIC.name in found.runs
+    static = STANDING in found.runs
     sections = [
         _data_section(found),
         *((table_i(measured), budget_section(measured)) if static else ()),
@@ -253,8 +257,7 @@ def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, st
         degradation_section(
             found.degradation, found.lacking.get("degradation sweep", "not asked for"), found.staged
         ),
-        *((ablation_section(measured),) if static else ()),
-        *((tracking_section(measured), strata_section(measured)) if static else ()),
+        *(section(measured) for section in (ablation_section, tracking_section, strata_section) if static),
         difference_section(found),
         paper_section(measured),
     ]

@@ -9,9 +9,9 @@ import numpy as np
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.operations.arrays.array_bounds import array_bounds
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import FIGURES, PAPER_VALUES, PaperValue, paper_value
+from worldstate_lab.evaluation.figures import FIGURES, PAPER_VALUES, PaperValue, paper_value, titles
 from worldstate_lab.evaluation.front_end_study import FrontEndStudy
-from worldstate_lab.evaluation.protocols import RETRAINED, STATIC
+from worldstate_lab.evaluation.protocols import RETRAINED, STANDING
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.line_of_sight import seen_early_s
 from worldstate_lab.metrics.bearing_gating import PUBLISHED_COVERAGE
@@ -85,7 +85,7 @@ class MeasuredValues:
         reasons = [f"Not scored: {refused[method]}." for method in methods if method in refused]
         rows = [(method, *self._cells(protocol, method, figures)) for method in methods]
         told = " ".join((self.found.runs[protocol].basis, caption, *dict.fromkeys(reasons)))
-        return Table(name, title, ("method", *(FIGURES[one].title for one in figures)), rows, told)
+        return Table(name, title, ("method", *titles(figures)), rows, told)
 
     def _cells(self, protocol: str, method: str, figures: Sequence[str]) -> list[Cell]:
         if method in self.found.refused.get(protocol, {}):
@@ -189,9 +189,9 @@ def _front_end_values(study: FrontEndStudy) -> Iterator[tuple[Place, Value]]:
 
 def _derived_values(values: Mapping[Place, Value], found: Evaluation) -> Iterator[tuple[Place, Value]]:
     """Yield what the paper states as differences, worst cases or counts over the figures."""
-    if STATIC.name in found.runs:
+    if STANDING in found.runs:
         yield ("static", "against the sustained rule", "fewer_false_alarms"), _fewer(found)
-        early = seen_early_s(found.runs[STATIC.name].trials)
+        early = seen_early_s(found.runs[STANDING].trials)
         count = Value(float((early > 0.0).sum()), digits=0, note=f"of {early.size}")
         yield ("static", "Vision-only", "approaches_with_early_box"), count
         yield from _seed_range(found)
@@ -208,9 +208,9 @@ def _derived_values(values: Mapping[Place, Value], found: Evaluation) -> Iterato
 
 def _fewer(found: Evaluation) -> Value:
     """Return the share of false alarms that the proposed method saves, on the same draws of recordings."""
-    every = np.vstack([np.arange(len(found.runs[STATIC.name].trials)), found.draws[STATIC.name]])
+    every = np.vstack([np.arange(len(found.runs[STANDING].trials)), found.draws[STANDING]])
     ours, others = (
-        found.scores[STATIC.name][method].draws(every)["false_alarms_per_hour"]
+        found.scores[STANDING][method].draws(every)["false_alarms_per_hour"]
         for method in (PROPOSED, "published, sustained")
     )
     fewer = 1.0 - ratio(ours, others)
@@ -218,9 +218,9 @@ def _fewer(found: Evaluation) -> Value:
 
 
 def _seed_range(found: Evaluation) -> Iterator[tuple[Place, Value]]:
-    counts = found.scores[STATIC.name][PROPOSED].counts
+    counts = found.scores[STANDING][PROPOSED].counts
     shares = counts["detected"].sum(axis=1) / counts["approaches"].sum(axis=1)
-    note = "" if len(found.runs[STATIC.name].seeds) > 1 else "one seed; --full draws five"
+    note = "" if len(found.runs[STANDING].seeds) > 1 else "one seed; --full draws five"
     for name, share in (("detection_least", shares.min()), ("detection_most", shares.max())):
         yield ("static", f"{PROPOSED}, least and most over five seeds", name), Value(float(share), note=note)
 

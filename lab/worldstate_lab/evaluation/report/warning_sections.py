@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import FIGURES, paper_value
-from worldstate_lab.evaluation.protocols import STATIC
+from worldstate_lab.evaluation.figures import FIGURES, paper_value, titles
+from worldstate_lab.evaluation.protocols import STANDING
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate_lab.evaluation.scores import paired
 from worldstate_lab.methods.table_rows import CURVE_ALPHAS
@@ -51,12 +51,12 @@ _COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all", "ece",
 
 def table_i(measured: MeasuredValues) -> Section:
     """Return the section of Table I."""
-    early = measured.at(STATIC.name, "Vision-only", "approaches_with_early_box")
-    hours = measured.at(STATIC.name, PROPOSED, "hazard_free_hours")
-    quantum = measured.at(STATIC.name, PROPOSED, "quantum_per_hour")
+    early = measured.at(STANDING, "Vision-only", "approaches_with_early_box")
+    hours = measured.at(STANDING, PROPOSED, "hazard_free_hours")
+    quantum = measured.at(STANDING, PROPOSED, "quantum_per_hour")
     table = measured.table(
-        STATIC.name,
-        measured.methods(STATIC.name),
+        STANDING,
+        measured.methods(STANDING),
         _WARNING,
         "table_i",
         "Table I: warning performance, standing ego",
@@ -66,10 +66,10 @@ def table_i(measured: MeasuredValues) -> Section:
         "random moments would detect. The folds are those of the protocol; thresholds are set on the other "
         "folds.",
     )
-    run = measured.found.runs[STATIC.name]
+    run = measured.found.runs[STANDING]
     every = {name: leads_s(run.trials, passes) for name, passes in run.decisions.items() if name in _LEADS}
     leads = {method: lead for method, lead in every.items() if np.isfinite(lead).any()}
-    stated = {method: paper_value(STATIC.name, method, "lead_s") for method in leads}
+    stated = {method: paper_value(STANDING, method, "lead_s") for method in leads}
     text = (
         f"False alarms are counted on {hours.number} h of hazard-free time, so one alarm onset is "
         f"{quantum.number} an hour (paper: 0.103 h, 9.7 an hour).",
@@ -97,23 +97,23 @@ def budget_section(measured: MeasuredValues) -> Section:
     rows: list[tuple[Cell, ...]] = []
     budgets = {alpha: method for method, alpha in _BUDGETS.items()}
     for alpha in CURVE_ALPHAS:
-        score = measured.found.scores[STATIC.name].get(f"curve {alpha:g}")
+        score = measured.found.scores[STANDING].get(f"curve {alpha:g}")
         if score is not None:
-            curve = score_values(score, measured.found, STATIC.name)
+            curve = score_values(score, measured.found, STANDING)
             curve |= {
-                name: measured.at(STATIC.name, budgets[alpha], name) for name in _BUDGET if alpha in budgets
+                name: measured.at(STANDING, budgets[alpha], name) for name in _BUDGET if alpha in budgets
             }
             rows.append((f"{alpha:g}", *(curve[name] for name in _BUDGET)))
     table = Table(
         "alpha",
         "Budget and achieved false alarms, proposed method",
-        ("alpha (share of windows)", *(FIGURES[name].title for name in _BUDGET)),
+        ("alpha (share of windows)", *titles(_BUDGET)),
         rows,
-        f"{measured.found.runs[STATIC.name].basis} alpha bounds the share of hazard-free windows in alarm on "
+        f"{measured.found.runs[STANDING].basis} alpha bounds the share of hazard-free windows in alarm on "
         "the calibration folds; the alarms an hour are counted on the folds that were not used. Intervals "
         "as in Table I.",
     )
-    return Section("Budget and false alarms", (), (table, equal_table(measured.found, STATIC.name)))
+    return Section("Budget and false alarms", (), (table, equal_table(measured.found, STANDING)))
 
 
 def equal_table(found: Evaluation, protocol: str) -> Table:
@@ -134,7 +134,7 @@ def equal_table(found: Evaluation, protocol: str) -> Table:
 
 def cueing_section(measured: MeasuredValues, awareness: Sequence[Figure]) -> Section:
     """Return the four panels of calibrated cueing; the last one comes with the degradation study."""
-    run = measured.found.runs[STATIC.name]
+    run = measured.found.runs[STANDING]
     pairs = [
         (trial, said)
         for answers in run.decisions[PROPOSED]
@@ -148,10 +148,10 @@ def cueing_section(measured: MeasuredValues, awareness: Sequence[Figure]) -> Sec
         )
         for name, horizon in HORIZONS_S.items()
     }
-    areas = {title: measured.at(STATIC.name, PROPOSED, f"auroc_{name}") for name, title in titles.items()}
+    areas = {title: measured.at(STANDING, PROPOSED, f"auroc_{name}") for name, title in titles.items()}
     table = measured.table(
-        STATIC.name,
-        measured.methods(STATIC.name, _AREAS[:1]),
+        STANDING,
+        measured.methods(STANDING, _AREAS[:1]),
         _CALIBRATION,
         "calibration",
         "Discrimination and calibration of windows",
@@ -159,9 +159,7 @@ def cueing_section(measured: MeasuredValues, awareness: Sequence[Figure]) -> Sec
         "calibrated labels would score with as many windows; it has no interval, as drawing recordings again "
         "only raises it. Raw: the statistic read as a probability, where it is between 0 and 1.",
     )
-    operating = operating_figure(
-        _points(measured), measured.at(STATIC.name, PROPOSED, "quantum_per_hour").value
-    )
+    operating = operating_figure(_points(measured), measured.at(STANDING, PROPOSED, "quantum_per_hour").value)
     return Section(
         "Calibrated cueing",
         ("The panels are those of the paper's figure on calibrated cueing; proposed method, standing ego.",),
@@ -185,20 +183,20 @@ def _points(measured: MeasuredValues) -> list[OperatingPoint]:
     return [
         OperatingPoint(
             method,
-            measured.at(STATIC.name, method, "false_alarms_per_hour"),
-            measured.at(STATIC.name, method, "detection"),
+            measured.at(STANDING, method, "false_alarms_per_hour"),
+            measured.at(STANDING, method, "detection"),
             _BUDGETS.get(method),
         )
         for method in shown
-        if method in measured.found.scores[STATIC.name]
+        if method in measured.found.scores[STANDING]
     ]
 
 
 def tracking_section(measured: MeasuredValues) -> Section:
     """Return identities, LOCATA's measures, GOSPA and time to visible of the methods that state any."""
     table = measured.table(
-        STATIC.name,
-        measured.methods(STATIC.name, _TRACKING),
+        STANDING,
+        measured.methods(STANDING, _TRACKING),
         _TRACKING,
         "tracking",
         "Tracks and time to visible, standing ego",
@@ -211,8 +209,8 @@ def tracking_section(measured: MeasuredValues) -> Section:
 def strata_section(measured: MeasuredValues) -> Section:
     """Return the figures by condition: clear and occluded; a degraded camera has its own section."""
     table = measured.table(
-        STATIC.name,
-        measured.methods(STATIC.name),
+        STANDING,
+        measured.methods(STANDING),
         _STRATA,
         "strata",
         "Clear and occluded, standing ego",
@@ -236,7 +234,7 @@ def difference_section(found: Evaluation) -> Section:
     table = Table(
         "differences",
         "Differences between methods",
-        ("protocol", "recordings", "difference", *(FIGURES[one].title for one in _COMPARED)),
+        ("protocol", "recordings", "difference", *titles(_COMPARED)),
         rows,
         "First method less the second on the same recordings, with the middle 95 % over the same draws of "
         "them: an interval that leaves out 0 is a difference that these recordings show.",
