@@ -57,7 +57,9 @@ def study_lines(study: SignatureStudy) -> list[str]:
     width = max((len(row.name) for row in filled), default=0)
     lines = [f"{'':{width}} {'':17} {'value':>6} {'[interval]':15} {'paper':>11} {'clips':>6}  corpus; how"]
     for row in filled:
-        measured = f"{_number(row.value, row):>6} {_between(row):15} {_published(row):>11}"
+        between = f"[{_number(row.low, row)}, {_number(row.high, row)}]"
+        paper = " - ".join(dict.fromkeys(_number(one, row) for one in row.paper or (None,)))
+        measured = f"{_number(row.value, row):>6} {between:15} {paper:>11}"
         lines.append(
             f"{row.name:{width}} {row.figure:17} {measured} {row.n_clips:6}  {row.corpus}; {row.note}"
         )
@@ -103,14 +105,6 @@ def _number(value: float | None, row: SignatureRow) -> str:
     if value is None or np.isnan(value):
         return "-"
     return f"{value:.0f}" if row.figure == "Hz" else f"{value:.3f}"
-
-
-def _between(row: SignatureRow) -> str:
-    return f"[{_number(row.low, row)}, {_number(row.high, row)}]"
-
-
-def _published(row: SignatureRow) -> str:
-    return "-" if row.paper is None else " - ".join(dict.fromkeys(_number(one, row) for one in row.paper))
 
 
 Corpora = tuple[ClipSignatures | None, ClipSignatures | None]

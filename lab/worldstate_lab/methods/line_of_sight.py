@@ -4,6 +4,7 @@ import math
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Literal, Self
 
 import numpy as np
@@ -200,12 +201,15 @@ class OcSortRecovery:
 
     def _decide(self, trial: Trial) -> Decisions:
         images, time_s = Images.of(trial), trial.hops.time_s
-        held = [[one for one in tracks if self._holds(one)] for tracks in _moving_tracks(trial, images)]
-        rows = [
-            (hop, one.track, self._azimuth_rad(one), _area(one))
-            for hop, image in enumerate(images.of_hop)
-            for one in (held[image] if image >= 0 else ())
-        ]
+        # A box that flashed up once never was a track to coast on.
+        counts = attrgetter("certain" if self.reading == "stock" else "known")
+        held = [list(filter(counts, tracks)) for tracks in _moving_tracks(trial, images)]
+        rows = []
+        for hop, image in enumerate(images.of_hop):
+            for one in held[image] if image >= 0 else ():
+                left, top, right, bottom = one.box_px.tolist()
+                azimuth = float(self.camera.azimuth(0.5 * (left + right)))
+                rows.append((hop, one.track, azimuth, (right - left) * (bottom - top)))
         bearing = np.full(len(time_s), np.nan)
         # In the order of area, so that the largest box of a hop is the one that stays.
         for hop, _, azimuth_rad, _ in sorted(rows, key=lambda row: row[3]):
@@ -213,17 +217,6 @@ class OcSortRecovery:
         tracks = HopTable.of_rows(TRACK_COLUMNS, [(time_s[hop], track, at) for hop, track, at, _ in rows])
         found = np.isfinite(bearing)
         return Decisions.of(time_s, found, side=sides(bearing), bearing_rad=bearing, tracks=tracks)
-
-    def _holds(self, one: TrackedBox) -> bool:
-        # A box that flashed up once never was a track to coast on.
-        return one.certain if self.reading == "stock" else one.known
-
-    def _azimuth_rad(self, one: TrackedBox) -> float:
-        return float(self.camera.azimuth(0.5 * (one.box_px[0] + one.box_px[2])))
-
-
-def _area(one: TrackedBox) -> float:
-    return float(np.prod(one.box_px[2:] - one.box_px[:2]))
 
 
 def _moving_tracks(trial: Trial, images: Images) -> Iterator[list[TrackedBox]]:

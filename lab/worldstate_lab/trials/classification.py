@@ -13,7 +13,6 @@ from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_extraction import (
     FRONT,
     FRONT_LATER_S,
-    LabelledWindow,
     extract_features,
     feature_table,
     sample_windows,
@@ -186,7 +185,7 @@ def windows_from_recordings(takes: TakeList, folder: Path) -> tuple[FeatureTable
     names = {take.name for take in takes.training}
     if not names:
         return None
-    found = [window for window in sample_windows(takes.root)[0] if _recording_id(window) in names]
+    found = [window for window in sample_windows(takes.root)[0] if window.path.parent.name in names]
     path = folder / f"windows-{origin_of([str(takes.root.absolute()), sorted(names)])}.csv"
     if not path.is_file():
         array = choose_array(takes.root)
@@ -233,8 +232,3 @@ def model_from_windows(windows: FeatureTable, folder: Path, seed: int) -> Path:
         settings = TrainingSettings(seed=seed, repeats=1)
         save_model(path, train_model(table, settings, dataset="training windows", group="static"))
     return path
-
-
-def _recording_id(window: LabelledWindow) -> str:
-    """Return the folder name of the recording that a window was cut from."""
-    return window.path.parent.name

@@ -50,7 +50,11 @@ def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
     for number, sweep in enumerate(study.sweeps, start=1):
         # A condition without a camera is not of a family: the line would have one point.
         names = dict.fromkeys(row.condition.family for row in sweep.awareness.rows[1:])
-        families = {name: [_point(row) for row in sweep.family(name)] for name in names if name != OFF}
+        families = {
+            name: [(Value(1.0 - row.vision.value), Value(*row.awareness)) for row in sweep.family(name)]
+            for name in names
+            if name != OFF
+        }
         figure = awareness_figure(families, paper.value if paper else math.nan)
         figures.append(_of_detector(figure, sweep, number))
     return tuple(figures)
@@ -191,10 +195,6 @@ def _rain(sweep: DetectorSweep, number: int) -> Table:
 
 def _of_detector(figure: Figure, sweep: DetectorSweep, number: int) -> Figure:
     return replace(figure, name=f"{figure.name}_{number}", title=f"{figure.title}, {sweep.detector}")
-
-
-def _point(row: AwarenessRow) -> tuple[Value, Value]:
-    return Value(1.0 - row.vision.value), Value(*row.awareness)
 
 
 def _at(band: Band, place: tuple[int, ...]) -> Value:
