@@ -24,14 +24,14 @@ from worldstate.adapters.datasets.ovad import (
     OvadDataset,
 )
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.adapters.files.atomic import atomic_path, deferred_signals, write_text
+from worldstate.adapters.files.atomic import atomic_path, write_text
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
 from worldstate.simulation.camera.street_view import View, paint_street
 from worldstate.simulation.camera.vehicle_view import PAINTS, Car, add_car, with_parked_car
-from worldstate.simulation.parallel import in_processes
+from worldstate.simulation.parallel import deferred_signals, in_processes
 from worldstate.simulation.scene.junction import MOVING_SITES, PLACES, SITES, Site, place, place_of
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.presets import DEFAULT_PRESET, preset

@@ -125,7 +125,7 @@ def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track,
         azimuth_std_rad=std_rad,
         azimuth_rate_rad_s=None if hidden else mean[AZIMUTH_RATE],
         range_m=range_m,
-        **_place(track, range_m, hidden, site),
+        **_place(track, hidden, site),
         inverse_tta_hz=closing_hz,
         inverse_tta_std_hz=None if closing_hz is None else std[RADIAL_RATE],
         tta_s=time_to_arrival(closing_hz, std[RADIAL_RATE]),
@@ -183,12 +183,9 @@ def hidden_azimuth(
     return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, HIDDEN_BIAS_STD)
 
 
-def _place(track: Track, range_m: float | None, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
+def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
     """Return position, velocity and covariance where known, and when a hidden one comes into view."""
-    place, motion = track.place, track.motion
-    if place is None and range_m is not None:
-        azimuth_rad = motion.azimuth_rad
-        return {"position_m": (range_m * math.cos(azimuth_rad), range_m * math.sin(azimuth_rad), 0.0)}
+    place = track.place
     if place is None or not place.known:
         return {}
     x, y, vx, vy = place.mean.tolist()
