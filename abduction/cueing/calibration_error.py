@@ -10,8 +10,6 @@ from worldstate.ground.typing import FloatArray, IndexArray
 
 # Ten equal bins, as in the paper; more of them raise the sampling floor.
 BINS = 10
-# The mean is then known to a twentieth of its standard deviation between draws.
-_FLOOR_DRAWS = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,36 +108,6 @@ def expected_calibration_error(risk: ArrayLike, hazards: ArrayLike, bins: int = 
     """
     curve = reliability_curve(risk, hazards, bins)
     return float(curve.counts @ np.abs(curve.predicted - curve.observed) / curve.counts.sum())
-
-
-def calibration_error_sampling(
-    risk: ArrayLike, rng: np.random.Generator, bins: int = BINS, draws: int = _FLOOR_DRAWS
-) -> tuple[float, float]:
-    r"""Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
-
-    The mean is the sampling floor at this number of windows.
-
-    .. math:: ECE = \frac1n \sum_b \Big| \sum_{i \in b} (y_i - r_i) \Big|, \qquad P(y_i = 1) = r_i
-
-    Shapes: risk (n,).
-
-    References
-    ----------
-    J. Bröcker and L. A. Smith, "Increasing the reliability of reliability diagrams", Weather and Forecasting
-    22, 2007.
-
-    Examples
-    --------
-    >>> mean, deviation = calibration_error_sampling(np.full(400, 0.5), np.random.default_rng(0))
-    >>> round(mean, 2), round(deviation, 3)
-    (0.02, 0.016)
-    """
-    predicted, _ = _checked_sample(risk, np.zeros(np.shape(risk)))
-    index = _bin_index(predicted, bins)
-    labels = rng.random((draws, predicted.size)) < predicted
-    membership = (index[:, None] == np.arange(bins)).astype(np.float64)
-    errors = np.abs((labels - predicted) @ membership).sum(axis=1) / predicted.size
-    return float(errors.mean()), float(errors.std())
 
 
 def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:

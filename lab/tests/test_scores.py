@@ -12,11 +12,10 @@ from sklearn.metrics import brier_score_loss, roc_auc_score
 from worldstate_lab.evaluation.operating_curve import BASELINE, DETECTED, OURS, equal_detection
 from worldstate_lab.evaluation.scores import Score, paired
 from worldstate_lab.metrics.bearing_gating import gating_curve
-from worldstate_lab.metrics.intervals import stratified_draws
+from worldstate_lab.metrics.intervals import calibration_error_sampling, stratified_draws
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
 from worldstate.abduction.cueing.calibration_error import (
-    calibration_error_sampling,
     expected_calibration_error,
 )
 from worldstate.ground.errors import InvalidArgumentError

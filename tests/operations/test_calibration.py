@@ -8,11 +8,11 @@ from scipy.optimize import minimize
 from sklearn.calibration import calibration_curve
 from sklearn.isotonic import IsotonicRegression
 from sklearn.metrics import brier_score_loss, r2_score, roc_auc_score
+from worldstate_lab.metrics.intervals import calibration_error_sampling
 
 from worldstate.abduction.cueing.calibration_error import (
     brier_score,
     brier_skill,
-    calibration_error_sampling,
     expected_calibration_error,
     reliability_curve,
 )

@@ -17,7 +17,6 @@ import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import (
     brier_score,
-    calibration_error_sampling,
     expected_calibration_error,
 )
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
@@ -30,11 +29,11 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.metrics.approach_table import ApproachTable, alarm_outcome
+from worldstate.operations.metrics.approach_table import ApproachTable, onset_outcome, rising_edges
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS
-from worldstate_lab.metrics.intervals import deal_folds
+from worldstate_lab.metrics.intervals import calibration_error_sampling, deal_folds
 from worldstate_lab.metrics.stream_statistic import (
     StatisticSwitches,
     log_joint,
@@ -253,7 +252,7 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
         [one.risk for one in free], [one.risk[one.stream.before_sight()] for one in approaches]
     )
     found = ApproachTable(
-        [alarm_outcome(one.stream.time_s, one.alarm, one.stream.t0_s) for one in approaches],
+        [onset_outcome(one.stream.time_s[rising_edges(one.alarm)], one.stream.t0_s) for one in approaches],
         [one.alarm for one in free],
     ).figures()
     both = bool(approaches) and bool(free)

@@ -39,7 +39,6 @@ from scipy.special import bdtrc
 
 from worldstate.abduction.cueing.calibration_error import (
     brier_score,
-    calibration_error_sampling,
     expected_calibration_error,
 )
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
@@ -59,7 +58,13 @@ from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
 from worldstate_lab.metrics.by_group import auroc_by_group, macro, rate, worst_rate
-from worldstate_lab.metrics.intervals import DRAWS, middle, paired_gains, recording_draws
+from worldstate_lab.metrics.intervals import (
+    DRAWS,
+    calibration_error_sampling,
+    middle,
+    paired_gains,
+    recording_draws,
+)
 
 # The floor belongs to the risks: another seed in every run would only add noise to it.
 FLOOR_SEED = 0

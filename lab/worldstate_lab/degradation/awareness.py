@@ -13,7 +13,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import (
     SECONDS_PER_HOUR,
-    alarm_outcome,
+    onset_outcome,
     poisson_interval,
     rising_edges,
 )
@@ -192,7 +192,7 @@ def _judge(others: Sequence[Staged], prior: Sequence[float], hops: int) -> Calla
 def _row(state: Condition, judged: Sequence[_Judged], counts: _Counts) -> AwarenessRow:
     free = [one for one in judged if one.recording.hazard_free]
     outcomes = [
-        alarm_outcome(one.recording.time_s, one.alarm, one.recording.t0_s)
+        onset_outcome(one.recording.time_s[rising_edges(one.alarm)], one.recording.t0_s)
         for one in judged
         if not one.recording.hazard_free
     ]

@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.abduction.cueing.calibration_error import BINS
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
@@ -245,3 +246,37 @@ def deal_folds(
     # Dealing goes on where the last stratum stopped, or the first folds would collect every remainder.
     fold_of[order] = np.arange(len(labels)) % min(*counts, folds)
     return fold_of
+
+
+# The mean is then known to a twentieth of its standard deviation between draws.
+_FLOOR_DRAWS = 400
+
+
+def calibration_error_sampling(
+    risk: ArrayLike, rng: np.random.Generator, draws: int = _FLOOR_DRAWS
+) -> tuple[float, float]:
+    r"""Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
+
+    The mean is the sampling floor at this number of windows.
+
+    .. math:: ECE = \frac1n \sum_b \Big| \sum_{i \in b} (y_i - r_i) \Big|, \qquad P(y_i = 1) = r_i
+
+    Shapes: risk (n,).
+
+    References
+    ----------
+    J. Bröcker and L. A. Smith, "Increasing the reliability of reliability diagrams", Weather and Forecasting
+    22, 2007.
+
+    Examples
+    --------
+    >>> mean, deviation = calibration_error_sampling(np.full(400, 0.5), np.random.default_rng(0))
+    >>> round(mean, 2), round(deviation, 3)
+    (0.02, 0.016)
+    """
+    predicted = finite_array("risk", risk, (None,))
+    index = np.minimum((predicted * BINS).astype(np.intp), BINS - 1)
+    labels = rng.random((draws, predicted.size)) < predicted
+    membership = (index[:, None] == np.arange(BINS)).astype(np.float64)
+    errors = np.abs((labels - predicted) @ membership).sum(axis=1) / predicted.size
+    return float(errors.mean()), float(errors.std())

@@ -11,7 +11,7 @@ alarm of each hazard-free stream, and asks the table of both for its figures:
 (0.5, 1.5, 0.75, 1.0)
 
 A detection is defined in two ways, and each kind of data keeps its own. A recording holds one approach,
-and the first *onset* counts: `alarm_outcome`. In a stream an alarm may stand since the approach before,
+and the first *onset* counts: `onset_outcome`. In a stream an alarm may stand since the approach before,
 and either side may be named; the first *hop* in alarm counts: `hop_outcome` in `stream_outcomes`. Onsets and
 hops more than five seconds before T0 belong to something else.
 """
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.abduction.signature.site_estimate import HOP_S
 from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import BoolArray, IndexArray
 
 Figures = dict[str, float | int | None]
 LONGEST_LEAD_S, AFTER_S = 5.0, 6.0
@@ -98,11 +98,6 @@ def onset_outcome(onsets_s: ArrayLike, t0_s: float) -> ApproachOutcome:
     early = lead_s > LONGEST_LEAD_S + SLACK_S
     counted = lead_s[(lead_s > SLACK_S) & ~early]
     return ApproachOutcome(float(counted.max(initial=0.0)), counted.size, int(early.sum()))
-
-
-def alarm_outcome(time_s: FloatArray, alarm: BoolArray, t0_s: float) -> ApproachOutcome:
-    """Return the outcome of the approach of a recording from its alarm at every hop, shapes (n,)."""
-    return onset_outcome(time_s[rising_edges(alarm)], t0_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

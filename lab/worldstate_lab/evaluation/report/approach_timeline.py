@@ -13,7 +13,7 @@ from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
 from worldstate.ground.errors import WorldstateError
 from worldstate.ground.typing import FloatArray, ImageArray
 from worldstate.operations.figure_style import BLUE, GREEN, PURPLE, RED
-from worldstate.operations.metrics.approach_table import alarm_outcome
+from worldstate.operations.metrics.approach_table import onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.evaluation.evaluation import ALPHA, Evaluation
 from worldstate_lab.evaluation.protocols import STANDING
@@ -73,7 +73,7 @@ def approach_section(found: Evaluation) -> Section:
 def leads_s(trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> FloatArray:
     """Return the lead of every approach and seed, NaN where it was not detected."""
     leads = [
-        alarm_outcome(said.time_s, said.alarm, trial.t0_s).lead_s
+        onset_outcome(said.time_s[rising_edges(said.alarm)], trial.t0_s).lead_s
         for answers in passes
         for trial, said in zip(trials, answers, strict=True)
         if not trial.hazard_free
