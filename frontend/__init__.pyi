@@ -15,12 +15,12 @@ from .bounds.cramer_rao import tone_crb_hz2 as tone_crb_hz2
 from .direction.bearing import Peak as Peak
 from .direction.bearing import find_peaks as find_peaks
 from .direction.feature import published_feature as published_feature
-from .direction.gcc import PairDelays as PairDelays
-from .direction.gcc import gcc_delays as gcc_delays
 from .direction.music import count_sources as count_sources
 from .direction.music import music_spectrum as music_spectrum
-from .direction.srp import srp_phat as srp_phat
-from .direction.srp import steered_power as steered_power
+from .direction.phat import PairDelays as PairDelays
+from .direction.phat import gcc_delays as gcc_delays
+from .direction.phat import srp_phat as srp_phat
+from .direction.phat import steered_power as steered_power
 from .ego_noise.ego_noise import EgoNoiseSettings as EgoNoiseSettings
 from .frame import AcousticFrame as AcousticFrame
 from .health.channel_health import ArrayHealth as ArrayHealth

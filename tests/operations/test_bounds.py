@@ -26,7 +26,7 @@ from worldstate.frontend.bounds.cramer_rao import (
     tone_crb_hz2,
 )
 from worldstate.frontend.direction.bearing import find_peaks
-from worldstate.frontend.direction.srp import srp_phat
+from worldstate.frontend.direction.phat import srp_phat
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError
 

@@ -15,7 +15,7 @@ from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.music import Subspace, music_spectrum
-from worldstate.frontend.direction.srp import steered_power
+from worldstate.frontend.direction.phat import steered_power
 from worldstate.frontend.ego_noise import ego_noise as whitening
 from worldstate.frontend.ego_noise.ego_noise import (
     EgoNoise,
