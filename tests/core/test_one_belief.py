@@ -69,7 +69,7 @@ def states(seed: int, *, sequence: bool, hops: int = 25) -> list[WorldState]:
 
 @pytest.mark.parametrize("sequence", [False, True])
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_hidden_is_at_least_every_risk_and_none_at_most_what_it_leaves(sequence: bool, seed: int) -> None:
     for state in states(seed, sequence=sequence):
         for cue in state.cues:
@@ -80,7 +80,7 @@ def test_hidden_is_at_least_every_risk_and_none_at_most_what_it_leaves(sequence:
 
 
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_chances_rise_with_the_horizon_and_stay_below_the_risk(seed: int) -> None:
     for state in states(seed, sequence=True):
         for cue in state.cues:
@@ -91,7 +91,7 @@ def test_chances_rise_with_the_horizon_and_stay_below_the_risk(seed: int) -> Non
 
 @pytest.mark.parametrize("sequence", [False, True])
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_an_advisory_stands_where_what_decides_does_or_is_held(sequence: bool, seed: int) -> None:
     for state in states(seed, sequence=sequence):
         likeliest = max((cue.risk for cue in state.cues), default=0.0)
@@ -112,7 +112,7 @@ def test_an_advisory_stands_where_what_decides_does_or_is_held(sequence: bool, s
 
 
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_single_windows_move_nothing_where_a_sequence_is_read(seed: int) -> None:
     """What a window of that source says is in its sequence already."""
     rng = np.random.default_rng(seed)
@@ -210,7 +210,7 @@ def test_a_hop_that_could_not_be_heard_moves_nothing_but_what_time_moves(sequenc
 
 
 @given(SEEDS, st.floats(0.2, 1.0))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_absence_counts_as_far_as_a_vehicle_would_have_been_heard(seed: int, share: float) -> None:
     """The odds of one that comes fall at most to the chance that it was masked."""
     rng = np.random.default_rng(seed)
