@@ -16,11 +16,9 @@ from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
 from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, Float32Array, FloatArray
+from worldstate.ground.values import LEAST_HEARD
 
 from .settings import ELEVATIONS_RAD, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
-
-# Share that could be heard below which a hop is left out of its window; `Heard.usable` has the same.
-_LEAST_HEARD = 0.2
 
 
 def hop_end(index: int, sample_rate_hz: float) -> int:
@@ -106,7 +104,7 @@ class HopSums:
         """Return the hop where noise leaves a share to be heard; below .2 its sums are empty."""
         if share >= self.share:
             return self
-        if share >= _LEAST_HEARD:
+        if share >= LEAST_HEARD:
             return replace(self, share=share, unheard=reason)
         arrays = ("heard", "power", "pairs", "energies")
         nothing = {name: np.zeros_like(getattr(self, name)) for name in arrays}

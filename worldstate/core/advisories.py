@@ -47,18 +47,18 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     before_ns = max((one.stamp_ns for one in memory.rules), default=measurement.stamp_ns)
     domain = measurement.domain
     fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
-    last = next((one for one in memory.rules if one.source == measurement.source), None)
-    same = last is not None and last.heard.reason == measurement.heard.reason
+    last = memory.rule_of(measurement.source, measurement.stamp_ns)
+    same = last.heard.reason == measurement.heard.reason
     rule = SourceRule(
         measurement.source,
         measurement.stamp_ns,
         fault=fault,
         heard=measurement.heard,
-        heard_ns=last.heard_ns if last is not None and same else measurement.stamp_ns,
+        heard_ns=last.heard_ns if same else measurement.stamp_ns,
     )
     if not measurement.heard.usable and memory.instant is not None:
         # What could not be heard neither raises an alarm nor ends one: silence does, after a second.
-        return memory.with_rule(replace(rule, statistic=() if last is None else last.statistic))
+        return memory.with_rule(replace(rule, statistic=last.statistic))
     memory = ruled(memory, rule, measurement.signature, measurement.co_evidence, model)
     elapsed_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
     return _adapted(memory, elapsed_s, model.policy)
@@ -75,8 +75,7 @@ def ruled(
     ratio = posterior.log_lambda
     statistic, bounded = min(posterior.hidden_total, 1.0), ratio if math.isfinite(ratio) else None
     instant = Instant(statistic, bounded, heard.log_lambda)
-    before = next((one.statistic for one in memory.rules if one.source == rule.source), ())
-    kept = (*before, instant.statistic)[-model.policy.sustain_hops :]
+    kept = (*memory.rule_of(rule.source).statistic, instant.statistic)[-model.policy.sustain_hops :]
     return replace(memory.with_rule(replace(rule, statistic=kept)), instant=instant)
 
 
@@ -99,10 +98,12 @@ def advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None,
     side by itself. None stands beside a risk below .1.
     """
     every = raised_advisories(memory, model)
-    if not any(every):
-        return every
-    risks = published_belief(memory, model).risks
-    return tuple(one if risk >= LEAST_RISK else None for one, risk in zip(every, risks, strict=True))
+    return standing(every, published_belief(memory, model)) if any(every) else every
+
+
+def standing(raised: tuple[SideAdvisory | None, ...], sides: SideBelief) -> tuple[SideAdvisory | None, ...]:
+    """Return the advisories that no risk denies."""
+    return tuple(one if risk >= LEAST_RISK else None for one, risk in zip(raised, sides.risks, strict=True))
 
 
 def raised_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:

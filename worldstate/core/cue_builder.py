@@ -13,11 +13,11 @@ from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, Sen
 from .advisories import (
     MOST_NATS,
     SideAdvisory,
-    advisories,
     bounded_log_odds,
     claimed_nats,
     decided_log_odds,
     raised_advisories,
+    standing,
     why_none,
 )
 from .birth_death import hidden_on
@@ -33,11 +33,12 @@ def cues_of(memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...
     """Return one risk cue per side, none before the first measurement."""
     if memory.instant is None:
         return ()
-    told, evidence = advisories(memory, model), _evidence(memory, model)
+    sides, raised = published_belief(memory, model), raised_advisories(memory, model)
+    told, evidence = standing(raised, sides), _evidence(memory, model, raised)
     # All sides together: what is taken out of arrays once.
     times = _times(memory.sequence, [one is not None for one in told])
     rested_on = tuple(one for one in sensors if one.condition != "silent")
-    build = partial(_cue, memory, memory.instant, model, published_belief(memory, model), rested_on)
+    build = partial(_cue, memory, memory.instant, model, sides, rested_on)
     return tuple(map(build, range(len(told)), told, times, evidence))
 
 
@@ -106,9 +107,11 @@ def _times(kept: SequenceMemory | None, advised: list[bool]) -> list[_Times]:
     ]
 
 
-def _evidence(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
+def _evidence(
+    memory: Memory, model: FilterModel, raised: tuple[SideAdvisory | None, ...]
+) -> list[EvidenceTerms]:
     """Return what raises the advisory of each side: the sound, or messages where they alone do."""
-    heard, raised = _heard(memory, model), raised_advisories(memory, model)
+    heard = _heard(memory, model)
     by_message = [one is not None and one.announced for one in raised]
     if not any(by_message):
         return heard

@@ -11,9 +11,9 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.core import step
-from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds
+from worldstate.ground import LEAST_HEARD, InvalidArgumentError, in_range, integer_ns, nanoseconds
 from worldstate.ground.serialisation import Layout, decode, encode
-from worldstate.measurement import Heard, Measurement, Odometry, PositionScan
+from worldstate.measurement import Measurement, Odometry, PositionScan
 from worldstate.state import Context, Priors, WorldState
 
 from .advisories import update_advisories
@@ -116,7 +116,7 @@ class WorldFilter:
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings)
         heard = hearings(memory)
         # What could not be heard is no evidence, and no budget was measured without it.
-        deaf = heard is not None and not any(Heard(one.share).usable for one in heard)
+        deaf = heard is not None and all(one.share < LEAST_HEARD for one in heard)
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,

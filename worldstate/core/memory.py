@@ -35,7 +35,7 @@ class SourceRule:
 
     source: str
     stamp_ns: int  # Of its last measurement
-    # As many as the rule asks for, the last one last; none of what only announces.
+    # Of as many measurements as the rule asks for, the last one last.
     statistic: tuple[Probability, ...] = ()
     fault: str | None = None  # What was wrong with it then
     announced: tuple[Count, ...] = ()  # Sides on which its messages announce vehicles; empty of what hears
@@ -101,6 +101,11 @@ class Memory:
     def __post_init__(self) -> None:
         if not self.advised_ns:
             object.__setattr__(self, "advised_ns", (None,) * len(self.births))
+
+    def rule_of(self, source: str, start_ns: int = 0) -> SourceRule:
+        """Return what a source said last; of one that has said nothing, nothing since a start."""
+        first = SourceRule(source, start_ns, heard_ns=start_ns)
+        return next((one for one in self.rules if one.source == source), first)
 
     def with_rule(self, rule: SourceRule) -> "Memory":
         """Return the memory with what a source said last."""

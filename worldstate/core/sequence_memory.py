@@ -335,7 +335,7 @@ def informed(
             kept = SequenceMemory(first, reading.share, reading.margin_s, reading.alarm)
         kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
         said = states_of(at_prior(reading.groups, reading.share, kept.prior(context)), reading.share)
-        # By whatever else is heard, and by a vehicle just come into view on that side.
+        # Masked by whatever else is heard, or by a vehicle that has just come into view on that side.
         said = _as_heard(kept.states.alone, said, measurement.heard.share)
         masked = np.array(kept.since_emerged_ns(kept.stamp_ns)) <= _MASKED_NS
         said = np.where(masked[:, None], kept.states.alone, said)

@@ -44,8 +44,7 @@ def sound_weight(memory: Memory, measurement: Measurement, start_ns: int, settin
 
     .. math:: \kappa = \min(dt / T, 1), \quad T = window
     """
-    stamps_ns = (one.stamp_ns for one in memory.rules if one.source == measurement.source)
-    before_ns = next(stamps_ns, start_ns)
+    before_ns = memory.rule_of(measurement.source, start_ns).stamp_ns
     return min(max(seconds(measurement.stamp_ns - before_ns), 0.0) / settings.window_s, 1.0)
 
 

@@ -17,6 +17,9 @@ AngleT = TypeVar("AngleT", float, FloatArray)
 # What a co-evidence channel last said of an entity: found, searched for and not found, not searched for.
 Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 
+# Share of a hop that could be heard below which nothing of it is read.
+LEAST_HEARD = 0.2
+
 NANOSECONDS_PER_SECOND = 1_000_000_000
 # Of signed 64 bits, less an hour: what is derived from a stamp, as the end of an advisory, is written too.
 _MOST_NS = (1 << 63) - 3600 * NANOSECONDS_PER_SECOND

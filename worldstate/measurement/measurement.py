@@ -14,9 +14,8 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.checks import all_of, check_fields, named, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
-from worldstate.ground.values import NotUsable, integer_ns
+from worldstate.ground.values import LEAST_HEARD, NotUsable, integer_ns
 
-_LEAST_HEARD = 0.2
 _ABOVE_ZERO, _MOST = math.ulp(0.0), sys.float_info.max
 _AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (_ABOVE_ZERO, 1e3)
 _SIGHTING = {
@@ -121,7 +120,7 @@ class Heard:
     @property
     def usable(self) -> bool:
         """Whether the hop is read at all: below a fifth what it does not hold says nothing."""
-        return self.share >= _LEAST_HEARD
+        return self.share >= LEAST_HEARD
 
     def __post_init__(self) -> None:
         check_fields(self, share=(0.0, 1.0), reason=str | None)

@@ -14,7 +14,7 @@ from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.frontend.settings import HOP_RATE_HZ, WINDOW_HOPS
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground import InputFileError, seconds
+from worldstate.ground import LEAST_HEARD, InputFileError, seconds
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import (
     BLUE,
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 _SIDE_COLORS = (PURPLE, GREEN, ORANGE, SKY)
 # States further apart are not joined by a line: nothing was heard between them.
 _GAP_S = 0.25
-_UNHEARD = 0.2  # Below, nothing of a hop is read
 # An entity is drawn where it more likely exists than not.
 _LIKELY = 0.5
 # A GIF this large has 576 x 416 pixels: labels of 9 points are still read in a browser.
@@ -142,7 +141,7 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     if any(foreign):
         draw_bars(axes, _times(states), foreign, len(names), "0.6", height=0.6)
         names.append("foreign sound")
-    deaf = [any(one.share < _UNHEARD for one in state.heard or ()) for state in states]
+    deaf = [any(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]
     if any(deaf):
         draw_bars(axes, _times(states), deaf, len(names), "0.3", height=0.6)
         names.append("could not be heard")
