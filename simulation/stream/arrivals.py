@@ -20,7 +20,6 @@ from worldstate.simulation.scene.vehicle import EgoMotion
 from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
 from .settings import HAZARDS, StreamSettings, Traffic
 
-HEADWAY_S = (1.5, 4.0)
 TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
 LONGEST_QUEUE = 8
 AROUND_DRIVE_S = 20.0  # a vehicle that arrives so long before or after a drive is still heard in it
@@ -118,7 +117,7 @@ def _arrival(
         if signal:
             driver = replace(driver, reach_m=EARSHOT_M[1])  # louder than its tyres
         leader = MANOEUVRES[flow](driver, rng)
-        late_s = TOGETHER_S * rng.standard_normal() if flow == "both" and arm == RIGHT else 0.0
+        late_s = _later(traffic, rng) if flow == "both" and arm == RIGHT else 0.0
         yield replace(_event(flow, arrival_s + late_s, leader), signal=signal)
         if arm is None:
             continue
@@ -129,8 +128,15 @@ def _arrival(
                 break
             # A follower on a bicycle would not keep up: it is a vehicle of the leader's kind or a car.
             kind = leader.motion.kind if rng.random() < 0.5 else vehicle_kind("light")
-            last = behind(last, rng.uniform(*HEADWAY_S), kind)
+            last = behind(last, rng.uniform(*traffic.headway_s), kind)
             yield _event("follows", arrival_s + late_s, last)
+
+
+def _later(traffic: Traffic, rng: np.random.Generator) -> float:
+    """Draw how much later the one from the right comes, seconds."""
+    if traffic.apart_s is None:
+        return TOGETHER_S * float(rng.standard_normal())
+    return float(rng.uniform(-traffic.apart_s, traffic.apart_s))
 
 
 def draw_sounds(settings: StreamSettings, microphones: int, rng: np.random.Generator) -> list[SoundEvent]:

@@ -33,6 +33,8 @@ class Traffic:
     per_hour: Mapping[str, float]  # Of each of `FLOWS`; those not named never come
     follower_share: float = 0.0  # Probability that a vehicle out of a hidden arm has another one behind it
     evenly: bool = False  # Whether arrivals out of hidden arms take turns instead of meeting by chance
+    headway_s: tuple[float, float] = (1.5, 4.0)  # Between one that leads and the next behind it
+    apart_s: float | None = None  # At most between two from both sides, either first; None: a normal .7 s
     kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normed
     sounds: Mapping[str, float] = field(default_factory=dict)  # What else sounds, by kind, an hour
     signals: Mapping[str, float] = field(default_factory=dict)  # Shares of the vehicles that warn, by signal
@@ -47,6 +49,10 @@ class Traffic:
             for key, number in getattr(self, name).items():
                 one_of(name, key, known)
                 in_range(f"{name}[{key!r}]", number, 0.0, most)
+        in_range("headway_s[0]", self.headway_s[0], 0.1, self.headway_s[1])
+        in_range("headway_s[1]", self.headway_s[1], self.headway_s[0], 10.0)
+        if self.apart_s is not None:
+            in_range("apart_s", self.apart_s, 0.0, 10.0)
         # A share of one would make a queue without an end.
         in_range("follower_share", self.follower_share, 0.0, 0.9)
         in_range("kinds: sum of the shares", sum(self.kinds.values()), 1e-6, 1e6)
@@ -76,6 +82,15 @@ TRAFFICS = {
             "approaches",
             {"left": 125 / 3, "right": 125 / 3, "both": 125 / 3, "queue": 25} | _OTHERS,
             evenly=True,
+        ),
+        # As above with arrivals as streets have them: arms that do not know of each other, and followers as
+        # near as a vehicle's length allows. Of 36 in 14.4 minutes 17 come alone, 12 from both sides.
+        Traffic(
+            "pairs",
+            {"left": 35, "right": 35, "both": 50, "queue": 30} | _OTHERS,
+            evenly=True,
+            headway_s=(0.8, 6.0),
+            apart_s=6.0,
         ),
         Traffic("no-hazard", _OTHERS),
         Traffic("empty", {}),

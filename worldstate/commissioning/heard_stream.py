@@ -30,13 +30,13 @@ from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.truth import VehicleTruth
 from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
-APPROACHES, HAZARD_FREE = "approaches", "no-hazard"
+APPROACHES, HAZARD_FREE = "pairs", "no-hazard"
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
 # Of a moving ego a stream is many drives, each with a seed of its own. An approach is judged to six seconds
-# after its last vehicle, and a second one of a queue comes four seconds after the first.
-DRIVES_S, DRIVES_EACH = {APPROACHES: 18.0, HAZARD_FREE: 12.0}, 1000
+# after its last vehicle, and a second one comes up to six seconds after the first.
+DRIVES_S, DRIVES_EACH = {APPROACHES: 20.0, HAZARD_FREE: 12.0}, 1000
 MOUNTING = 2  # Number of the junction where wrong mountings are heard
 
 
