@@ -12,12 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from worldstate.adapters.acoustic import heard_of
 from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.frame import AcousticFrame
+from worldstate.frontend.levels import NoiseMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import InvalidArgumentError, in_range
@@ -292,6 +295,12 @@ def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
 
 def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.ndarray]:
     looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
+    # The meter belongs to what watches microphones, which is off here; levels alone it reads the same.
+    meter, excess_db = NoiseMeter(), list[float]()
+    for one in frames:
+        meter.push(one.band_log_energy, float(one.feature.mean()))
+        excess_db.append(meter.excess_db)
+    heard = [heard_of(replace(one, excess_db=db)) for one, db in zip(frames, excess_db, strict=True)]
     return {
         "time_s": np.array([one.stamp_ns for one in frames]) * 1e-9,
         "feature": np.array([one.feature for one in frames], np.float32),
@@ -301,6 +310,10 @@ def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.
         "band_log_energy": np.array([one.band_log_energy for one in frames], np.float32),
         "looming_hz": np.array([np.nan if one is None else one.inverse_tta_hz for one in looming]),
         "looming_std_hz": np.array([np.nan if one is None else one.std_hz for one in looming]),
+        "direct": np.array([direct_probability(one.peaks) for one in frames]),
+        "excess_db": np.array(excess_db),
+        "heard": np.array([one.share for one in heard]),
+        "unheard": np.array([one.reason or "" for one in heard], np.str_),
         "middle": _last_hops(middle, [one.sample_index for one in frames]),
     }
 

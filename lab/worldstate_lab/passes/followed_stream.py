@@ -26,7 +26,13 @@ from worldstate.commissioning.sequence_training import StreamTruth, stream_truth
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, CoEvidenceChannel, Measurement
+from worldstate.measurement.measurement import (
+    Approach,
+    Bearing,
+    CoEvidenceChannel,
+    Heard,
+    Measurement,
+)
 from worldstate.state import Entity, WorldState
 from worldstate.state.context import Context
 
@@ -59,6 +65,7 @@ def measurements(
             bearing=_bearing(heard, i),
             approach=_approach(heard, i),
             sequence=reading if i + 1 >= LEAST_HOPS else TOO_FEW,
+            heard=Heard(float(hops.heard[i]), str(hops.unheard[i]) or None),
         )
         yield asked_again(measurement, vision)
 
