@@ -33,13 +33,14 @@ from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.truth import VehicleTruth
 from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
-APPROACHES, HAZARD_FREE = "pairs", "no-hazard"
+# Hazards one after another; a moving ego has one a drive, with the arrivals that its model learned.
+PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
 # Of a moving ego a stream is many drives, each with a seed of its own. An approach is judged to six seconds
-# after its last vehicle, and a second one comes up to six seconds after the first.
-DRIVES_S, DRIVES_EACH = {APPROACHES: 20.0, HAZARD_FREE: 12.0}, 1000
+# after its last vehicle, and a second one of a queue comes four seconds after the first.
+DRIVES_S, DRIVES_EACH = {APPROACHES: 18.0, HAZARD_FREE: 12.0}, 1000
 MOUNTING = 2  # Number of the junction where wrong mountings are heard
 
 
@@ -73,7 +74,7 @@ class CommissionSettings:
     --------
     >>> plan = learned_streams(CommissionSettings(junctions=2))
     >>> [f"{one.site.name} {one.traffic.name} {one.minutes:g}" for one in plan][:2]
-    ['SA101 approaches 7.2', 'SA101 no-hazard 6']
+    ['SA101 pairs 7.2', 'SA101 no-hazard 6']
     """
 
     junctions: int = 16
@@ -141,7 +142,8 @@ def _streams(
 ) -> list[StreamSettings]:
     """Return two streams of every numbered junction, or as many drives as last so long."""
     found: list[StreamSettings] = []
-    kinds = ((APPROACHES, approach_minutes), (HAZARD_FREE, hazard_free_minutes))
+    hazards = APPROACHES if settings.moving_ego else PAIRS
+    kinds = ((hazards, approach_minutes), (HAZARD_FREE, hazard_free_minutes))
     for (number, name), (traffic, minutes) in product(names.items(), kinds):
         own = first_seed + number + SEEDS_EACH * settings.seed
         whole = StreamSettings(
