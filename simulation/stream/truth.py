@@ -181,9 +181,10 @@ def describe_events(
             "place_m": list(one.sound.place_m) if one.sound.has_place else None,
             "first_s": round(one.start_s + one.sound.start_s, 3),
             "last_s": round(one.start_s + one.sound.end_s, 3),
-            "loudness_db": round(float(loudness_db[number].max()), 1) if loudness_db[number].size else None,
+            "loudness_db": round(float(levels[0].max()), 1) if levels.size else None,
         }
         for number, one in enumerate(sounds, start=len(vehicles))
+        for levels in [loudness_db[number]]
     ]
     return {"vehicles": told, "sounds": others}
 
@@ -240,7 +241,7 @@ def rows_csv(vehicles: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatAr
     writer.writerow(COLUMNS)
     for one in vehicles:
         places = np.column_stack([one.x_m, one.y_m, one.speed_mps]).round(2).tolist()
-        loudness, seen = loudness_db[one.number].round(1).tolist(), one.in_view.astype(int).tolist()
+        loudness, seen = loudness_db[one.number][0].round(1).tolist(), one.in_view.astype(int).tolist()
         left = ["" if value is None else value for value in one.time_to_visible_s()]
         for row in zip(one.time_s.tolist(), places, seen, left, loudness, strict=True):
             writer.writerow([row[0], one.number, *row[1], *row[2:]])

@@ -20,7 +20,7 @@ from worldstate.adapters.datasets.ovad import Recording
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.kinds import LIGHT
@@ -31,6 +31,7 @@ from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver
 from worldstate.simulation.stream.rendering import (
     EVENT,
     OVERLAP_S,
+    EventSound,
     StreamScene,
     draw_microphones,
     event_sound,
@@ -100,6 +101,32 @@ def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() 
     at = round((rows[50] - 2.0) * 3000)
     around = alone.pressure_pa[:, at - 150 : at + 150].astype(float)
     assert levels[50] == pytest.approx(10 * np.log10((around**2).mean() / 4e-10), abs=0.02)
+
+
+@pytest.mark.parametrize("later_s", [1.5, 4.0])
+def test_what_a_second_vehicle_adds_is_the_difference_of_scenes_with_it_and_without(later_s: float) -> None:
+    """10 log10(1 + p2 / (p1 + background)) in the band, half a second each, of vehicles rendered apart."""
+    scene = scene_of(16.0 / 60.0)
+    events = [event_at(1.0), event_at(1.0 + later_s, "right")]
+    (empty,), (first,), (both,) = (list(render_blocks(scene, some)) for some in ((), events[:1], events))
+
+    def halves(level_db: FloatArray, rows_s: FloatArray) -> FloatArray:
+        power = np.zeros(160)
+        power[np.rint(rows_s * 10).astype(int)] = 10.0 ** (level_db / 10.0)
+        return power.reshape(-1, 5).mean(axis=1)
+
+    every_s = 0.1 * np.arange(160)
+    background, one, two = (
+        halves(loudness_db(EventSound(0, block.pressure_pa), every_s, 6000.0, banded=True), every_s)
+        for block in (empty, first, both)
+    )
+    p1, p2 = (
+        halves(both.loudness_db[number][1], row_times(event, scene.settings))
+        for number, event in enumerate(events)
+    )
+    added = 10.0 * np.log10(1.0 + p2 / (p1 + background))
+    assert (added > 6.0).sum() >= 4 and (added < 0.5).sum() >= 4
+    np.testing.assert_allclose(added, 10.0 * np.log10(two / one), atol=0.5)
 
 
 def test_a_signal_is_heard_over_its_vehicle_and_leaves_it_as_it_is() -> None:

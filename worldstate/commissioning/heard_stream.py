@@ -192,7 +192,7 @@ class HeardStream:
 
     hops: HopTable  # One row a hop: `AcousticFrame` by columns, NaN where something was refused
     vehicles: HopTable  # One row a vehicle: flow, kind, arm, T0 as `entry_s` (NaN: never comes into view)
-    rows: HopTable  # One row a vehicle and tenth of a second: time, place, in view, loudness
+    rows: HopTable  # One row a vehicle and .1 s: time, place, in view, how loud, in `BAND_HZ` too
 
     def row_hops(self) -> tuple[IndexArray, BoolArray]:
         """Return the number of the hop of every row of `rows`, and which of these hops there are."""
@@ -349,7 +349,8 @@ def _truth(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray])
             "x_m": distance * np.cos(azimuth),
             "y_m": distance * np.sin(azimuth),
             "in_view": _joined([one.in_view for one in every]).astype(np.bool_),
-            "loudness_db": _joined([loudness_db[one.number] for one in every]),
+            "loudness_db": _joined([loudness_db[one.number][0] for one in every]),
+            "band_db": _joined([loudness_db[one.number][1] for one in every]),
         }
     )
     return vehicles, rows
