@@ -10,7 +10,7 @@ from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, open_sound
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.frontend.stream import AcousticFrame
-from worldstate.ground.values import NotUsable, seconds
+from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
 
@@ -214,11 +214,7 @@ def measure_steps(
             uncalibrated=source.settings.uncalibrated,
         )
         front_end, since_ns = adapter.front_end, -1 if source.before is None else source.world().stamp_ns
-        rate_hz, taken = audio.sample_rate_hz, 0
-        for block in audio.blocks(max(int(rate_hz / BLOCKS_PER_SECOND), 1)):
-            if source.engine is not None:
-                front_end.follow_engine(source.engine.at(seconds(source.start_ns) + taken / rate_hz))
-                taken += len(block)
+        for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in front_end.process(block):
                 # What the belief to go on from has taken in already only fills the windows.
                 if frame.stamp_ns <= since_ns:

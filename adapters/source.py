@@ -18,7 +18,6 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.checkpoint_file import Checkpoint
-from worldstate.adapters.files.odometry_file import EngineSpeed
 from worldstate.core.filter import WorldFilter
 from worldstate.core.fixed_lag import Timed
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -148,8 +147,6 @@ class Source:
         measured.
     start_ns : int
         Time of the first sample on the clock of that belief.
-    engine : EngineSpeed or None
-        Of the own vehicle, whose lines are then cancelled together with its learned noise.
     guard : DomainGuard or None
         Tells sounds that the model was not made for.
     road_users : RoadUserModel or None
@@ -195,7 +192,6 @@ class Source:
     degradation: float | Callable[[int], float] = 0.0
     before: Checkpoint | None = None
     start_ns: int = 0
-    engine: EngineSpeed | None = None
     guard: DomainGuard | None = None
     road_users: RoadUserModel | None = None
     sequence: SequenceModel | NotUsable | None = None

@@ -18,7 +18,7 @@ from worldstate.adapters.files.acoustic_domain import array_of, states_budget
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model
-from worldstate.adapters.files.odometry_file import EngineSpeed, OdometryLog, read_engine
+from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
@@ -58,7 +58,6 @@ def open_source(
     sides: SidePatterns | None = None,
     resume: Path | str | Checkpoint | None = None,
     start_s: float = 0.0,
-    engine: Path | str | EngineSpeed | None = None,
     ego: OdometryLog | None = None,
     others: Sequence[OtherModality] = (),
     settings: ListenSettings | None = None,
@@ -98,8 +97,6 @@ def open_source(
     start_s : float
         Time of the first sample on the clock of that belief, for a recording that follows another; a stream
         with a clock of its own brings it.
-    engine : path or EngineSpeed, optional
-        Speed of the own engine, as `read_engine` reads it; its lines are cancelled, with `ego_noise` only.
     ego : OdometryLog, optional
         How the ego vehicle moves, in place of the one speed of the context.
     others : sequence of callables, optional
@@ -117,8 +114,7 @@ def open_source(
     InputFileError
         If a file is missing or damaged; the message names it.
     InvalidArgumentError
-        If the model holds no threshold for the budget, both detections and a detector are given, or an engine
-        without `ego_noise`.
+        If the model holds no threshold for the budget, or both detections and a detector are given.
     OutOfDomainError
         If the array is not that of the data set, or not the model's.
 
@@ -136,8 +132,6 @@ def open_source(
     (56, 0.05)
     """
     settings, context = settings or ListenSettings(), context or Context()
-    if engine is not None and not settings.ego_noise:
-        raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
     sound = as_sound(path)
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     moves = bool((ego and ego.moves) or (recording and recording.moving_ego) or context.ego_speed_mps)
@@ -150,7 +144,6 @@ def open_source(
         sides=sides,
         start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10))
         or (sound.start_ns if isinstance(sound, SoundStream) else 0),
-        engine=_read(engine, read_engine),
         others=tuple(others) if ego is None else (*others, ego.told.__iter__),
     )
     if recording is not None:

@@ -11,7 +11,6 @@ from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum, pair_sum_of
 from worldstate.frontend.direction.phat import steered_power
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, spanned
-from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
@@ -219,13 +218,9 @@ class HopSpectra:
         beams = [(row, self._srp) for row in self.beams]
         if chosen.feature:
             beams.append((self._feature_beams, self._feature))
-        part = spanned(part for _, part in beams)
-        learned = bins[part]
-        engine = HarmonicCanceller(learned, sample_rate_hz, nfft)
-        frequencies = bin_frequencies_hz(learned, sample_rate_hz, nfft)
-        split = ElevationSplit.of(array, frequencies)
-        frames_per_s = 2.0 * sample_rate_hz / nfft
-        return EgoNoise(frames_per_s, array.n_microphones, beams, engine, split)
+        learned = bins[spanned(part for _, part in beams)]
+        split = ElevationSplit.of(array, bin_frequencies_hz(learned, sample_rate_hz, nfft))
+        return EgoNoise(2.0 * sample_rate_hz / nfft, array.n_microphones, beams, split)
 
     def _centre(self, heard: BoolArray) -> float:
         """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""

@@ -184,36 +184,6 @@ class FrontEnd:
         """
         self._ego_noise().weight = in_range("none_probability", none_probability, 0.0, 1.0)
 
-    def follow_engine(self, fundamental_hz: float | None, tolerance: float = 0.02) -> None:
-        """Set the fundamental f of the own engine, whose harmonics ``h f`` are cancelled; None stops it.
-
-        It is tracked between calls: one call per hop follows a changing speed best, an occasional one is
-        enough at a steady speed.
-
-        Parameters
-        ----------
-        fundamental_hz : float or None
-            Firing frequency, Hz: revolutions per second times half the number of cylinders (four-stroke), or
-            the last value of `track_fundamental`.
-        tolerance : float
-            Largest relative error of it, in [0, 0.5].
-
-        Raises
-        ------
-        InvalidArgumentError
-            Out of range, or `settings.ego_noise` is None.
-
-        Examples
-        --------
-        >>> from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-        >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
-        >>> front_end = FrontEnd(array, 8000, FrontEndSettings(ego_noise=EgoNoiseSettings()))
-        >>> front_end.follow_engine(60.0)
-        """
-        engine = self._ego_noise().engine
-        if engine is not None:
-            engine.follow(fundamental_hz, tolerance)
-
     def _ego_noise(self) -> EgoNoise:
         if self._spectra.ego_noise is None:
             raise InvalidArgumentError("settings.ego_noise: expected EgoNoiseSettings, got None")

@@ -112,10 +112,8 @@ class CarSensors:
         By name, in the order of the file; positions relative to the array.
     setups : mapping of str to CameraSetup
         What belongs to each of the cameras.
-    model, odometry, engine_rpm : Path, optional
-        Model file, motion of the vehicle and speed of its engine.
-    firings_per_turn : float
-        Of that engine: half its cylinders.
+    model, odometry : Path, optional
+        Model file and motion of the vehicle.
     measurements : mapping of str to Path
         What other sensors recorded, such as a radar, by the name of the part that reads it.
     crossing_m : float
@@ -127,8 +125,6 @@ class CarSensors:
     setups: Mapping[str, CameraSetup] = field(default_factory=dict)
     model: Path | None = None
     odometry: Path | None = None
-    engine_rpm: Path | None = None
-    firings_per_turn: float = 2.0
     measurements: Mapping[str, Path] = field(default_factory=dict)
     crossing_m: float = 9.0
 
@@ -156,8 +152,8 @@ def read_car(path: str | Path) -> CarSensors:
     mounted at ``"position_m"`` with ``"yaw_deg"``, ``"pitch_deg"`` and ``"roll_deg"`` (`Mounting`). Cameras
     are as `read_camera` reads them, with a ``"name"`` and the keys of `CameraSetup`: ``"detections"``,
     ``"image_rate_hz"``, ``"miss_rates"``, ``"classes"``, ``"min_score"``, ``"min_box_px"`` and ``"labels"``.
-    ``"model"``, ``"odometry"``, ``"engine": {"rpm", "firings_per_turn"}``, ``"measurements": {NAME: FILE}``
-    and ``"crossing_m"`` are those of `CarSensors`. Every key is optional; files lie beside the car file.
+    ``"model"``, ``"odometry"``, ``"measurements": {NAME: FILE}`` and ``"crossing_m"`` are those of
+    `CarSensors`. Every key is optional; files lie beside the car file.
 
     Parameters
     ----------
@@ -278,14 +274,6 @@ class _CameraEntry(CameraRecord):
 
 
 @dataclass(frozen=True, slots=True)
-class _Engine:
-    """What a car file holds of its engine."""
-
-    rpm: str
-    firings_per_turn: float = field(default=2.0, metadata=ADDED)
-
-
-@dataclass(frozen=True, slots=True)
 class _CarFile:
     """What a car file holds."""
 
@@ -294,7 +282,6 @@ class _CarFile:
     name: str | None = None
     model: str | None = None
     odometry: str | None = None
-    engine: _Engine | None = None
     measurements: Mapping[str, str] = field(default_factory=dict, metadata=ADDED)
     crossing_m: float = field(default=9.0, metadata=ADDED)
 
@@ -303,7 +290,7 @@ class _CarFile:
         if len(self.cameras) > MOST_CAMERAS:
             got = len(self.cameras)
             raise InvalidArgumentError(f"car.cameras: expected at most {MOST_CAMERAS}, got {got}")
-        folder, engine = path.parent, self.engine
+        folder = path.parent
         array, cameras, setups = None if self.array is None else self.array.array(path), {}, {}
         for number, record in enumerate(self.cameras):
             where = f"car.cameras[{number}]"
@@ -313,15 +300,12 @@ class _CarFile:
                 origin_m = (0.0, 0.0, 0.0) if self.array is None else self.array.position_m
                 cameras[record.name] = _relative(record, origin_m)
                 setups[record.name] = record.setup(folder)
-        firings = 2.0 if engine is None else engine.firings_per_turn
         return CarSensors(
             array,
             cameras,
             setups,
             model=_beside(folder, self.model),
             odometry=_beside(folder, self.odometry),
-            engine_rpm=None if engine is None else folder / engine.rpm,
-            firings_per_turn=in_range("car.engine.firings_per_turn", firings, 0.1, 100.0),
             measurements={name: folder / file for name, file in self.measurements.items()},
             crossing_m=in_range("car.crossing_m", self.crossing_m, 1.0, 100.0),
         )

@@ -34,8 +34,6 @@ from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.stft import whiten
 from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, FloatArray
 
-from .harmonic_cancellation import HarmonicCanceller
-
 _TINY = np.float32(1e-30)
 # Hops of a lower weight are not learned: a likely source must not enter.
 _LEAST_WEIGHT = 0.5
@@ -92,11 +90,9 @@ class EgoNoise:
         frames_per_s: float,
         n_microphones: int,
         beams: Sequence[tuple[Steering, slice]],
-        engine: HarmonicCanceller | None = None,
         elevation_split: "ElevationSplit | None" = None,
     ) -> None:
         self.weight = 0.0
-        self.engine = engine
         self.ego_share = 0.0
         self._split = elevation_split
         self._beams = [WhitenedBeams(plain) for plain, _ in beams]
@@ -122,15 +118,13 @@ class EgoNoise:
         return self._covariance.n_frames
 
     def process(self, spectra: Complex64Array) -> list[tuple[Complex64Array, Steering]]:
-        r"""Cancel, learn and whiten the frames of a hop (frames, bins, M), phase transform included.
+        r"""Learn and whiten the frames of a hop (frames, bins, M), phase transform included.
 
-        .. math:: y = \hat R^{-1/2}\, (x - \ell), \qquad Z_m = y_m / |y_m|
+        .. math:: y = \hat R^{-1/2} x, \qquad Z_m = y_m / |y_m|
 
-        with the engine lines l and the covariance R learned so far, shrunk by the share of the street.
+        with the covariance R learned so far, shrunk by the share of the street.
         """
         inside = spectra[:, self._bins]
-        if self.engine is not None:
-            inside = self.engine.cancel(inside)
         self._learn(inside)
         self._refresh()
         whitened = self._whitened(inside)

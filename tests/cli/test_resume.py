@@ -1,4 +1,4 @@
-"""A run that goes on where another ended, the engine's speed, and the bearing in the snapshot."""
+"""A run that goes on where another ended, and the bearing in the snapshot."""
 
 import json
 
@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main
-from worldstate.ground.errors import InvalidArgumentError
 
 
 @pytest.mark.parametrize("follows", [False, True])
@@ -48,22 +45,3 @@ def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path
     stated = [s["bearing"] for s in whole if s["bearing"]]
     assert len(stated) > len(whole) / 2
     assert set(stated[0]) == {"azimuth_rad", "std_rad", "prominence"}
-
-
-def test_the_engine_is_followed_with_ego_noise_only(approach, tmp_path, capsys):
-    speed = tmp_path / "rpm.csv"
-    speed.write_text("time_s,rpm\n0,1500\n60,1500\n")
-    with pytest.raises(InvalidArgumentError, match="ego_noise"):
-        open_source(approach.folder, engine=speed)
-    source = open_source(approach.folder, engine=speed, settings=ListenSettings(ego_noise=True))
-    assert source.engine is not None
-    assert source.engine.at(3.0) == 50.0
-    car = tmp_path / "car.json"
-    car.write_text('{"engine": {"rpm": "rpm.csv", "firings_per_turn": 2}}')
-    words = ["run", str(approach.folder), "--ego-noise", "--car", str(car)]
-    assert main([*words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["hops"] > 50
-    for text in ("time_s,rpm\n", "time_s,rpm\n1,900\n1,900\n", "time_s,rpm\n0,fast\n", "time_s\n0\n"):
-        speed.write_text(text)
-        assert main(words) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1

@@ -76,8 +76,6 @@ FORMER_OPTIONS = {
     "--classes": f"classes, {_CAMERA_FILE}",
     "--onnx-model": "--detector FILE.onnx",
     "--labels": f"labels, {_CAMERA_FILE}",
-    "--engine-rpm": "engine in --car",
-    "--engine-lines": "engine in --car",
     "--forgetting": "--site-memory S",
     "--site-adaptation": "--site-memory S",
     "--no-site-adaptation": "--site-memory 0",

@@ -101,7 +101,6 @@ def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> Comman
 
 
 def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "Source":
-    from worldstate.adapters.files.odometry_file import read_engine
     from worldstate.adapters.own_parts import other_modality
     from worldstate.operations.recordings.car_cameras import with_cameras
 
@@ -120,7 +119,6 @@ def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "Sour
         start_s=arguments.start or 0.0,
         detector=None if detector is None else detector(),
         others=[other_modality("--measurements", text) for text in measured],
-        engine=None if car.engine_rpm is None else read_engine(car.engine_rpm, car.firings_per_turn),
     )
     return with_cameras(source, car, several) if several else source
 

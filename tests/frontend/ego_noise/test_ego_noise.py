@@ -1,4 +1,4 @@
-"""Ego-noise: the generator's physics, prewhitening and its definition, learning, engine lines, no harm."""
+"""Ego-noise: the generator's physics, prewhitening and its definition, learning, no harm."""
 
 from dataclasses import replace
 
@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from sklearn.covariance import OAS
 from sklearn.metrics import roc_auc_score
 
-from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.music import Subspace, music_spectrum
@@ -23,9 +22,8 @@ from worldstate.frontend.ego_noise.ego_noise import (
     shrunk_inverse_root,
     white_share,
 )
-from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.stft import StreamingStft, whiten
+from worldstate.frontend.spectra.stft import whiten
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.sound.ego_sound import ENGINE_M, ego_noise, ego_sound
@@ -255,7 +253,6 @@ def test_block_size_does_not_matter_while_learning(cuts: list[int]) -> None:
     whole, pieces = FrontEnd(ROOF, RATE, LEARNING), FrontEnd(ROOF, RATE, LEARNING)
     for front_end in (whole, pieces):
         front_end.learn_ego_noise(0.9)
-        front_end.follow_engine(64.0)
     frames = whole.process(sound)
     parts = [frame for block in np.split(sound, sorted(cuts)) for frame in pieces.process(block)]
     assert len(parts) == len(frames) > 5
@@ -381,91 +378,10 @@ def test_old_noise_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_it_has_to_be_asked_for() -> None:
     front_end = FrontEnd(ROOF, RATE, PLAIN)
-    for call in (lambda: front_end.learn_ego_noise(1.0), lambda: front_end.follow_engine(50.0)):
-        with pytest.raises(InvalidArgumentError, match="ego_noise"):
-            call()
+    with pytest.raises(InvalidArgumentError, match="ego_noise"):
+        front_end.learn_ego_noise(1.0)
     with pytest.raises(InvalidArgumentError, match="none_probability"):
         FrontEnd(ROOF, RATE, LEARNING).learn_ego_noise(1.2)
-
-
-# Engine lines.
-
-
-def comb(fundamental: np.ndarray, channels: int, rng: np.random.Generator) -> np.ndarray:
-    """Lines of unit mean square each, with phases of their own at every microphone, (n, channels)."""
-    cycles = np.cumsum(fundamental) / RATE
-    lines = np.zeros((len(fundamental), channels))
-    for order in range(3, 31):
-        lines += np.sqrt(2) * np.cos(2 * np.pi * (order * cycles[:, None] + rng.random(channels)))
-    return lines.astype(np.float32)
-
-
-def cancelled(sound: np.ndarray, told_hz: np.ndarray, tolerance: float = 0.01) -> np.ndarray:
-    """Spectra before, spectra after, hop by hop, the speed told every hop."""
-    stft, canceller = (
-        StreamingStft(sound.shape[1], NFFT, range(3, 30)),
-        HarmonicCanceller(range(3, 30), RATE, NFFT),
-    )
-    out = []
-    for k, block in enumerate(np.array_split(sound, len(sound) // 1600)):
-        canceller.follow(float(told_hz[min((k + 1) * 1600, len(told_hz) - 1)]), tolerance)
-        spectra = stft.push(block)
-        out.append(np.stack([spectra, canceller.cancel(spectra)]))
-    return np.concatenate(out, axis=1)
-
-
-def power_db(values: np.ndarray) -> float:
-    return float(10 * np.log10(np.square(np.abs(values)).mean()))
-
-
-@pytest.mark.parametrize(
-    ("drift_hz_per_s", "told_wrong"), [(0.0, 1.0), (0.0, 1.003), (1.5, 1.0), (-1.5, 1.002)]
-)
-def test_lines_go_and_the_rest_stays(drift_hz_per_s: float, told_wrong: float) -> None:
-    rng = np.random.default_rng(18)
-    fundamental = 52.0 + drift_hz_per_s * np.arange(4 * RATE) / RATE
-    lines = comb(fundamental, 8, rng)
-    noise = 2.0 * rng.standard_normal(lines.shape).astype(np.float32)
-    before, after = cancelled(lines + noise, told_wrong * fundamental)
-    (only_lines, _), (only_noise, _) = (cancelled(part, fundamental) for part in (lines, noise))
-    late = slice(len(before) // 2, None)
-    left = (after - only_noise)[late]
-    assert power_db(left) < power_db(only_lines[late]) - 12
-    assert power_db(before[late]) - power_db(after[late]) > 3
-
-
-def test_an_engine_whose_speed_is_heard_and_not_told() -> None:
-    rng = np.random.default_rng(22)
-    lines = comb(np.full(4 * RATE, 47.3), 8, rng)
-    noise = 2.0 * rng.standard_normal(lines.shape).astype(np.float32)
-    heard = track_fundamental((lines + noise)[: 2 * RATE, 0], RATE).frequency_hz[-1]
-    before, after = cancelled(lines + noise, np.full(len(lines), heard))
-    only_noise = cancelled(noise, np.full(len(lines), heard))[0]
-    late = slice(len(before) // 2, None)
-    assert power_db((after - only_noise)[late]) < power_db((before - only_noise)[late]) - 12
-
-
-def test_next_to_nothing_is_taken_where_there_is_no_engine() -> None:
-    sound = np.random.default_rng(19).standard_normal((3 * RATE, 8)).astype(np.float32)
-    before, after = cancelled(sound, np.full(len(sound), 52.0))
-    assert power_db(before) - power_db(after) < 0.1
-    assert power_db(before - after) < power_db(before) - 15
-
-
-def test_without_an_engine_the_spectra_are_handed_through() -> None:
-    spectra = np.ones((5, 10, 2), np.complex64)
-    canceller = HarmonicCanceller(range(3, 13), RATE, NFFT)
-    assert canceller.cancel(spectra) is spectra
-    canceller.follow(60.0)
-    assert canceller.fundamental_hz == 60.0
-    canceller.cancel(spectra)
-    canceller.follow(None)
-    assert canceller.fundamental_hz is None
-    assert canceller.cancel(spectra) is spectra
-    with pytest.raises(InvalidArgumentError, match="fundamental_hz"):
-        canceller.follow(5.0)
-    canceller.follow(60.0)
-    assert np.isfinite(canceller.cancel(np.zeros((5, 10, 2), np.complex64))).all()
 
 
 # What it is for.

@@ -23,7 +23,7 @@ CAR_HELP = """\
    "cameras": [{"name": "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90,
                 "position_m": [1.9, 0, 1.3], "stamp_offset_s": 0.04, "detections": "front.json"}],
    "model": "mine.json", "odometry": "odometry.csv", "measurements": {"radar": "radar.csv"},
-   "engine": {"rpm": "rpm.csv", "firings_per_turn": 2}, "crossing_m": 9}
+   "crossing_m": 9}
 Every key is optional. An option in its place counts before it; --camera NAME names one of its cameras."""
 DETECTIONS_HELP = """\
 --detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the

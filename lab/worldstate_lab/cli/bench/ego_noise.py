@@ -2,9 +2,7 @@
 
 56 channels, 47,998 Hz, nfft 512, half overlap, SRP bins only; BLAS pinned to one thread. The sound is white
 noise and a wave from below, so that it is whitened. What is timed is the processor time of `EgoNoise.process`
-and `levelled` less the phase transform that they replace, in three states: gate open, gate shut after
-learning, and gate open with an engine whose lines are cancelled; `engine_alone` is the difference that the
-engine makes.
+and `levelled` less the phase transform that they replace, with the gate open and shut after learning.
 """
 
 import argparse
@@ -17,7 +15,6 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit
-from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import Complex64Array, Float32Array
@@ -38,11 +35,11 @@ def ego_noise_times(seed: int) -> dict[str, Milliseconds]:
     spectra = [stft.push(np.roll(sound, 977 * k, axis=0)) for k in range(HOPS)]
     times = {"stft": [elapsed_ms(partial(stft.push, sound), time.process_time) for _ in spectra]}
     plain = [elapsed_ms(partial(whiten, heard[:, SRP]), time.process_time) for heard in spectra]
-    for name, engine, shut in (("learning", False, False), ("shut", False, True), ("engine", True, False)):
-        ego = _ego_noise(engine)
+    for name in ("learning", "shut"):
+        ego = _ego_noise()
         spent = []
         for k, heard in enumerate(spectra):
-            if shut and k == WARM_UP - 10:
+            if name == "shut" and k == WARM_UP - 10:
                 ego.weight = 0.0
             spent.append(elapsed_ms(partial(_processed, ego, heard), time.process_time))
         times[f"ego_noise_{name}"] = [a - b for a, b in zip(spent, plain, strict=True)]
@@ -57,15 +54,11 @@ def _sound(rng: np.random.Generator) -> Float32Array:
     return heard.astype(np.float32)
 
 
-def _ego_noise(engine: bool) -> EgoNoise:
+def _ego_noise() -> EgoNoise:
     array = roof_array_56()
     frequencies = bin_frequencies_hz(BINS, RATE, NFFT)[SRP]
     beams = Steering.towards(array, frequencies, np.radians(np.arange(-90.0, 91.0)))
-    canceller = HarmonicCanceller(BINS[SRP], RATE, NFFT)
-    if engine:
-        canceller.follow(50.0)
-    judge = ElevationSplit.of(array, frequencies)
-    ego = EgoNoise(2.0 * RATE / NFFT, 56, [(beams, SRP)], canceller, judge)
+    ego = EgoNoise(2.0 * RATE / NFFT, 56, [(beams, SRP)], ElevationSplit.of(array, frequencies))
     ego.weight = 1.0
     return ego
 
@@ -87,8 +80,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     # The mean: one hop in four carries the eigendecomposition.
     mean = {name: float(np.median([np.mean(r[name]) for r in rounds])) for name in rounds[0]}
     p99 = {name: float(np.median([np.percentile(r[name], 99) for r in rounds])) for name in rounds[0]}
-    for times in (mean, p99):
-        times["engine_alone"] = times["ego_noise_engine"] - times["ego_noise_learning"]
     ratios = {name: spent / mean["stft"] for name, spent in mean.items()}
     lines = [
         f"  {name:20s} {spent:7.3f} ms   p99 {p99[name]:7.3f}   {ratios[name]:5.2f} of the transform"
