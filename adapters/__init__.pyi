@@ -35,9 +35,9 @@ from .files.model_file import Model as Model
 from .files.model_file import Provenance as Provenance
 from .files.model_file import read_model as read_model
 from .files.model_file import save_model as save_model
-from .listen import Step as Step
-from .listen import listen_steps as listen_steps
-from .listen import measure_steps as measure_steps
+from .listener import Step as Step
+from .listener import listen_steps as listen_steps
+from .listener import measure_steps as measure_steps
 from .source import ListenSettings as ListenSettings
 from .source import Source as Source
 from .source_files import open_source as open_source

@@ -9,12 +9,10 @@ A package names them in its pyproject.toml, and the command line names one of th
 | `worldstate.measurements` | `MeasurementsPart` | ``--measurements NAME=FILE`` |
 """
 
-import heapq
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import partial
 from importlib.metadata import entry_points
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias
 
@@ -142,21 +140,6 @@ def other_modality(option: str, text: str) -> OtherModality:
     """Return what NAME=FILE reads, by the package that brings NAME."""
     name, path = part_and_target(option, text)
     return partial(_checked, load_part("worldstate.measurements", name, option), Path(path), name)
-
-
-class Waiting:
-    """Measurements of other modalities that wait for their time, oldest first."""
-
-    def __init__(self, others: Iterable[OtherModality], after_ns: int) -> None:
-        merged = heapq.merge(*(one() for one in others), key=attrgetter("stamp_ns"))
-        self._rest = (one for one in merged if one.stamp_ns > after_ns)
-        self._next = next(self._rest, None)
-
-    def until(self, stamp_ns: int) -> Iterator[Timed]:
-        """Yield what was measured up to a time and has not been yielded before."""
-        while self._next is not None and self._next.stamp_ns <= stamp_ns:
-            yield self._next
-            self._next = next(self._rest, None)
 
 
 def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Timed]:

@@ -10,7 +10,7 @@ from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import SidePatterns
 from worldstate.abduction.signature.domain_guard import DomainGuard
-from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
+from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, path_of
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
@@ -124,7 +124,7 @@ class Source:
         One microphone a channel, in the order of the channels.
     detections : DetectionLog or None
         What the camera reported, on the clock of the sound; None counts as not asked.
-    model : SignatureModel or EnsembleModel
+    model : Signature
         From features to likelihoods.
     policy : CueingPolicy
         Threshold, sustained rule and risk map.
@@ -181,7 +181,7 @@ class Source:
     sound: SoundInput
     array: MicrophoneArray
     detections: DetectionLog | None
-    model: AnySignature
+    model: Signature
     policy: CueingPolicy
     context: Context
     settings: ListenSettings = field(default_factory=ListenSettings)
@@ -224,7 +224,7 @@ class Source:
         if not isinstance(known, SequenceModel):
             return known
         history, street = (None, None) if before is None else (before.history, before.street)
-        listener = street_listener(self.model.domain, self.sides, street)
+        listener = street_listener(getattr(self.model, "domain", None), self.sides, street)
         return SequenceReader(known, history, listener)
 
     def camera_channel(self) -> VisionQuery:

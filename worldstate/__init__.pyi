@@ -7,8 +7,8 @@ from .adapters.acoustic import AcousticAdapter as AcousticAdapter
 from .adapters.camera.detections import DetectionFrame as DetectionFrame
 from .adapters.camera.pinhole import PinholeCamera as PinholeCamera
 from .adapters.files.model_file import read_model as read_model
-from .adapters.listen import listen as listen
-from .adapters.listen import listen_steps as listen_steps
+from .adapters.listener import listen as listen
+from .adapters.listener import listen_steps as listen_steps
 from .adapters.source import ListenSettings as ListenSettings
 from .adapters.source_files import open_source as open_source
 from .belief.settings import FilterSettings as FilterSettings

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.listen import Step, listen_steps
+from worldstate.adapters.listener import Step, listen_steps
 from worldstate.adapters.source import Source
 from worldstate.ground.errors import InvalidArgumentError
 

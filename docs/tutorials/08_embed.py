@@ -29,7 +29,7 @@ def main(out: Path, size: str = "full") -> None:
     settings = DatasetSettings(1, seed=1, bandwidth_hz=2000.0, duration_s=6.0 if size == "small" else 10.0)
     with TemporaryDirectory() as root:
         source = open_source(Path(root) / write_dataset(root, settings)[0].folder)
-        measured = [one for _, one in measure_steps(source, reader=source.reader())]
+        measured = [one for _, one in measure_steps(source)]
     in_order, straight = source.world(), []
     for one in measured:
         in_order = in_order.update(one)

@@ -15,7 +15,7 @@ from worldstate.abduction.grounding.grounded_likelihood import (
     car,
 )
 from worldstate.adapters.acoustic import LINE_SPACING, AcousticAdapter, Grounding, observe
-from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main

@@ -18,7 +18,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, read_featur
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.adapters.listen import listen, measure_steps
+from worldstate.adapters.listener import listen, measure_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main

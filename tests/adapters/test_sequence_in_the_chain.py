@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from made_up_sequence import sequence_model
 
 from worldstate import Context, MicrophoneArray
@@ -22,7 +24,7 @@ from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model, save_model
-from worldstate.adapters.listen import Step, listen_steps
+from worldstate.adapters.listener import Listener, Step, listen_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
 from worldstate.commissioning.commission import stream_evidence
@@ -30,6 +32,7 @@ from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.frontend.approach.looming import Looming
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Heard
+from worldstate.measurement.odometry import Odometry
 from worldstate.operations.recordings.hop_table import HopTable
 
 RATE_HZ = 6000
@@ -65,6 +68,44 @@ def steps(folder: Path, **options: object) -> Iterator[Step]:
 @pytest.fixture(scope="module")
 def whole(folder: Path) -> list[Step]:
     return list(steps(folder))
+
+
+DRIVEN = ListenSettings(ego_noise=True)
+
+
+@pytest.fixture(scope="module")
+def driven(folder: Path) -> list[str]:
+    """States with ego-noise that is learned by what is believed."""
+    return [step.state.to_json() for step in steps(folder, settings=DRIVEN)]
+
+
+@settings(max_examples=20)
+@given(cuts=st.lists(st.integers(0, 3 * RATE_HZ), max_size=20))
+def test_states_are_the_same_to_the_bit_for_blocks_of_any_length(
+    folder: Path, driven: list[str], cuts: list[int]
+) -> None:
+    sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
+    source = open_source(folder / "sound.wav", model=folder / "model.json", settings=DRIVEN)
+    listener = Listener(source, RATE_HZ)
+    states = [state for block in np.split(sound, sorted(cuts)) for state in listener.push(block)]
+    assert [state.to_json() for state in states] == driven
+
+
+def test_what_is_told_counts_from_its_stamp_on_and_a_checkpoint_is_gone_on_from(folder: Path) -> None:
+    sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
+    told = [Odometry("wheels", 10**8 * tenth, 2.0) for tenth in (2, 13, 14, 25)]
+    source = open_source(folder / "sound.wav", model=folder / "model.json", others=[lambda: told])
+    recorded = [step.state.to_json() for step in listen_steps(source)]
+    plain = replace(source, others=())
+    running = Listener(plain, RATE_HZ)
+    running.tell(*reversed(told))
+    states = running.push(sound[: 2 * RATE_HZ])
+    later = Listener(replace(plain, before=running.checkpoint), RATE_HZ)
+    later.tell(*told)
+    states += later.push(sound)
+    assert [state.to_json() for state in states] == recorded
+    speeds = [state.context.ego_speed_mps for state in states]
+    assert speeds == [2.0] * len(states)
 
 
 def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path, whole: list[Step]) -> None:

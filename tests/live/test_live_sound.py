@@ -8,7 +8,7 @@ import pytest
 import soundfile
 
 from worldstate.adapters.audio.open_sound import open_sound
-from worldstate.adapters.listen import listen_steps
+from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.live.bounded_channel import BoundedChannel
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound, SoundBlock

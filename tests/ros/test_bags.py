@@ -289,7 +289,7 @@ def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
 
 
 def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
-    from worldstate.adapters.listen import listen_steps
+    from worldstate.adapters.listener import listen_steps
     from worldstate.adapters.source import ListenSettings
     from worldstate.adapters.source_files import open_source
     from worldstate.frontend import MicrophoneArray

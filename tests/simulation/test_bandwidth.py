@@ -13,7 +13,7 @@ from scipy.signal import resample_poly
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.adapters.files.acoustic_domain import check_tables, feature_order
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main

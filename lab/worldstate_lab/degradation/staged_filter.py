@@ -21,7 +21,7 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import MAX_IMAGE_AGE_S, VisionQuery
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import Source, unoccluded_sector
 from worldstate.adapters.source_files import open_source
 from worldstate.core.filter import WorldFilter

@@ -18,7 +18,7 @@ from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.adapters.files.array_match import TRAIN
 from worldstate.adapters.files.model_file import Model
-from worldstate.adapters.listen import Step, listen_steps, measure_steps
+from worldstate.adapters.listener import Step, listen_steps, measure_steps
 from worldstate.adapters.source import ListenSettings, Source
 from worldstate.adapters.source_files import open_source
 from worldstate.frontend.approach.doppler import radial_speed
@@ -90,7 +90,7 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     vision = source.camera_channel()
     boxes = _boxes(source, vision)
     truth = _truth(take, boxes)
-    pairs = list(measure_steps(source, signature=_Silent()))
+    pairs = list(measure_steps(replace(source, model=_Silent())))
     frames = [_slim(frame) for frame, _ in pairs]
     stream = hop_stream((m for _, m in pairs), name=take.name)
     reference = np.array([_reference(frame, vision) for frame, _ in pairs])

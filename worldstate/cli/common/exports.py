@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_message import LogMessage, LogSink
-    from worldstate.adapters.listen import Step
+    from worldstate.adapters.listener import Step
     from worldstate.adapters.source import Source
     from worldstate.state import WorldState
 

@@ -17,7 +17,7 @@ from .sensors import MOVING, GivenSensors, given_sensors
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionFilter
-    from worldstate.adapters.listen import Step
+    from worldstate.adapters.listener import Step
     from worldstate.adapters.live.live_sound import LiveSound
     from worldstate.adapters.source import Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray

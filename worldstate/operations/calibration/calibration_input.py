@@ -6,7 +6,7 @@ from zlib import crc32
 
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray

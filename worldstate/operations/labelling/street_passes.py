@@ -14,7 +14,7 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
-from worldstate.adapters.listen import measure_steps
+from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import Source
 from worldstate.adapters.source_files import open_source
 from worldstate.ground import NotUsable, OutOfDomainError, seconds

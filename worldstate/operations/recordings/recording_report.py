@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.files.checkpoint_file import Checkpoint
-from worldstate.adapters.listen import Step, listen_steps
+from worldstate.adapters.listener import Step, listen_steps
 from worldstate.adapters.source import Source
 from worldstate.adapters.state_log import states_writer
 from worldstate.ground.values import seconds

@@ -1,0 +1,326 @@
+"""The whole chain over blocks of sound: one world-state a hop out."""
+
+import heapq
+from bisect import insort
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Unpack
+
+from worldstate.abduction.sequence.sequence_reader import SequenceReader
+from worldstate.abduction.signature.site_estimate import SiteSignature
+from worldstate.adapters.audio.open_sound import SoundInput, open_sound
+from worldstate.adapters.files.checkpoint_file import Checkpoint
+from worldstate.core.fixed_lag import Timed
+from worldstate.frontend.frame import AcousticFrame
+from worldstate.ground.typing import Float32Array
+from worldstate.measurement.measurement import Measurement
+from worldstate.state import WorldState
+
+from .acoustic import AcousticAdapter
+from .acoustic_sequence import learn_passes
+from .own_parts import OtherModality
+from .source import Source
+from .source_files import SourceParts, open_source
+
+# Half a hop.
+PARTS_PER_SECOND = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One hop: what was heard, what was measured, what is believed.
+
+    Parameters
+    ----------
+    frame : AcousticFrame
+        What the front-end read from the sound.
+    measurement : Measurement
+        What the adapter made of it.
+    checkpoint : Checkpoint
+        What another run goes on from: the belief after it, whose snapshot is `state`, and what was learned of
+        the site and heard of the street up to it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     steps = list(listen_steps(open_source(path)))
+    >>> steps[0].frame.stamp_ns == steps[0].measurement.stamp_ns == steps[0].state.stamp_ns
+    True
+    """
+
+    frame: AcousticFrame
+    measurement: Measurement
+    checkpoint: Checkpoint
+
+    @property
+    def state(self) -> WorldState:
+        """The snapshot after the hop."""
+        return self.checkpoint.world.state
+
+
+class Listener:
+    """Blocks of sound in, one world-state a hop (0.1 s) out; the same to the bit for blocks of any length.
+
+    Parameters
+    ----------
+    source : Source
+        From `open_source`: array, model, camera, context, and what is gone on from. Its sound is not opened.
+    sample_rate_hz : float
+        Of the blocks.
+
+    Attributes
+    ----------
+    world : WorldFilter
+        The belief after the last hop.
+
+    Raises
+    ------
+    InvalidArgumentError, OutOfDomainError
+        As `AcousticAdapter`.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array.microphone_array import ovad_array
+    >>> import numpy as np
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> listener = Listener(open_source("microphones", array=ovad_array()), 48_000)
+    >>> [state.stamp_ns / 1e9 for block in np.split(noise, 100) for state in listener.push(block)]
+    [1.0, 1.1, 1.2]
+    """
+
+    def __init__(self, source: Source, sample_rate_hz: float) -> None:
+        self.world = source.world()
+        self._source, self._rate_hz = source, sample_rate_hz
+        self._signature, self._reader = source.signature(), source.reader()
+        self._adapter = AcousticAdapter(
+            source.array,
+            sample_rate_hz,
+            self._signature,
+            start_ns=source.start_ns,
+            vision=source.co_evidence or source.camera_channel(),
+            grounding=source.settings.grounding,
+            guard=source.guard,
+            road_users=source.road_users,
+            sequence=self._reader,
+            front_end_settings=source.settings.front_end(source.array, sample_rate_hz),
+            uncalibrated=source.settings.uncalibrated,
+        )
+        # What the belief to go on from has taken in already, or what was told before it began, is left out.
+        self._since_ns = source.start_ns - 1 if source.before is None else self.world.stamp_ns
+        self._waiting = _Waiting(source.others, self._since_ns)
+        self._part = max(int(sample_rate_hz / PARTS_PER_SECOND), 1)
+
+    def push(self, block: Float32Array) -> list[WorldState]:
+        """Take the next samples; return the state after each hop that ends in them.
+
+        Parameters
+        ----------
+        block : ndarray
+            Shape (n, M), any n; floats of full scale 1, int16 or int32.
+
+        Returns
+        -------
+        list of WorldState
+            The first after the first full second, then one every 0.1 s.
+
+        Raises
+        ------
+        InvalidArgumentError
+            On another number of channels, NaN or infinity.
+        """
+        return [step.state for step in self.steps(block)]
+
+    def tell(self, *told: Timed) -> None:
+        """Take odometry, positions or measurements of other sensors; each counts from its own stamp on."""
+        self._waiting.add(told)
+
+    @property
+    def checkpoint(self) -> Checkpoint:
+        """What another listener goes on from."""
+        signature, reader = self._signature, self._reader
+        site = signature.estimate if isinstance(signature, SiteSignature) else None
+        if not isinstance(reader, SequenceReader):
+            return Checkpoint(self.world, site)
+        hearing = None if reader.street is None else reader.street.hearing
+        return Checkpoint(self.world, site, reader.history, hearing)
+
+    def steps(self, block: Float32Array) -> Iterator[Step]:
+        """Yield the hops that end in the next samples with what was heard and measured."""
+        reader = self._reader if self._source.settings.site_adaptation else None
+        for frame, measurement in self.measured(block):
+            for other in self._waiting.until(measurement.stamp_ns):
+                self.world = self.world.update(other)
+            self.world = self.world.predict_to(measurement.stamp_ns).update(measurement)
+            self._adapter.set_no_source_probability(self.world.belief.hypotheses[2])
+            if isinstance(reader, SequenceReader):
+                learn_passes(reader.street, self.world.state)
+            yield Step(frame, measurement, self.checkpoint)
+
+    def measured(self, block: Float32Array) -> Iterator[tuple[AcousticFrame, Measurement]]:
+        """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
+        for part in self._parts(block):
+            for frame in self._adapter.front_end.process(part):
+                # What the belief to go on from has taken in already only fills the windows.
+                if frame.stamp_ns > self._since_ns:
+                    yield frame, self._adapter.interpret(frame)
+
+    def _parts(self, block: Float32Array) -> Iterator[Float32Array]:
+        """Cut a block so that no two hops end in one part."""
+        # What is believed after a hop weighs what is learned of ego-noise in the next.
+        return (block[start : start + self._part] for start in range(0, len(block), self._part))
+
+
+def listen(path: SoundInput | str | Sequence[str], **parts: Unpack[SourceParts]) -> Iterator[WorldState]:
+    """Yield one world-state a hop (0.1 s) from a sound file or recording folder.
+
+    Parameters
+    ----------
+    path : path, sequence of paths, SoundStream or Audio
+        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
+        a stream (raw samples from a pipe, the sound of a bag), or an open recording.
+    array, detections, detector, camera, miss_rates, model, context, settings
+        As `open_source` takes them: files, or the objects that they hold.
+
+    Yields
+    ------
+    WorldState
+        The first after the first second of sound.
+
+    Raises
+    ------
+    InputFileError
+        If a file is missing or damaged; the message names it.
+    InvalidArgumentError
+        As `open_source`.
+
+    Examples
+    --------
+    A second and a fifth of noise:
+
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     [(state.stamp_ns / 1e9, len(state.entities)) for state in listen(path)]
+    [(1.0, 0), (1.1, 0), (1.2, 0)]
+    """
+    for step in listen_steps(open_source(path, **parts)):
+        yield step.state
+
+
+def listen_steps(source: Source) -> Iterator[Step]:
+    """Yield every hop of `source` with what was heard and measured.
+
+    Parameters
+    ----------
+    source : Source
+        From `open_source`.
+
+    Yields
+    ------
+    Step
+        One a hop, the first after the first second of sound.
+
+    Raises
+    ------
+    InputFileError
+        If the sound file is damaged or does not fit the array.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     [step.frame.feature.shape for step in listen_steps(open_source(path))]
+    [(60,), (60,), (60,)]
+    """
+    for listener, block in listened(source):
+        yield from listener.steps(block)
+
+
+def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]:
+    """Yield every hop of `source` as it was heard and measured, nothing filtered: what calibration needs.
+
+    Ego-noise is not learned, which takes a belief that nothing is there.
+
+    Parameters
+    ----------
+    source : Source
+        What to listen to.
+
+    Yields
+    ------
+    frame, measurement : AcousticFrame, Measurement
+        One pair a hop.
+
+    Raises
+    ------
+    InputFileError
+        If the sound file is damaged or does not fit the array.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     [measurement.co_evidence.reason for _, measurement in measure_steps(open_source(path))]
+    ['no detections file', 'no detections file', 'no detections file']
+    """
+    for listener, block in listened(source):
+        yield from listener.measured(block)
+
+
+def listened(source: Source) -> Iterator[tuple[Listener, Float32Array]]:
+    """Yield the sound of `source` block by block, each beside the one listener that is to take it."""
+    strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
+    with open_sound(source.sound, expect_channels=n_microphones, strict=strict) as audio:
+        listener = Listener(source, audio.sample_rate_hz)
+        for block in audio.blocks(max(audio.sample_rate_hz // PARTS_PER_SECOND, 1)):
+            yield listener, block
+
+
+class _Waiting:
+    """Measurements of other sensors that wait for their time, oldest first."""
+
+    def __init__(self, others: Iterable[OtherModality], after_ns: int) -> None:
+        merged = heapq.merge(*(one() for one in others), key=attrgetter("stamp_ns"))
+        self._after_ns = after_ns
+        self._recorded = (one for one in merged if one.stamp_ns > after_ns)
+        self._next = next(self._recorded, None)
+        self._told: list[Timed] = []
+
+    def add(self, told: Iterable[Timed]) -> None:
+        """Take what has just been measured."""
+        for one in told:
+            if one.stamp_ns > self._after_ns:
+                insort(self._told, one, key=attrgetter("stamp_ns"))
+
+    def until(self, stamp_ns: int) -> Iterator[Timed]:
+        """Yield what was measured up to a time and has not been yielded before."""
+        while self._next is not None and self._next.stamp_ns <= stamp_ns:
+            yield self._next
+            self._next = next(self._recorded, None)
+        while self._told and self._told[0].stamp_ns <= stamp_ns:
+            yield self._told.pop(0)
