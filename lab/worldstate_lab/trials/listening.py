@@ -156,9 +156,9 @@ def chain_tables(take: Take, chain: str, model: Path | None = None) -> dict[str,
 
 
 def _grounded(step: Step, grounding: Grounding) -> FloatArray:
-    """Weigh the model's scores with bearing, approach rate and engine line, eq. (5)."""
+    """Weigh the model's scores with bearing and approach rate, eq. (5)."""
     heard = step.measurement
-    observation = observe(step.frame, heard.bearing, heard.approach)
+    observation = observe(heard.bearing, heard.approach)
     return grounding.answer(heard.signature, observation).evidence.log_likelihoods
 
 
