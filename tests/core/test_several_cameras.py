@@ -7,11 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from worldstate import Absent, Measurement, NotUsable, Present, Sighting, SignatureEvidence, WorldFilter
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 from worldstate.measurement.measurement import CameraLook, Look
 
 SILENT, EVEN = NotUsable("-"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
@@ -170,3 +173,74 @@ def test_what_a_further_camera_cannot_have_seen_is_refused() -> None:
         after(measured(1.0, front, camera("left", 1.0, LEFT, car(4.0))))
     with pytest.raises(InvalidArgumentError, match="further: expected at most 32, got 33"):
         after(measured(1.0, front, *[camera("left", 1.0, LEFT)] * 33))
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6), st.permutations(["front", "left", "rear"]))
+def test_names_of_cameras_carry_no_meaning(seed: int, names: list[str]) -> None:
+    """Boxes in the overlap included: which camera keeps an identity does not follow from its name."""
+    rng, views = np.random.default_rng(seed), ((-0.6, 0.6), (0.2, 1.5), (-1.5, 0.5))
+    hops = []
+    for hop in range(10, 20):
+        found = [[car(rng.uniform(*ends), score=rng.uniform(0.5, 1.0)) for _ in range(rng.integers(4))]
+                 for ends in views]  # fmt: skip
+        hops.append((0.1 * hop, reading(rng), found))
+
+    def stated(names):
+        looks = [(at, heard, [camera(*one) for one in
+                  [(name, at, view, *boxes) for name, view, boxes in zip(names, views, found, strict=True)]])
+                 for at, heard, found in hops]  # fmt: skip
+        world = after(*(measured(at, *cameras, sequence=heard) for at, heard, cameras in looks))
+        return numbers(world.state)
+
+    np.testing.assert_allclose(stated(names), stated(["front", "left", "rear"]), atol=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6), st.permutations(["acoustic", "radar", "second", "v2x"]))
+def test_names_of_sources_carry_no_meaning(seed: int, names: list[str]) -> None:
+    """Sound, two radars and messages of one instant."""
+    rng = np.random.default_rng(seed)
+    radar = SearchedSector(Sector(0.0, 1.0), 60.0, 0.9)
+    hops = []
+    for hop in range(10, 20):
+        places = [Position((rng.uniform(8.0, 40.0), rng.uniform(-12.0, 12.0)), ((0.3, 0.0), (0.0, 0.3)))
+                  for _ in range(6)]  # fmt: skip
+        box = car(rng.uniform(-0.5, 0.5))
+        hops.append((0.1 * hop, reading(rng), box, places))
+
+    def stated(names):
+        world, (sound, *others) = WorldFilter(), names
+        for at, heard, box, places in hops:
+            stamp_ns, searched = round(at * 1e9), (radar, radar, None)
+            scans = [PositionScan(name, stamp_ns, tuple(places[2 * i : 2 * i + 2]), searched[i])
+                     for i, name in enumerate(others)]  # fmt: skip
+            look = camera("front", at, FRONT, box)
+            for one in (measured(at, look, source=sound, sequence=heard), *scans):
+                world = world.update(one)
+        return numbers(world.state)
+
+    np.testing.assert_allclose(stated(names), stated(["acoustic", "radar", "second", "v2x"]), atol=1e-9)
+
+
+def test_boxes_of_three_cameras_are_fused_by_their_precisions() -> None:
+    stds, azimuths = (0.02, 0.01, 0.04), (0.40, 0.41, 0.43)
+    views = (FRONT, LEFT, (-1.5, 0.5))
+    seen = [camera(name, 1.0, view, car(azimuth, std)) for name, view, azimuth, std in
+            zip("abc", views, azimuths, stds, strict=True)]  # fmt: skip
+    (entity,) = after(measured(1.0, *seen)).state.entities
+    weights = 1.0 / np.square(stds)
+    assert entity.azimuth_rad == pytest.approx(weights @ azimuths / weights.sum(), abs=1e-6)
+    assert entity.azimuth_std_rad == pytest.approx(weights.sum() ** -0.5, rel=1e-6)
+
+
+def numbers(state):
+    """Return what a state says of entities and sides, as one row."""
+    entities = [(one.existence_probability, one.hidden_probability, one.azimuth_rad, one.azimuth_std_rad,
+                 len(one.classification)) for one in state.entities]  # fmt: skip
+    cues = [(one.risk, *(one.within or {}).values(), *vars_of(one.hypotheses)) for one in state.cues]
+    return [number for row in (*entities, *cues) for number in row]
+
+
+def vars_of(priors):
+    return priors.hidden, priors.visible, priors.none

@@ -1,4 +1,4 @@
-"""Association of sightings with entities, in view and at the edge of an occluder, all at once."""
+"""Association of detections with entities, in view and at the edge of an occluder, all at once."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -8,10 +8,12 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.road_users import SEEN_AS
+from worldstate.belief.kinematics.cartesian import CartesianBelief, full_measurement
+from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, MotionBelief
 from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
-from worldstate.measurement import Sector, Sighting
 
-from .site_geometry import SiteGeometry, normal_share
+from .detection import Detection
+from .site_geometry import HIDDEN_BIAS_STD, SiteGeometry, normal_share
 from .track import Track
 
 # Of a pair outside the gate; below any sum of scores within it.
@@ -20,7 +22,6 @@ FORBIDDEN = -1e6
 # preferred, and finite, so that a parked car that drives off keeps its id.
 _PARKED_MISMATCH = -10.0
 _UNFORESEEN = 0.05  # Of a vehicle that comes into view, whatever the sound had said of the time
-_FOUND = 0.95  # Of the looks at an entity in view
 _LEAST = 1e-300  # Keeps logarithms finite
 # All of five tracks and five measurements, or of three and twelve; their tables take .2 ms to read.
 _MOST_EVENTS = 2000
@@ -34,8 +35,16 @@ _GATE_SIGMA, _GATE_RAD = 4.0, 0.35
 EDGE_STD_RAD = 0.15
 # P(the signature names the wrong side): rarely on junctions that its model was trained on, often on others.
 _SIDE_CONFUSION = 0.2
-# P(a new sighting was not heard before): most vehicles from a side street are.
-UNHEARD = 0.05
+# No statement is certain, and a refuted claim that is repeated can still turn out to be true: what was taken
+# to be in view stood behind something that the context does not name.
+MOST_EXISTENCE, LEAST_EXISTENCE = 0.999, 1e-3
+# m/s, of a velocity that was not measured: wide, so that it decides nothing.
+_ANY_SPEED_STD = 100.0
+# m/s, of vehicles in a street: twice the speed limit in town covers nearly all.
+_SPEED_STD = 15.0
+# Of the squared Mahalanobis distance of a position: .9997 of chi-square with four degrees of freedom, as four
+# deviations of a bearing are.
+_GATE = 21.0
 # Of P(hidden), left by a hand-over: at zero, a second vehicle behind the corner would have to be found anew.
 HANDOVER_RESIDUAL = 0.02
 # As detectors call them. What was heard drives: a detector has misread its label, or the ear the kind.
@@ -45,50 +54,52 @@ _ON_FOOT, _MISREAD = frozenset({"person", "pedestrian"}), 0.1
 
 @dataclass(frozen=True, slots=True)
 class Association:
-    """Whose a look's measurements are: the likeliest assignment, and P(one of them is its) of every track."""
+    """Whose detections are: the likeliest assignment, and the probability of every pair."""
 
-    found: dict[int, int]  # Measurement of a track
-    chances: list[float]  # Over all joint events, shape (tracks,)
-    new: list[int]  # Measurements of no track
+    found: dict[int, int]  # Detection of a track
+    pairs: FloatArray  # P(a detection is a track's) over all joint events, shape (detections, tracks)
+    new: list[int]  # Detections of no track
+
+    @property
+    def chances(self) -> list[float]:
+        """P(one of them is its) of every track."""
+        chances: list[float] = np.minimum(self.pairs.sum(axis=0), 1.0).tolist()
+        return chances
 
 
-def associated(
-    tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], view: Sector, site: SiteGeometry
-) -> Association:
-    r"""Return whose the sightings are.
+def associated(tracks: Sequence[Track], detections: Sequence[Detection], site: SiteGeometry) -> Association:
+    r"""Return whose the detections of an instant are, all boxes or all positions.
 
-    Every sighting is one of an entity in view, a hidden one that comes past an edge, or a vehicle that was
-    not heard; how much likelier than that, nats, they are one of
+    Every one is of an entity that was detected before, of a hidden one that comes past an edge, or of an
+    object that was not known; how much likelier than that, nats, they are one of
 
-    .. math:: \log \frac{r p_D N(z; \theta, S)}{1 - r p_D} \frac{V}{u}, \qquad
-              \log r\, [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)] \frac{V}{u}
+    .. math:: \log \frac{r\, p_D\, N(z; H m, H P H^T + R)}{(1 - r p_D)\, u}, \qquad
+              \log \frac{r}{u} [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)]
 
     with existence r, of a hidden one times the chance that it stands near its edge by now, the edge a of its
-    side, which the signature may have confused with probability c, and u vehicles that were not heard
-    anywhere in the view V. Entities in view and hidden ones compete: an entity that has left the view would
-    else take the first sighting of the next one.
+    side, which the signature may have confused with probability c, and the density u of objects that were
+    not known. Entities in view and hidden ones compete: an entity that has left the view would else take
+    the first detection of the next one.
     """
-    if not tracks or not sightings:
-        return Association({}, [0.0] * len(tracks), list(range(len(sightings))))
-    unheard = math.log(UNHEARD / (2.0 * view.half_width_rad))
-    detected = np.array([track.detected for track in tracks])
-    scores = _scores(tracks, sightings, detected, site)
-    return joint_association(np.where(scores > FORBIDDEN, scores - unheard, FORBIDDEN), detected)
+    detected = np.array([track.detected for track in tracks], bool)
+    if not tracks or not detections:
+        return joint_association(np.empty((len(detections), len(tracks))), detected)
+    return joint_association(_log_ratios(tracks, detections, detected, site), detected)
 
 
 def joint_association(log_ratios: FloatArray, detected: BoolArray) -> Association:
-    """Return the association of measurements and tracks by how much likelier than new each pair is.
+    """Return the association of detections and tracks by how much likelier than new each pair is.
 
-    Shapes: log_ratios (measurements, tracks), FORBIDDEN outside the gate; detected (tracks,).
+    Shapes: log_ratios (detections, tracks), FORBIDDEN outside the gate; detected (tracks,).
     """
     # Within its gate a detected entity takes a measurement before that counts as a new one; a maximum of
     # the two would be a tie of all poor pairs, which the order of measurements would settle.
     gated = log_ratios > FORBIDDEN
     scores = np.where(gated & detected, np.logaddexp(log_ratios, 0.0), log_ratios)
     found = _likeliest(scores)
-    chances = association_probabilities(log_ratios).sum(axis=0)
-    new = [j for j in range(len(log_ratios)) if j not in found.values()]
-    return Association(found, np.minimum(chances, 1.0).tolist(), new)
+    taken = set(found.values())
+    new = [j for j in range(len(log_ratios)) if j not in taken]
+    return Association(found, association_probabilities(log_ratios), new)
 
 
 def association_probabilities(log_ratios: FloatArray) -> FloatArray:
@@ -191,33 +202,94 @@ def _likeliest(scores: FloatArray) -> dict[int, int]:
     return {column: row for row, column in pairs if column < known and every[row, column] > FORBIDDEN}
 
 
-def _scores(
-    tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], detected: BoolArray, site: SiteGeometry
+def _log_ratios(
+    tracks: Sequence[Track], detections: Sequence[Detection], detected: BoolArray, site: SiteGeometry
 ) -> FloatArray:
-    """Return the score of every sighting and track, shape (sightings, tracks)."""
-    azimuth_rad = np.array([one.azimuth_rad for one in sightings])[:, None]
-    std_rad = np.array([one.std_rad for one in sightings])[:, None]
-    moving = np.array([one.moving for one in sightings])[:, None]
-    in_view = _in_view(tracks, azimuth_rad, std_rad, moving)
-    if detected.all():
-        return in_view
-    classes = np.log([[_shared_class(track, one.label) for track in tracks] for one in sightings])
-    comes = np.array([track.existence * reached_edge(track, site) for track in tracks])
-    heard = np.maximum(comes * emergence_density(tracks, azimuth_rad, site), _LEAST)
-    return np.where(detected, in_view, np.where(moving, np.log(heard) + classes, FORBIDDEN))
+    """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
+    motion, in_sight = MotionBelief.stacked([one.motion for one in tracks]), detections[0].found is not None
+    azimuth_rad = np.array([[one.azimuth_rad] for one in detections])
+    found = np.array([[one.found or 0.0] for one in detections])
+    existence = np.array([one.existence for one in tracks]).clip(LEAST_EXISTENCE, MOST_EXISTENCE)
+    likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
+    density = _azimuth_density(motion, detections, detected)
+    heard = np.flatnonzero(~detected) if in_sight else np.array([], int)
+    if len(heard):
+        # What was only heard is found where it comes into view.
+        hidden = [tracks[i] for i in heard]
+        density[:, heard] = np.log(np.maximum(emergence_density(hidden, azimuth_rad, site), _LEAST))
+        reached = np.array([reached_edge(one, site) for one in hidden])
+        likely[:, heard] = np.log(existence[heard] * reached)
+    if detections[0].position is None:
+        density += _alike(tracks, detections, detected)
+    else:
+        density = _density_m2(tracks, motion, detections, density)
+    log_new = np.array([[one.log_new] for one in detections])
+    return np.where(density > 0.5 * FORBIDDEN, density + likely - log_new, FORBIDDEN)
 
 
-def _in_view(
-    tracks: tuple[Track, ...], azimuth_rad: FloatArray, std_rad: FloatArray, moving: BoolArray
+def _azimuth_density(
+    motion: MotionBelief, detections: Sequence[Detection], detected: BoolArray
 ) -> FloatArray:
-    existence = np.array([track.existence for track in tracks])
-    residual = wrap_angle(azimuth_rad - np.array([track.motion.azimuth_rad for track in tracks]))
-    variance = np.array([track.motion.azimuth_std_rad for track in tracks]) ** 2 + std_rad**2
-    density = -0.5 * (residual**2 / variance + np.log(2.0 * math.pi * variance))
-    expected = np.log(np.maximum(_FOUND * existence, _LEAST)) - np.log1p(-existence * _FOUND)
-    mismatch = np.where(moving == np.array([track.moving for track in tracks]), 0.0, _PARKED_MISMATCH)
-    outside = (np.abs(residual) > _GATE_RAD) | (residual**2 > _GATE_SIGMA**2 * variance)
-    return np.where(outside, FORBIDDEN, density + expected + mismatch)
+    """Return the log density of every detection's azimuth, 1/rad, FORBIDDEN outside the gate of a box."""
+    azimuth_rad, std_rad = np.array([(one.azimuth_rad, one.std_rad) for one in detections]).T[:, :, None]
+    residual = wrap_angle(azimuth_rad - motion.mean[:, AZIMUTH])
+    # The sound of a hidden one may come from the edge instead.
+    bias = np.where(detected, 0.0, HIDDEN_BIAS_STD)
+    variance = motion.covariance[:, AZIMUTH, AZIMUTH] + std_rad**2 + bias**2
+    squares = residual**2 / variance
+    density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
+    if detections[0].position is not None:
+        return np.where(squares > _GATE, FORBIDDEN, density)
+    outside = (np.abs(residual) > _GATE_RAD) | (squares > _GATE_SIGMA**2)
+    return np.where(outside, FORBIDDEN, density)
+
+
+def _alike(tracks: Sequence[Track], detections: Sequence[Detection], detected: BoolArray) -> FloatArray:
+    """Return what motion and class say of every pair of a box and a track, nats."""
+    moving = np.array([[bool(one.moving)] for one in detections])
+    alike = np.where(moving == np.array([one.moving for one in tracks]), 0.0, _PARKED_MISMATCH)
+    for i in np.flatnonzero(~detected).tolist():
+        classes = [math.log(_shared_class(tracks[i], one.classes[0][0])) for one in detections]
+        alike[:, i] = np.where(moving[:, 0], classes, FORBIDDEN)
+    return alike
+
+
+def _density_m2(
+    tracks: Sequence[Track], motion: MotionBelief, detections: Sequence[Detection], azimuth: FloatArray
+) -> FloatArray:
+    """Return the log density of every position, 1/m^2, FORBIDDEN outside the gate.
+
+    The velocity enters by how much likelier it is than that of another, so that an entity without a place is
+    scored in the same units, by its azimuth and log range.
+    """
+    measured = [full_measurement(one.position, _ANY_SPEED_STD) for one in detections if one.position]
+    z, noise = np.array([one[0] for one in measured]), np.array([one[1] for one in measured])
+    range_m = np.maximum(np.hypot(z[:, 0], z[:, 1]), 1.0)
+    along = z[:, :2] / range_m[:, None]
+    farther = np.log(range_m)[:, None] - motion.mean[:, LOG_RANGE]
+    nearness = np.einsum("ij,ijk,ik->i", along, noise[:, :2, :2], along) / range_m**2
+    variance = motion.covariance[:, LOG_RANGE, LOG_RANGE] + nearness[:, None]
+    squares = farther**2 / variance
+    # From 1 / (rad log m) to 1 / m^2.
+    log_range = -0.5 * (squares + np.log(2.0 * math.pi * variance)) - 2.0 * np.log(range_m)[:, None]
+    density = np.where(squares > _GATE, FORBIDDEN, azimuth + log_range)
+    placed = [i for i, track in enumerate(tracks) if track.place is not None]
+    if placed:
+        density[:, placed] = _cartesian([tracks[i] for i in placed], z, noise)
+    return density
+
+
+def _cartesian(tracks: Sequence[Track], z: FloatArray, noise: FloatArray) -> FloatArray:
+    places = CartesianBelief.stacked([track.place for track in tracks if track.place is not None])
+    distance, density = _log_normal(z[:, None] - places.mean, noise[:, None] + places.covariance)
+    _, usual = _log_normal(z[:, 2:], noise[:, 2:, 2:] + _SPEED_STD**2 * np.eye(2))
+    return np.where(distance > _GATE, FORBIDDEN, density - usual[:, None])
+
+
+def _log_normal(residual: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return squared Mahalanobis distance and log density of residuals, shape (..., n) both without n."""
+    distance = np.einsum("...k,...k->...", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
+    return distance, -0.5 * (distance + np.linalg.slogdet(2.0 * math.pi * spread)[1])
 
 
 def _shared_class(track: Track, label: str) -> float:

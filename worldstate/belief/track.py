@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, TypeAlias
+from typing import Annotated, TypeAlias, TypeVar
 from uuid import UUID, uuid5
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, predict_place
 from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief, predict, relax
+from worldstate.ground import FloatArray
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 
@@ -39,6 +40,7 @@ _IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
 _LOST_PLACE_M = 10.0
 
 
+NumbersT = TypeVar("NumbersT", float, FloatArray)  # Of one entity, or of each of many
 Label: TypeAlias = Annotated[tuple[str, float], Keys("label", "probability")]
 
 
@@ -60,8 +62,8 @@ class Track:
     answer: Answer = "unqueried"  # Last answer of the co-evidence channel about it
     miss_rate: Probability | None = None  # beta of that answer
     approach_heard: bool = False  # Whether its approach rate was ever measured
-    # Whether it was ever heard before it was seen, or lost from view and heard again.
-    was_hidden: bool = False
+    # P(it was hidden on its side): of one in view, that of the association at its hand-over.
+    came_from: Probability = 0.0
     place: CartesianBelief | None = None  # Then `motion` follows from it
     behind: Probability = 1.0  # P(behind its side's occluder), by that place
     width_rad: float = 0.0  # Of its last box
@@ -99,18 +101,17 @@ def born(kind: str, number: int, existence: float, stamp_ns: int, site: SiteGeom
     )
 
 
-def after_empty_look(existence: float, miss_rate: float) -> float:
+def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
     r"""Return the existence after a missed detection.
 
     .. math:: r \leftarrow \frac{r \beta}{r \beta + 1 - r} = \frac{r (1 - p_D)}{1 - r\, p_D},
         \qquad p_D = 1 - \beta
     """
-    # At r = 1 and beta = 0 the ratio is 0/0; what certainly exists stays.
     missed = existence * miss_rate
-    return missed / (missed + 1.0 - existence) if existence < 1.0 else 1.0
+    return missed / (missed + 1.0 - existence)
 
 
-def after_sighting(existence: float, miss_rate: float, clutter_rate: float) -> float:
+def after_sighting(existence: NumbersT, miss_rate: float, clutter_rate: float) -> NumbersT:
     r"""Return the existence after a detection.
 
     .. math:: r \leftarrow \frac{r\, (1 - \beta (1 - c))}{r\, (1 - \beta (1 - c)) + (1 - r)\, c}

@@ -64,7 +64,7 @@ def birth_death(
                 counts[k] += 1
             else:
                 kept.remove(one := returning)
-            one = replace(one, side=k, seen=False, was_hidden=True, existence=min(sides.hidden[k], 1.0))
+            one = replace(one, side=k, seen=False, came_from=1.0, existence=min(sides.hidden[k], 1.0))
             stamp_ns, motion = measurement.stamp_ns, site.sides[k].prior()
             kept.append(replace(one, motion=motion, updated_ns=stamp_ns, place=None, behind=1.0))
     return replace(memory, tracks=tuple(kept), births=tuple(counts))
@@ -85,7 +85,7 @@ def merged_tracks(tracks: tuple[Track, ...], stamp_ns: int) -> tuple[tuple[Track
             first, second = sorted((same, other), key=lambda one: (one.created_ns, one.id))
             known = max(same.existence, other.existence)
             one = replace(
-                same, id=first.id, created_ns=first.created_ns, was_hidden=first.was_hidden, existence=known
+                same, id=first.id, created_ns=first.created_ns, came_from=first.came_from, existence=known
             )
             left.remove(other)
             left[left.index(same)] = found[found.index(same)] = one

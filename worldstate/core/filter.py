@@ -8,12 +8,13 @@ from typing import Any, ClassVar
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated_policy
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.detection import BY_ALL
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.core import step
 from worldstate.ground import LEAST_HEARD, InvalidArgumentError, in_range, integer_ns, nanoseconds
 from worldstate.ground.serialisation import Layout, decode, encode
-from worldstate.measurement import Measurement, Odometry, PositionScan
+from worldstate.measurement import Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 
 from .advisories import update_advisories
@@ -24,12 +25,13 @@ from .memory import NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
 from .site_model import FilterModel, from_here, published_belief, site_geometry_of, without_open_sides
 from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
-from .vision_update import counting_boxes, vision_update
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
 # All that two cameras and a radio find at a crowded crossing; a step costs with their square.
 MOST_TRACKS = 128
+# A crowded street shows some forty; at 600 a step took .3 s.
+MOST_BOXES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +185,7 @@ class WorldFilter:
         # Before anything is computed: a measurement that is refused leaves the filter as it was.
         measurement, left_out = _fitting(measurement, self.context), 0
         if isinstance(measurement, Measurement):
-            measurement, left_out = counting_boxes(measurement)
+            measurement, left_out = _counting_boxes(measurement)
         lag = self._lag.add(measurement, self.stamp_ns, self._step)
         if lag is None:
             return self._begun_anew(measurement)
@@ -216,8 +218,7 @@ class WorldFilter:
         memory, measurement, looks = step.new_looks(memory, measurement, self.start_ns, self.settings)
         # Evidence first: association and births need the explanations of this very window.
         memory = step.update_evidence(memory, measurement, weight, model)
-        for seen, look_weight in looks:
-            memory = vision_update(memory, measurement, seen, look_weight, model.site)
+        memory = step.update_looks(memory, measurement, looks, model)
         memory = update_advisories(memory, measurement, model)
         memory = step.update_sequence(memory, measurement, [seen for seen, _ in looks], model)
         return step.update_entities(memory, measurement, model)
@@ -329,6 +330,20 @@ def _with_likeliest(memory: Memory) -> Memory:
     order = sorted(range(len(tracks)), key=lambda i: (tracks[i].detected, -tracks[i].existence))
     kept = tuple(tracks[i] for i in sorted(order[:MOST_TRACKS]))
     return replace(memory, tracks=kept, tracks_left_out=memory.tracks_left_out + left_out)
+
+
+def _counting_boxes(measurement: Measurement) -> tuple[Measurement, int]:
+    """Return a measurement with the boxes of each image that count, and the number of the others."""
+    left_out = sum(max(len(one.sightings) - MOST_BOXES, 0) for one in measurement.looks)
+    if not left_out:
+        return measurement, 0
+    further = tuple(replace(one, sightings=_counting(one.sightings)) for one in measurement.further)
+    return replace(measurement, sightings=_counting(measurement.sightings), further=further), left_out
+
+
+def _counting(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
+    """Return the moving ones and those of the highest score, however a detector lists them."""
+    return tuple(sorted(sightings, key=lambda one: (not one.moving, -one.score, BY_ALL(one)))[:MOST_BOXES])
 
 
 def _fitting(measurement: object, context: Context) -> Timed:

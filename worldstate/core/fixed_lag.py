@@ -5,13 +5,13 @@ and those after it once more. One that was delivered before is dropped, one olde
 that is ahead of all others by more than the lag waits until another one confirms its stamp.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TypeAlias
 
-from worldstate.ground.serialisation import ADDED
+from worldstate.ground.serialisation import ADDED, encode
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
 from worldstate.state import Delivery
@@ -37,7 +37,7 @@ class Arrival:
 
     @property
     def key(self) -> tuple[int, str]:
-        """What arrivals are in order of; one source says one thing at a time."""
+        """What a delivery is known by; one source measures one thing at a time."""
         return self.measurement.stamp_ns, self.measurement.source
 
 
@@ -93,9 +93,10 @@ class FixedLag:
 
     def _taken(self, measurement: Timed, step: Step) -> "FixedLag":
         """Return the buffer with a measurement in its place, and those after it taken in once more."""
-        stamp_ns, keys = measurement.stamp_ns, [one.key for one in self.arrivals]
-        at = bisect_left(keys, (stamp_ns, measurement.source))
-        memory = self.arrivals[at].before if at < len(keys) else self.latest
+        stamp_ns, stamps_ns = measurement.stamp_ns, [one.measurement.stamp_ns for one in self.arrivals]
+        at, end = bisect_left(stamps_ns, stamp_ns), bisect_right(stamps_ns, stamp_ns)
+        at += sum(_content(one.measurement) < _content(measurement) for one in self.arrivals[at:end])
+        memory = self.arrivals[at].before if at < len(stamps_ns) else self.latest
         kept = list(self.arrivals[:at])
         for one in (measurement, *(later.measurement for later in self.arrivals[at:])):
             kept.append(Arrival(one, memory))
@@ -118,6 +119,16 @@ class FixedLag:
         if stamp_ns - since_ns >= REANCHOR_NS:
             return None
         return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
+
+
+def _content(measurement: Timed) -> tuple[int, str]:
+    """Return what measurements of one instant are in order of: their kind, and all of them but names."""
+    if isinstance(measurement, Odometry):
+        return 0, str(encode(replace(measurement, source="-")))
+    if isinstance(measurement, PositionScan):
+        return 2 + (measurement.searched is None), str(encode(replace(measurement, source="-")))
+    looks = sorted(str(encode(replace(one, look=replace(one.look, sensor="-")))) for one in measurement.looks)
+    return 1, str((looks, encode(replace(measurement, source="-", look=None, sightings=(), further=()))))
 
 
 @dataclass(frozen=True, slots=True)

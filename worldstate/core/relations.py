@@ -60,8 +60,8 @@ def _edges(track: Track, memory: Memory, context: Context) -> Iterator[Relation]
         share = hidden_share(track, memory.sides)
         yield Relation(track.id, occluder, "occluded_by", share, stamp_ns)
         yield Relation(track.id, occluder, "approaching_from", share * _comes(track, memory), stamp_ns)
-    elif track.was_hidden:
-        yield Relation(track.id, occluder, "emerged_from", 1.0, stamp_ns)
+    elif track.came_from >= _LEAST:
+        yield Relation(track.id, occluder, "emerged_from", track.came_from, stamp_ns)
     if track.approach_heard:
         deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
         yield Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns)

@@ -7,27 +7,28 @@ from operator import attrgetter
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.belief.association import HANDOVER_RESIDUAL
+from worldstate.belief.detection import camera_scan, position_scan
 from worldstate.belief.hidden_bearing import announced, hidden_motion
 from worldstate.belief.kinematics.cartesian import corrected, driven
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track, hidden_share, predict_tracks, turned
+from worldstate.ground import FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan
 
 from .acoustic_update import acoustic_update
 from .advisories import NO_LOOK, advisories, claimed_nats, ruled
 from .birth_death import HIDDEN, birth_death, events_between, merged_tracks, past_edges, published, surviving
+from .detection_update import detection_update
 from .fixed_lag import LAG_NS
 from .memory import FORGOTTEN_NS, CountedLook, Memory, SourceRule, without_forgotten
-from .position_update import position_update
 from .relations import relations_at
 from .sequence_memory import alerted, carried, informed
 from .site_model import FilterModel, from_here
-from .vision_update import log_co_evidence
 
 
 def update_odometry(memory: Memory, told: Odometry) -> Memory:
@@ -119,6 +120,16 @@ def _places_passed(before: Sequence[Track], memory: Memory, model: FilterModel) 
     return past_edges(memory, left, (), memory.stamp_ns)
 
 
+def update_looks(
+    memory: Memory, measurement: Measurement, looks: Sequence[tuple[CameraLook, float]], model: FilterModel
+) -> Memory:
+    """Return the memory after the new looks of a measurement, all cameras at once."""
+    if not looks:
+        return memory
+    scans = [camera_scan(seen, model.site.view(seen.look), weight) for seen, weight in looks]
+    return detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
+
+
 def update_evidence(memory: Memory, measurement: Measurement, weight: float, model: FilterModel) -> Memory:
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
     windows = memory.windows
@@ -148,6 +159,12 @@ def masked_by(signature: SignatureEvidence, share: float) -> SignatureEvidence:
     return replace(signature, hidden=tuple(heard.tolist()))
 
 
+def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
+    """Return log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
+    hidden, visible, none = answer.log_likelihoods().tolist()
+    return np.array([*[hidden] * directions, visible, none])
+
+
 def _with_hand_overs(
     signature: SignatureEvidence, handover_ns: tuple[int | None, ...], begin_ns: int
 ) -> SignatureEvidence:
@@ -165,7 +182,7 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     settings, last = model.site.settings, _last_look(memory, scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     weight = min(elapsed_s / settings.look_interval_s, 1.0)
-    memory = position_update(memory, scan, weight, model.site)
+    memory = detection_update(memory, [position_scan(scan, weight)], None, scan.stamp_ns, model.site)
     memory = replace(memory, looks=_with_look(memory, _scan_look(scan)), seq=memory.seq + 1)
     if memory.sequence is not None:
         memory = replace(memory, sequence=alerted(memory.sequence, model.context))

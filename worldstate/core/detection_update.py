@@ -1,0 +1,300 @@
+"""Update the entities with the detections of one instant: found, missed, announced, handed over."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
+from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, Association, associated
+from worldstate.belief.detection import Detection, Scan, fused
+from worldstate.belief.kinematics.cartesian import (
+    CartesianBelief,
+    at_position,
+    update_bearing,
+    update_position,
+)
+from worldstate.belief.kinematics.motion import (
+    AZIMUTH,
+    AZIMUTH_RATE,
+    LOG_RANGE,
+    RADIAL_RATE,
+    MotionBelief,
+    update,
+)
+from worldstate.belief.site_geometry import SiteGeometry, normal_share
+from worldstate.belief.track import (
+    Track,
+    after_empty_look,
+    after_sighting,
+    born,
+    follow_places,
+    merged,
+    relabelled,
+)
+from worldstate.ground import BoolArray, FloatArray, seconds, wrap_angle
+from worldstate.measurement import Sector
+
+from .birth_death import REOCCLUSION_NS, after_look
+from .memory import NEWS_HOLDS_NS, Memory
+
+# Of (theta_dot rad/s, rho 1/s) at the first box: a car at 50 km/h passing at 15 m has .9 rad/s, two
+# deviations. A parked one has none, but zero would make the covariance singular.
+_NEW_RATE_STD = (0.5, 0.5)
+_PARKED_RATE_STD = (1e-3, 1e-3)
+_ROUNDING = 1e-12  # Odds of certainty have no quotient
+_Found = Mapping[int, Detection]  # By the index of the track
+
+
+def detection_update(
+    memory: Memory, scans: Sequence[Scan], asked: CoEvidence | None, stamp_ns: int, site: SiteGeometry
+) -> Memory:
+    """Return the memory after all looks of an instant, whose order carries no meaning.
+
+    `asked` is what cameras answer of the sector of a sound; None of positions.
+    """
+    known, (detections, by_look) = memory.tracks, fused(scans)
+    whose = associated(known, detections, site)
+    memory, fresh = _born(memory, [detections[j] for j in whose.new], scans[0], stamp_ns, site)
+    tracks = (*known, *fresh)
+    rows = whose.found | dict(enumerate(whose.new, start=len(known)))
+    found = {i: detections[j] for i, j in rows.items()}
+    if scans[0].sector is None:
+        existence = [_told(one, found.get(i), scans[0]) for i, one in enumerate(tracks)]
+    else:
+        existence = _existence(tracks, found, _hits(tracks, rows, whose, by_look), scans)
+    moved, views, chances = (
+        _moved(tracks, found),
+        _other_views(memory, scans),
+        whose.chances + [1.0] * len(fresh),
+    )
+    after = list[Track]()
+    for i, track in enumerate(tracks):
+        if i in found:
+            changes = moved[i] | _seen_as(track, found[i], chances[i], scans, stamp_ns, site)
+        else:
+            changes = _unseen(track, scans, asked, views, stamp_ns, site)
+        after.append(replace(track, existence=existence[i], **changes))
+    if scans[0].sector is None:
+        after = [_announced(one, site) if i in found else one for i, one in enumerate(after)]
+    return after_look(memory, follow_places(after, site), whose, stamp_ns, site)
+
+
+def _born(
+    memory: Memory, new: Sequence[Detection], scan: Scan, stamp_ns: int, site: SiteGeometry
+) -> tuple[Memory, list[Track]]:
+    """Return new entities before their detections count; hidden where messages say so."""
+    fresh, births, sighted = list[Track](), list(memory.births), memory.sighted
+    for one in new:
+        side = site.hiding_side(one.azimuth_rad) if one.found is None else None
+        existence = min(one.existence, MOST_EXISTENCE)
+        if side is None:
+            track = born("visible", sighted, existence, stamp_ns, site)
+            fresh.append(replace(track, side=site.nearest_side(one.azimuth_rad)))
+            sighted += 1
+        else:
+            track = born(site.sides[side].label, births[side], existence, stamp_ns, site)
+            fresh.append(replace(track, side=side, came_from=1.0))
+            births[side] += 1
+    fresh = [replace(one, sources=(scan.source,)) for one in fresh]
+    return replace(memory, births=tuple(births), sighted=sighted), fresh
+
+
+def _hits(
+    tracks: Sequence[Track], rows: Mapping[int, int], whose: Association, by_look: BoolArray
+) -> FloatArray:
+    """Return P(a look has detected a track), certain of a first detection, shape (tracks, looks)."""
+    hits = np.zeros((len(tracks), by_look.shape[1]))
+    hits[: whose.pairs.shape[1]] = np.minimum(whose.pairs.T @ by_look, 1.0)
+    for i, j in rows.items():
+        if not tracks[i].seen:
+            hits[i] = by_look[j]
+    return hits
+
+
+def _existence(
+    tracks: Sequence[Track], found: _Found, hits: FloatArray, scans: Sequence[Scan]
+) -> list[float]:
+    r"""Return the existence after every look s of an instant, each with the chance c that it has detected it.
+
+    .. math:: r_s = c_s\, r_+ + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
+              p_s = p_D\, P_{range}\, (1 - P_{hidden}), \qquad
+              \frac{r'}{1 - r'} = \frac{r}{1 - r} \prod_s \frac{r_s}{1 - r_s} \frac{1 - r}{r}
+    """
+    if not tracks:
+        return []
+    first = {i: one.existence for i, one in found.items() if not tracks[i].seen}
+    before = np.array([max(one.existence, first.get(i, 0.0)) for i, one in enumerate(tracks)])
+    counts = np.array([one.detected or i in first for i, one in enumerate(tracks)])
+    r = before.clip(_ROUNDING, 1.0 - _ROUNDING)
+    seen = np.array([one.seen for one in tracks])
+    in_sight = np.where(seen, 1.0, 1.0 - np.array([one.behind for one in tracks]))
+    odds = ratio = r / (1.0 - r)
+    for hit, scan in zip(hits.T, scans, strict=True):
+        detected = _searched(tracks, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
+        missed = after_empty_look(r, 1.0 - detected)
+        missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
+        now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
+        ratio = ratio * (now / (1.0 - now)) / odds
+    existence: list[float] = np.where(counts, ratio / (1.0 + ratio), before).tolist()
+    return existence
+
+
+def _searched(tracks: Sequence[Track], scan: Scan) -> FloatArray:
+    """Return P(a look covers it) of every track, by the range of the sensor in its sector."""
+    if scan.sector is None or scan.miss_rate is None:
+        return np.zeros(len(tracks))
+    azimuth_rad = np.array([one.motion.azimuth_rad for one in tracks])
+    covers = np.abs(wrap_angle(azimuth_rad - scan.sector.centre_rad)) <= scan.sector.half_width_rad
+    if math.isinf(scan.range_m):
+        return covers.astype(float)
+    farther = [math.log(scan.range_m) - one.motion.mean[LOG_RANGE] for one in tracks]
+    stds = [math.sqrt(one.motion.covariance[LOG_RANGE, LOG_RANGE]) for one in tracks]
+    shares = [normal_share(gap / std) for gap, std in zip(farther, stds, strict=True)]
+    return np.where(covers, shares, 0.0)
+
+
+def _told(track: Track, told: Detection | None, scan: Scan) -> float:
+    """Return the existence after messages."""
+    # A sender that lies in one message lies in the next: what a source repeats counts once.
+    if told is None or scan.source in track.sources:
+        return track.existence
+    odds = told.existence / (1.0 - told.existence)
+    before = min(track.existence, MOST_EXISTENCE)
+    return min(before * odds / (before * odds + 1.0 - before), MOST_EXISTENCE)
+
+
+def _moved(tracks: Sequence[Track], found: _Found) -> dict[int, dict[str, Any]]:
+    """Return the motion or the place of the found tracks, by their index, after what was measured of them."""
+    moved, usual = dict[int, dict[str, Any]](), list[int]()
+    for i, one in found.items():
+        track = tracks[i]
+        if one.position is not None or track.place is not None:
+            moved[i] = {"place": _placed(track, one)}
+        elif track.seen and one.moving == track.moving:
+            usual.append(i)
+        else:
+            moved[i] = {"motion": _motion_at(one, track.motion)}
+    if usual:
+        motion = MotionBelief.stacked([tracks[i].motion for i in usual])
+        azimuth_rad = np.array([found[i].azimuth_rad for i in usual])
+        std_rad = np.array([found[i].std_rad for i in usual])
+        after = update(motion, AZIMUTH, azimuth_rad, std_rad, weight=1.0).each()
+        moved |= {i: {"motion": one} for i, one in zip(usual, after, strict=True)}
+    return moved
+
+
+def _placed(track: Track, found: Detection) -> CartesianBelief:
+    position, place = found.position, track.place
+    if position is None:
+        assert place is not None
+        return update_bearing(place, found.azimuth_rad, found.std_rad)
+    if place is not None:
+        return update_position(place, position)
+    place = at_position(position)
+    if not track.seen:
+        return place
+    return update_bearing(place, track.motion.azimuth_rad, track.motion.azimuth_std_rad)
+
+
+def _motion_at(box: Detection, before: MotionBelief) -> MotionBelief:
+    """Return the motion belief at a box, with approach rate and range of an earlier belief."""
+    rate_std, radial_std = _NEW_RATE_STD if box.moving else _PARKED_RATE_STD
+    mean, std = [box.azimuth_rad, 0.0, 0.0, 3.2], [box.std_rad, rate_std, radial_std, 0.6]
+    if box.moving:
+        mean[2:] = before.mean[RADIAL_RATE:].tolist()
+        std[2:] = np.sqrt(np.diag(before.covariance)[RADIAL_RATE : LOG_RANGE + 1]).tolist()
+    return MotionBelief.around((mean[0], mean[1], mean[2], mean[3]), (std[0], std[1], std[2], std[3]))
+
+
+def _seen_as(
+    track: Track, found: Detection, chance: float, scans: Sequence[Scan], stamp_ns: int, site: SiteGeometry
+) -> dict[str, Any]:
+    """Return what a detection changes of its track; one not in view before takes its side and class there."""
+    classes, changes = found.classes, dict[str, Any](updated_ns=stamp_ns)
+    if classes:
+        changes["labels"] = relabelled(track.labels, classes) if track.seen else classes
+    if found.moving is not None:
+        changes["moving"] = found.moving
+    if found.position is None:
+        changes["width_rad"] = found.width_rad
+    else:
+        changes["approach_heard"] = True
+    changes["sources"] = merged(track.sources, scans[0].source)
+    if found.found is None:
+        return changes
+    if not track.seen:
+        side = site.nearest_side(found.azimuth_rad)
+        changes |= {"seen": True, "side": side, "came_from": track.came_from * chance}
+    miss_rate = _miss_rate(scans, found.azimuth_rad)
+    return changes | {"last_seen_ns": stamp_ns, "answer": "visible", "miss_rate": miss_rate}
+
+
+def _miss_rate(scans: Sequence[Scan], azimuth_rad: float) -> float | None:
+    """Return P(all looks miss what is in view there), None where none has searched."""
+    rates = [one.miss_rate or 0.0 for one in scans if one.searches(azimuth_rad)]
+    return math.prod(rates) if rates else None
+
+
+def _announced(track: Track, site: SiteGeometry) -> Track:
+    """Return a track that a message has placed, on the side whose occluder hides it there, if one does."""
+    assert track.place is not None
+    x, y = track.place.mean[:2].tolist()
+    side = site.hiding_side(math.atan2(y, x))
+    unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
+    if side is None or (track.seen and unseen_ns <= REOCCLUSION_NS):
+        return track
+    return replace(track, side=side, seen=False, came_from=1.0)
+
+
+def _unseen(
+    track: Track,
+    scans: Sequence[Scan],
+    asked: CoEvidence | None,
+    views: Sequence[Sector],
+    stamp_ns: int,
+    site: SiteGeometry,
+) -> dict[str, Any]:
+    """Return what the looks of an instant, none of which has found a track, change of its last answer."""
+    absent, unasked = {"answer": "absent"}, {"answer": "unqueried", "miss_rate": None}
+    if not track.detected:
+        # What is only heard was asked of in the sector of its sound.
+        if isinstance(asked, Absent):
+            return absent | {"miss_rate": asked.miss_rate}
+        return {} if asked is None else unasked
+    miss_rate = _miss_rate(scans, track.motion.azimuth_rad)
+    if miss_rate is not None:
+        left = asked is not None and _has_left(track, miss_rate, stamp_ns, site)
+        return unasked if left else absent | {"miss_rate": miss_rate}
+    # Where only other cameras have looked, or a radar elsewhere, the last answer holds.
+    covered = any(one.touches(track.motion.azimuth_rad) for one in views)
+    return {} if asked is None or covered else unasked
+
+
+def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
+    """Return where cameras with a sector of their own looked in the last second."""
+    if not any(one.names_sector for one in scans):
+        return []
+    recent = (one for one in memory.looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
+    asked = (one for one in recent if not isinstance(one.answer, Unqueried))
+    return [Sector.between(*one.sector_rad) for one in asked if one.sector_rad is not None]
+
+
+def _has_left(track: Track, miss_rate: float, stamp_ns: int, site: SiteGeometry) -> bool:
+    r"""Tell whether the likelier reason of a miss is that its leading end has passed the edge ahead of it.
+
+    .. math:: p \ge (1 - p)\, \beta^{\min(t / T, 1)}
+
+    with the chance p of that, the time t since its last box and the interval T of looks. Boxes end as soon as
+    a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
+    """
+    if not (track.seen and track.moving):
+        return False
+    way = math.copysign(1.0, track.motion.mean[AZIMUTH_RATE])
+    end_rad = track.motion.azimuth_rad + 0.5 * way * track.width_rad
+    past = site.past_edge(end_rad, track.motion.azimuth_std_rad, way)
+    unseen_s = seconds(stamp_ns - (track.last_seen_ns or 0))
+    missed = math.pow(miss_rate, min(unseen_s / site.settings.look_interval_s, 1.0))
+    return past >= (1.0 - past) * missed
