@@ -76,7 +76,8 @@ class Entity:
     moving : bool
         False for an object that vision holds for parked.
     direction : str or None
-        Approach side that it is or was hidden on.
+        Approach side that it is hidden on; of one in view, the side it came from, or whose edge it was first
+        seen nearest to.
     azimuth_rate_rad_s : float or None
         d azimuth / dt, rad/s; None while hidden.
     range_m : float or None
@@ -198,7 +199,8 @@ class Relation:
         the ego vehicle, ``"same_lane"`` and ``"in_front_of"`` to what an entity is next ahead of, the ego
         vehicle or another entity; these three are told of entities with a position.
     probability : float
-        Probability that it holds, given that both ends exist.
+        Probability that it holds, given that both ends exist; of ``"emerged_from"``, that the detection at
+        the hand-over was of the entity that was hidden there.
     stamp_ns : int
         Time of the belief, ns.
     since_ns, until_ns : int or None
