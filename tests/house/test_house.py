@@ -67,7 +67,7 @@ def test_what_the_project_is_built_on_is_imported_by_the_product(package):
 
 OPTIONAL = {
     "sklearn": ("worldstate.operations.train_model(None, None, dataset='', group='static')", "train"),
-    "matplotlib": ("worldstate.operations.write_timeline(None, pathlib.Path('a.png'))", "plot"),
+    "matplotlib": ("worldstate.operations.write_state_figure([], pathlib.Path('a.png'))", "plot"),
     "networkx": ("worldstate.WorldState(0, 0).graph()", "graph"),
 }
 

@@ -1,14 +1,28 @@
 """Figures of snapshots: what stands in them, and where the command refuses."""
 
+from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from scripted_states import scripted_states
 
 from worldstate.cli.main import main
-from worldstate.operations.viewing.state_figure import write_animation, write_birds_eye
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.figure_style import with_gaps
+from worldstate.operations.recordings.true_track import TrueTrack, read_true_tracks
+from worldstate.operations.viewing import state_figure
+from worldstate.operations.viewing.state_figure import (
+    SoundPower,
+    write_animation,
+    write_birds_eye,
+    write_state_figure,
+)
+
+TIME_S = 0.2 + 0.1 * np.arange(40)
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +92,73 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(log, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     assert main(["log", "plot", str(log), *options]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.fixture
+def panels(states, tmp_path, monkeypatch):
+    """Return the panels of the figure over time, which is drawn and not written."""
+
+    def drawn(states=states, **parts):
+        figure = Figure(figsize=(10.0, 9.6), layout="constrained")
+
+        @contextmanager
+        def lent(*rest):
+            yield figure
+
+        monkeypatch.setattr(state_figure, "figure_file", lent)
+        write_state_figure(states, tmp_path / "states.png", **parts)
+        return figure.axes[:4]
+
+    return drawn
+
+
+def test_the_true_track_is_drawn_in_line_of_sight_and_out_of_it(panels):
+    in_view = (TIME_S > 2.15) & (TIME_S < 3.65)
+    true = TrueTrack(TIME_S, 0.02 * np.arange(40), in_view, np.zeros((40, 2)))
+    shown = panels(t0_s=2.2, truth=(true,))
+    lines = {line.get_label(): line for line in shown[0].lines}
+    seen = lines["vehicle, truth, in sight"]
+    assert seen.get_xdata()[np.isfinite(seen.get_ydata())][[0, -1]] == pytest.approx([2.2, 3.6])
+    assert lines["line-of-sight entry $T_0$"].get_xdata() == [2.2, 2.2]
+    shown[0].figure.draw_without_rendering()
+    for axes in (shown[0], *shown[2:]):
+        assert not axes.get_legend().get_window_extent().overlaps(axes.get_window_extent())
+    assert not any("truth" in line.get_label() for line in panels()[0].lines)
+
+
+def test_a_recording_without_truth_has_no_true_track(tmp_path):
+    assert read_true_tracks(tmp_path) == ()
+    (tmp_path / "truth.json").write_text("[1]")
+    with pytest.raises(InputFileError, match="truth"):
+        read_true_tracks(tmp_path)
+
+
+def test_power_is_drawn_where_it_was_heard(panels):
+    sound = SoundPower(TIME_S, np.linspace(-1.5, 1.5, 7), np.ones((40, 7)))
+    edges = np.asarray(panels(sound=sound)[0].collections[0].get_coordinates()[0, :, 0])
+    assert (edges[1:] + edges[:-1]) / 2 == pytest.approx(TIME_S)
+
+
+def test_the_axis_begins_with_the_first_window_on_a_clock_of_1970_too(panels, states):
+    late = [replace(state, stamp_ns=state.stamp_ns + 1_700_000_000 * 10**9) for state in states]
+    for told in (states, late):
+        low, high = panels(told)[0].get_xlim()
+        assert low == pytest.approx(told[0].stamp_ns / 1e9 - 1.0, abs=1e-3)
+        assert high == pytest.approx(told[-1].stamp_ns / 1e9 + 0.1, abs=1e-3)
+
+
+def test_an_advisory_stands_in_the_row_of_its_side(panels, states):
+    raised = [one for one in states if any(cue.direction == "left" and cue.advisory for cue in one.cues)]
+    rows = panels()[1]
+    names = [label.get_text() for label in rows.get_yticklabels()]
+    bar = rows.collections[0].get_paths()[0].get_extents()
+    assert names[round((bar.y0 + bar.y1) / 2)] == "advisory left"
+    assert bar.x0 == pytest.approx(raised[0].stamp_ns / 1e9)
+
+
+def test_no_line_is_drawn_across_a_gap():
+    apart = np.column_stack([np.concatenate([TIME_S[2:6], TIME_S[20:30]]), np.ones(14)])
+    broken = with_gaps(apart)
+    assert np.isnan(broken[4]).all()
+    assert np.isfinite(np.delete(broken, 4, axis=0)).all()
+    assert np.isfinite(with_gaps(np.column_stack([TIME_S, TIME_S]))).all()

@@ -62,14 +62,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.source_files import open_source
     from worldstate.cli.common.listening import listen_with_progress
-    from worldstate.operations.recordings.timeline import write_timeline
+    from worldstate.operations.viewing.state_figure import drawn_run
 
     out = output_folder(arguments.out, "timeline.png", "states.jsonl", "summary.json")
     folder = simulate_approach(out / "recording", arguments.seed)
-    report = listen_with_progress(
-        open_source(folder), title=f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}",
-        states_path=out / "states.jsonl",
-    )  # fmt: skip
-    write_timeline(report.timeline, out / "timeline.png")
+    source, title = open_source(folder), f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}"
+    with drawn_run(out / "timeline.png", source, title) as draw:
+        report = listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
     write_report(out / "summary.json", report.to_dict())
     return CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}"])

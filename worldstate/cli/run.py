@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionLog
     from worldstate.adapters.files.odometry_file import OdometryLog
+    from worldstate.adapters.listener import Step
     from worldstate.adapters.source import Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
@@ -77,22 +78,26 @@ def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> Comman
     """Listen to the recording; return what was found."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
-    from worldstate.operations.recordings.timeline import write_timeline
+    from worldstate.operations.viewing.state_figure import drawn_run
 
     source = _source(arguments, given)
     try:
-        with exports.exported_hops(arguments, source, given.car.crossing_m) as export:
-            report = listening.listen_with_progress(
-                source, title=str(source.audio_path), states_path=arguments.out, on_hop=export
-            )
+        with (
+            drawn_run(arguments.figure, source, str(source.audio_path)) as draw,
+            exports.exported_hops(arguments, source, given.car.crossing_m) as export,
+        ):
+
+            def on_hop(step: "Step") -> None:
+                export(step)
+                draw(step)
+
+            report = listening.listen_with_progress(source, states_path=arguments.out, on_hop=on_hop)
     except SilentChannelsError as error:
         if arguments.mask_dead:
             raise
         raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
     if arguments.save_state is not None and report.end is not None:
         save_checkpoint(arguments.save_state, report.end)
-    if arguments.figure is not None:
-        write_timeline(report.timeline, arguments.figure)
     summary = report.to_dict() | {
         "array": inputs.stance(source.array),
         "detections": sensors.box_counts(source, as_json=arguments.json),

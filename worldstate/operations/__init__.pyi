@@ -9,7 +9,6 @@ from .metrics.roc import auroc as auroc
 from .recordings.hop_table import HopTable as HopTable
 from .recordings.recording_report import RecordingReport as RecordingReport
 from .recordings.recording_report import run_recording as run_recording
-from .recordings.timeline import Timeline as Timeline
-from .recordings.timeline import write_timeline as write_timeline
 from .training.training import TrainingSettings as TrainingSettings
 from .training.training import train_model as train_model
+from .viewing.state_figure import write_state_figure as write_state_figure

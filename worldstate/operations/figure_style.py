@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".svg", ".pdf")
-# Hops further apart than this are not joined by a line.
+# Hops further apart than this are not joined by a line: one may be missing.
 HOP_S = 0.1
-GAP_S = 1.5 * HOP_S
+GAP_S = 2.5 * HOP_S
 # 150 dots an inch: a figure 9 inches wide is 1350 pixels, and still sharp at the 830 of a README page.
 _DPI = 150
 # The palette of Okabe and Ito, told apart with any colour vision; black is left to axes and bounds.
@@ -69,20 +69,15 @@ def figure_style() -> Iterator[None]:
 
 @contextmanager
 def figure_file(path: Path, width_in: float, height_in: float) -> Iterator["Figure"]:
-    """Lend an empty figure, and write it to `path` when the block ends without an error."""
+    """Lend an empty figure; it is written, whole, when the block ends without an error."""
     check_suffix(path)
     from matplotlib.figure import Figure
 
     with figure_style():
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         yield figure
-        save_figure(figure, path)
-
-
-def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a figure whole or not at all, in the format that the suffix names."""
-    with atomic_path(check_suffix(path)) as temporary:
-        figure.savefig(temporary, dpi=_DPI, format=path.suffix[1:].lower())
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, dpi=_DPI, format=path.suffix[1:].lower())
 
 
 def legend_beside(axes: "Axes", title: str | None = None) -> None:
@@ -128,9 +123,9 @@ def name_rows(axes: "Axes", names: Sequence[str]) -> None:
     axes.tick_params(axis="y", length=0)
 
 
-def with_gaps(rows: FloatArray, longest_s: float = GAP_S) -> FloatArray:
+def with_gaps(rows: FloatArray) -> FloatArray:
     """Put a row of NaN where rows lie further apart in time, so that no line is drawn across.
 
     Shapes: rows (n, columns), the first column the time, seconds.
     """
-    return np.insert(rows, np.flatnonzero(np.diff(rows[:, 0]) > longest_s) + 1, np.nan, axis=0)
+    return np.insert(rows, np.flatnonzero(np.diff(rows[:, 0]) > GAP_S) + 1, np.nan, axis=0)

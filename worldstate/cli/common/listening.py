@@ -167,7 +167,6 @@ def open_given(
 def listen_with_progress(
     source: "Source",
     *,
-    title: str,
     states_path: Path | None,
     on_hop: "Callable[[Step], None]" = lambda step: None,
 ) -> "RecordingReport":
@@ -185,7 +184,7 @@ def listen_with_progress(
             on_hop(step)
             bar.advance()
 
-        return run_recording(source, title=title, states_path=states_path, on_hop=follow)
+        return run_recording(source, states_path=states_path, on_hop=follow)
 
 
 def read_streams(

@@ -1,7 +1,8 @@
 """A run drawn from its snapshots: over time, over the power of the sound, from above, and moving."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,13 +13,16 @@ from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.listener import Step
+from worldstate.adapters.source import Source
 from worldstate.frontend.settings import HOP_RATE_HZ, WINDOW_HOPS
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import LEAST_HEARD, InputFileError, seconds
-from worldstate.ground.typing import FloatArray
+from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.operations.figure_style import (
     BLUE,
     GREEN,
+    HOP_S,
     ORANGE,
     PURPLE,
     RED,
@@ -31,6 +35,7 @@ from worldstate.operations.figure_style import (
     name_rows,
     with_gaps,
 )
+from worldstate.operations.recordings.true_track import TrueTrack, read_true_tracks
 from worldstate.state import Entity, Occluder, RiskCue, WorldState
 
 if TYPE_CHECKING:
@@ -39,8 +44,9 @@ if TYPE_CHECKING:
 
 # Of the sides, told apart from red and blue, which say hidden and in view.
 _SIDE_COLORS = (PURPLE, GREEN, ORANGE, SKY)
-# States further apart are not joined by a line: nothing was heard between them.
-_GAP_S = 0.25
+_WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
+# Longest title in one line above a figure of this width.
+_TITLE_CHARACTERS = 100
 # An entity is drawn where it more likely exists than not.
 _LIKELY = 0.5
 # A GIF this large has 576 x 416 pixels: labels of 9 points are still read in a browser.
@@ -74,31 +80,84 @@ def sound_power(
     for block in audio.blocks(audio.sample_rate_hz):
         rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.process(block)]
         on_second()
-    time_s, power = np.array([t for t, _ in rows]), np.array([row for _, row in rows])
+    return _power([t for t, _ in rows], front_end.settings.azimuths_rad(), [row for _, row in rows])
+
+
+def _power(ends_s: Sequence[float], azimuths_rad: FloatArray, rows: Sequence[Float32Array]) -> SoundPower:
     # Drawn at its end, a window of a second would lag the camera by half of one.
-    age_s = 0.5 * WINDOW_HOPS / HOP_RATE_HZ
-    return SoundPower(time_s - age_s, front_end.settings.azimuths_rad(), power)
+    return SoundPower(np.array(ends_s) - 0.5 * _WINDOW_S, azimuths_rad, np.array(rows))
+
+
+@contextmanager
+def drawn_run(path: Path | None, source: Source, title: str) -> Iterator[Callable[[Step], None]]:
+    """Lend a function that takes the hops of a recording; they are drawn when the block ends, if anywhere."""
+    states, power, azimuths_rad = list[WorldState](), list[Float32Array](), np.empty(0)
+
+    def keep(step: Step) -> None:
+        nonlocal azimuths_rad
+        states.append(step.state)
+        power.append(step.frame.srp.astype(np.float32))
+        azimuths_rad = step.frame.azimuths_rad
+
+    yield (lambda step: None) if path is None else keep
+    if path is not None and states:
+        sound, truth = _power(_times(states), azimuths_rad, power), read_true_tracks(source.audio_path.parent)
+        write_state_figure(states, path, title=title, sound=sound, t0_s=source.t0_s, truth=truth)
 
 
 def write_state_figure(
-    states: Sequence[WorldState], path: Path, *, title: str = "", sound: SoundPower | None = None
+    states: Sequence[WorldState],
+    path: Path,
+    *,
+    title: str = "",
+    sound: SoundPower | None = None,
+    t0_s: float | None = None,
+    truth: Sequence[TrueTrack] = (),
 ) -> None:
-    """Draw azimuths, what was raised and seen, existence and risk over time."""
+    """Draw azimuths, what was raised and seen, existence and risk over time.
+
+    Parameters
+    ----------
+    states : sequence of WorldState
+        Of one run, at least one.
+    path : Path
+        Exactly this file.
+    title : str
+        Heading of the figure.
+    sound : SoundPower, optional
+        Drawn below the azimuths.
+    t0_s : float, optional
+        Line-of-sight entry.
+    truth : sequence of TrueTrack
+        True tracks of the vehicles of a simulated recording.
+    """
     with figure_file(path, 10.0, 8.6 if sound is None else 9.6) as figure:
         heights = (1.0 if sound is None else 1.4, 0.42, 0.6, 0.6)
         azimuths, rows, existence, risk = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         if sound is not None:
             label = "power of the sound over its median over azimuth, each window at its middle"
             draw_power(azimuths, sound.time_s, sound.azimuths_rad, sound.power, label)
+        _draw_truth(azimuths, truth)
         _draw_azimuths(azimuths, states)
         _draw_rows(rows, states)
         _draw_existence(existence, states)
         _draw_risk(risk, states)
+        for axes in (azimuths, rows, existence, risk) if t0_s is not None else ():
+            entry = axes.axvline(t0_s, color="black", lw=1.2, ls="--")
+            entry.set_label("line-of-sight entry $T_0$" if axes is azimuths else "")
         for axes in (azimuths, existence, risk):
             legend_beside(axes)
-        time_s = _times(states)
-        risk.set(xlabel="time (s), end of the decision window", xlim=(time_s[0] - 0.1, time_s[-1] + 0.1))
-        figure.suptitle(title)
+        # The first window begins a second before its decision.
+        span_s = _times(states)[0] - _WINDOW_S, _times(states)[-1] + HOP_S
+        risk.set(xlabel="time (s), end of the decision window", xlim=span_s)
+        figure.suptitle(title if len(title) <= _TITLE_CHARACTERS else "..." + title[-_TITLE_CHARACTERS:])
+
+
+def _draw_truth(axes: "Axes", truth: Sequence[TrueTrack]) -> None:
+    for track in truth:
+        for shown, style, name in ((~track.in_view, ":", "out of sight"), (track.in_view, "-", "in sight")):
+            line = np.where(shown, np.degrees(track.azimuth_rad), np.nan)
+            axes.plot(track.time_s, line, style, color="black", lw=2.0, label=f"vehicle, truth, {name}")
 
 
 def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
@@ -116,7 +175,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
                 tracks.setdefault((one.id, one.status == "hidden"), []).append(row)
     for (_, hidden), rows in tracks.items():
         color, label = (RED, "hidden") if hidden else (BLUE, "in view")
-        time_s, azimuth, low, high = with_gaps(np.array(rows), _GAP_S).T
+        time_s, azimuth, low, high = with_gaps(np.array(rows)).T
         axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
         axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
     axes.set(ylabel="azimuth (deg)\nleft positive", ylim=(-95, 95), yticks=range(-90, 91, 45))
@@ -150,7 +209,7 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
 
 def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
     rows = [(seconds(state.stamp_ns), *_existence(state, _sides(states))) for state in states]
-    time_s, *columns = with_gaps(np.array(rows), _GAP_S).T
+    time_s, *columns = with_gaps(np.array(rows)).T
     for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
         axes.plot(time_s, column, color=color, label=f"somebody hidden, {side}")
     axes.plot(time_s, columns[-1], color=BLUE, ls=":", label="the likeliest in view")
@@ -171,7 +230,7 @@ def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
     for row, side in enumerate(_sides(states)):
         cues = [next((one for one in state.cues if one.direction == side), None) for state in states]
         told = [(np.nan, np.nan) if c is None else (c.risk, (c.within or {}).get("3", np.nan)) for c in cues]
-        time_s, risk, within = with_gaps(np.column_stack([_times(states), told]), _GAP_S).T
+        time_s, risk, within = with_gaps(np.column_stack([_times(states), told])).T
         axes.plot(time_s, risk, color=_SIDE_COLORS[row], label=f"risk, {side}")
         if np.isfinite(within).any():
             axes.plot(time_s, within, color=_SIDE_COLORS[row], ls="--", label=f"in view within 3 s, {side}")
