@@ -10,9 +10,12 @@ from typing import Unpack
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, open_sound
+from worldstate.adapters.camera.detections import DetectionFrame
+from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.fixed_lag import Timed
 from worldstate.frontend.frame import AcousticFrame
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
@@ -100,12 +103,13 @@ class Listener:
         self.world = source.world()
         self._source, self._rate_hz = source, sample_rate_hz
         self._signature, self._reader = source.signature(), source.reader()
+        self._vision = source.co_evidence or source.camera_channel()
         self._adapter = AcousticAdapter(
             source.array,
             sample_rate_hz,
             self._signature,
             start_ns=source.start_ns,
-            vision=source.co_evidence or source.camera_channel(),
+            vision=self._vision,
             grounding=source.settings.grounding,
             guard=source.guard,
             road_users=source.road_users,
@@ -141,6 +145,31 @@ class Listener:
     def tell(self, *told: Timed) -> None:
         """Take odometry, positions or measurements of other sensors; each counts from its own stamp on."""
         self._waiting.add(told)
+
+    def look(self, stamp_ns: int, frame: DetectionFrame, camera: str = SENSOR) -> None:
+        """Take what a running detector found in an image; of several cameras the one is named.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            When the image was taken by the stamps of the camera, nanoseconds.
+        frame : DetectionFrame
+            All of its boxes.
+        camera : str
+            Name of the camera, where the source has several.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If there is no such camera.
+        InputFileError
+            If a box lies outside the image.
+        """
+        vision = self._vision
+        cameras = vision.cameras if isinstance(vision, SeveralCameras) else {SENSOR: vision}
+        if camera not in cameras:
+            raise InvalidArgumentError(f"camera: expected one of {', '.join(cameras)}, got {camera}")
+        cameras[camera].see(stamp_ns, frame)
 
     @property
     def checkpoint(self) -> Checkpoint:

@@ -1,6 +1,6 @@
 """What is listened to: a recording with its array, model, camera and what was believed before."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,16 +16,14 @@ from worldstate.adapters.audio.open_sound import SoundInput, path_of
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.filter import WorldFilter
-from worldstate.core.fixed_lag import Timed
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
 from worldstate.ground import InvalidArgumentError, NotUsable, in_range
-from worldstate.measurement.measurement import CoEvidenceChannel
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context
 
@@ -155,13 +153,11 @@ class Source:
         Reads when a vehicle comes into view; or why the model's cannot be used here.
     sides : SidePatterns or None
         What either arm of a known street sounds like; not read where `before` holds what was heard of it.
-    co_evidence : CoEvidenceChannel or None
-        Asked in place of the detections: a camera that runs.
+    co_evidence : SeveralCameras or None
+        Asked in place of the detections of one camera.
     others : tuple of callables
         What other sensors measured, odometry too, each returning it in the order of stamps on the clock of
         the sound.
-    told : callable or None
-        Asked once a hop what sensors that run have told up to its stamp.
 
     Examples
     --------
@@ -196,9 +192,8 @@ class Source:
     road_users: RoadUserModel | None = None
     sequence: SequenceModel | NotUsable | None = None
     sides: SidePatterns | None = None
-    co_evidence: CoEvidenceChannel | None = None
+    co_evidence: SeveralCameras | None = None
     others: tuple[OtherModality, ...] = ()
-    told: Callable[[int], Iterable[Timed]] | None = None
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""

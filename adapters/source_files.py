@@ -59,6 +59,7 @@ def open_source(
     resume: Path | str | Checkpoint | None = None,
     start_s: float = 0.0,
     ego: OdometryLog | None = None,
+    moving_ego: bool = False,
     others: Sequence[OtherModality] = (),
     settings: ListenSettings | None = None,
 ) -> Source:
@@ -99,6 +100,8 @@ def open_source(
         with a clock of its own brings it.
     ego : OdometryLog, optional
         How the ego vehicle moves, in place of the one speed of the context.
+    moving_ego : bool
+        Whether the ego vehicle will be told to move, as by a running odometry: chooses the model.
     others : sequence of callables, optional
         What other sensors measured: functions that return `Measurement` and `PositionScan` in their order.
     settings : ListenSettings, optional
@@ -134,7 +137,8 @@ def open_source(
     settings, context = settings or ListenSettings(), context or Context()
     sound = as_sound(path)
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
-    moves = bool((ego and ego.moves) or (recording and recording.moving_ego) or context.ego_speed_mps)
+    told = moving_ego or (ego is not None and ego.moves)
+    moves = bool(told or (recording and recording.moving_ego) or context.ego_speed_mps)
     known = model if isinstance(model, Model) else read_model(model, moving_ego=moves)
     source = replace(
         _heard(sound, known, _read(array, read_array), context, settings, moves),

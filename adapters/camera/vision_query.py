@@ -21,7 +21,7 @@ from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, 
 from worldstate.measurement.sector import WHOLE_SIDES, Sector
 
 from .box_linking import kept_and_parked
-from .detections import DetectionFilter, DetectionLog
+from .detections import DetectionFilter, DetectionFrame, DetectionLog
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
@@ -32,10 +32,15 @@ SAMPLES = 8
 BORDER_PX = 1.0
 
 
+# Looks of a running camera that are remembered: whether a box stands still is asked over the last second, and
+# more than 60 images a second bring nothing to a decision every 0.1 s.
+REMEMBERED = 64
 # Half the width of the sector around a bearing, and the probability that a moving object of the class is
 # reported where there is none, unless it was measured.
 _HALF_WIDTH_RAD, _CLUTTER_RATE = math.radians(10.0), 0.01
 MAX_IMAGE_AGE_S = 0.15  # At which an image is used: one and a half of OVAD's periods
+# Of a camera that runs, before its first image.
+NO_LOOKS = DetectionLog((), np.empty(0, dtype=np.int64), "the camera")
 
 
 class VisionQuery:
@@ -101,19 +106,54 @@ class VisionQuery:
         clutter: Callable[[float], float] | None = None,
     ) -> None:
         self.camera = camera
-        self.detections = detections
         self.miss_rate = miss_rate or default_miss_rates()
         self.keep = keep or DetectionFilter()
         self._degradation = degradation if callable(degradation) else lambda stamp_ns: degradation
-        self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
         self.view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
         self._clutter = clutter or (lambda d: _CLUTTER_RATE)
+        if detections is not None:
+            _check_size(camera, detections)
+        self._take(detections)
+
+    def _take(self, detections: DetectionLog | None) -> None:
+        self.detections = detections
+        self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
         # As background subtraction does: asked for a truck it would never find one.
         named = () if detections is None else (frame.labels for frame in detections.frames)
         self._calls_all_cars = set().union(*named) == {"car"}
-        if detections is not None:
-            _check_size(camera, detections)
+
+    def see(self, stamp_ns: int, frame: DetectionFrame) -> None:
+        """Take what a running detector found in an image; one that is no later than the last is left out.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            When the image was taken by the stamps of the camera, nanoseconds.
+        frame : DetectionFrame
+            All of its boxes.
+
+        Raises
+        ------
+        InputFileError
+            If a box lies outside the image.
+
+        Examples
+        --------
+        >>> from worldstate.adapters.camera.detections import DetectionFrame
+        >>> query = VisionQuery(PinholeCamera(), None)
+        >>> query.see(nanoseconds(0.9), DetectionFrame(np.empty((0, 4)), np.empty(0), ()))
+        >>> type(query.ask(nanoseconds(1.0), Bearing(0.0, 0.05))).__name__
+        'Absent'
+        """
+        before = self.detections or NO_LOOKS
+        new = DetectionLog((frame,), np.array([stamp_ns]), before.source).shifted(self.camera.stamp_offset_s)
+        if len(before.frames) and new.stamps_ns[0] <= before.stamps_ns[-1]:
+            return
+        _check_size(self.camera, new)
+        frames = (*before.frames, frame)[-REMEMBERED:]
+        stamps_ns = np.append(before.stamps_ns, new.stamps_ns)[-REMEMBERED:]
+        self._take(DetectionLog(frames, stamps_ns, before.source))
 
     def ask(
         self,

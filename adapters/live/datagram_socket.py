@@ -3,14 +3,13 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Generic, Self, TypeVar
 
 from worldstate.adapters.camera.detections import DetectionFrame, frame_of
 from worldstate.adapters.files.odometry_file import OdometryRecord
-from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground import InvalidArgumentError, WorldstateError, in_range
 from worldstate.ground.serialisation import decode, decode_json
-from worldstate.measurement.odometry import Odometry
 
 from .bounded_channel import BoundedChannel
 
@@ -81,15 +80,17 @@ class DatagramSocket(Generic[T]):
         self._thread.join()
         self._socket.close()
 
-    def __call__(self) -> Iterator[tuple[int, T]]:
-        """Yield what waits, each with the time of its capture on the stream's clock, nanoseconds."""
+    def deliver(self, take: Callable[[int, T], None]) -> None:
+        """Pass on what waits, each with the time of its capture on the stream's clock, nanoseconds.
+
+        What cannot be read, or is refused there, is counted.
+        """
         for arrived_s, datagram in self._datagrams.take_all():
             try:
                 age_s, told = self._read_one(datagram)
-            except InvalidArgumentError as error:
+                take(self._stamp_ns(arrived_s - age_s), told)
+            except WorldstateError as error:
                 self.refused, self.problem = self.refused + 1, str(error)
-                continue
-            yield self._stamp_ns(arrived_s - age_s), told
 
     def _read_one(self, datagram: bytes) -> tuple[float, T]:
         try:
@@ -121,7 +122,7 @@ class DetectionSocket(DatagramSocket[DetectionFrame]):
 
 
 class OdometrySocket(DatagramSocket[OdometryRecord]):
-    """Odometry of a running vehicle, which `Source.told` takes.
+    """Odometry of a running vehicle, for `Listener.tell`.
 
     ``{"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}``, with a localiser "x_m", "y_m" and "yaw_rad"
     in the map, too. The last one holds until the next. The filter puts what is up to two seconds late where
@@ -129,20 +130,9 @@ class OdometrySocket(DatagramSocket[OdometryRecord]):
     """
 
     def __init__(self, address: str, stamp_ns: Callable[[float], int]) -> None:
-        super().__init__(address, stamp_ns, _checked_odometry, "--odometry")
-        self._ahead: list[Odometry] = []  # Captured after the last hop, whose sound takes a while to be heard
-
-    def until(self, stamp_ns: int) -> Iterator[Odometry]:
-        """Yield what was captured up to a time and has not been yielded before."""
-        told = sorted([*self._ahead, *(one.at(at_ns) for at_ns, one in self())], key=lambda one: one.stamp_ns)
-        self._ahead = [one for one in told if one.stamp_ns > stamp_ns]
-        yield from (one for one in told if one.stamp_ns <= stamp_ns)
-
-
-def _checked_odometry(record: object) -> OdometryRecord:
-    told = decode(OdometryRecord, record, "datagram")
-    told.at(0)
-    return told
+        super().__init__(
+            address, stamp_ns, lambda record: decode(OdometryRecord, record, "datagram"), "--odometry"
+        )
 
 
 def _bound_socket(address: str, option: str) -> socket.socket:

@@ -5,12 +5,12 @@ Latencies are kept as counts: a day takes no more memory than a minute.
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.listener import Step, listen_steps
+from worldstate.adapters.listener import Listener, Step, listened
 from worldstate.adapters.source import Source
 from worldstate.ground.errors import InvalidArgumentError
 
@@ -30,15 +30,21 @@ class LiveStep:
     lost_s: float  # Seconds of sound that were lost up to now
 
 
-def live_steps(source: Source) -> Iterator[LiveStep]:
-    """Yield every hop of a source whose sound is a `LiveSound`, as soon as it is known."""
+def live_steps(source: Source, *hand_in: Callable[[Listener], None]) -> Iterator[LiveStep]:
+    """Yield every hop of a source whose sound is a `LiveSound`, as soon as it is known.
+
+    `hand_in` is called before every block of sound, for what other sensors have given.
+    """
     sound = source.sound
     if not isinstance(sound, LiveSound):
         got = source.audio_path
         raise InvalidArgumentError(f"source: expected one whose sound is a LiveSound, got {got}")
-    for step in listen_steps(source):
-        latency_s = sound.age_s(step.frame.sample_index)
-        yield LiveStep(step, latency_s, sound.overruns, sound.lost_s)
+    for listener, block in listened(source):
+        for one in hand_in:
+            one(listener)
+        for step in listener.steps(block):
+            latency_s = sound.age_s(step.frame.sample_index)
+            yield LiveStep(step, latency_s, sound.overruns, sound.lost_s)
 
 
 class LatencyMeter:

@@ -176,6 +176,7 @@ def test_an_ego_that_moves_is_heard_by_the_model_that_was_made_for_it(alone: Pat
         (open_source(alone, context=drives), moving),
         (open_source(alone, context=stands), standing),
         (open_source(alone), standing),
+        (open_source(alone, moving_ego=True), moving),
     ):
         assert encode(source.model) == encode(model.signature) and source.policy.alpha == 0.02
     # One that is given stays, and states no budget where the ego does otherwise than it was made for.

@@ -13,9 +13,10 @@ import pytest
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.vision_query import NO_LOOKS, REMEMBERED, VisionQuery
 from worldstate.adapters.live.bounded_channel import BoundedChannel
 from worldstate.adapters.live.datagram_socket import DetectionSocket
-from worldstate.adapters.live.live_camera import REMEMBERED, CameraFeed, ImageLooks, LiveCamera, image_channel
+from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, image_channel
 from worldstate.adapters.live.live_sound import LiveSound
 from worldstate.adapters.source import ListenSettings, Source
 from worldstate.adapters.source_files import open_source
@@ -58,10 +59,9 @@ def test_it_answers_as_the_camera_of_a_recording(source):
     frames = [EMPTY if place is None else box(place) for place in places]
     log = DetectionLog.at_rate(frames, 10.0)
     recorded = replace(source, detections=log).camera_channel()
-    looks: list[tuple[int, DetectionFrame]] = []
-    live = LiveCamera(source, lambda: looks[-1:])
+    live = replace(source, detections=NO_LOOKS).camera_channel()
     for number, frame in enumerate(frames):
-        looks.append((stamp(number), frame))
+        live.see(stamp(number), frame)
         assert live.ask(stamp(number), AHEAD) == recorded.ask(stamp(number), AHEAD)
         assert live.sightings(stamp(number)) == recorded.sightings(stamp(number))
         assert live.last_look(stamp(number)) == recorded.last_look(stamp(number))
@@ -70,20 +70,20 @@ def test_it_answers_as_the_camera_of_a_recording(source):
 
 
 def test_without_an_image_it_was_not_asked(source):
-    looks: list[tuple[int, DetectionFrame]] = []
-    camera = LiveCamera(source, lambda: looks)
+    camera = replace(source, detections=NO_LOOKS).camera_channel()
     assert isinstance(camera.ask(0, AHEAD), Unqueried)
-    looks.append((0, EMPTY))
+    camera.see(0, EMPTY)
     assert isinstance(camera.ask(stamp(1), AHEAD), Absent)
     # The camera hangs: its last image is no look at what is there now.
     assert isinstance(camera.ask(stamp(5), AHEAD), Unqueried)
-    looks.append((stamp(5), box(260.0)))
+    camera.see(stamp(5), box(260.0))
     assert isinstance(camera.ask(stamp(5), AHEAD), Present)
 
 
 def test_looks_out_of_order_are_left_out(source):
-    looks = [(stamp(5), EMPTY), (stamp(3), box(260.0)), (stamp(5), box(260.0))]
-    camera = LiveCamera(source, lambda: looks)
+    camera = source.camera_channel()
+    for look in ((stamp(5), EMPTY), (stamp(3), box(260.0)), (stamp(5), box(260.0))):
+        camera.see(*look)
     assert isinstance(camera.ask(stamp(5), AHEAD), Absent)
 
 
@@ -98,16 +98,17 @@ class Counting:
         return box(float(frame[0, 0, 0]))
 
 
-def camera_day(source: Source, hops: int) -> tuple[LiveCamera, int, int]:
+def camera_day(source: Source, hops: int) -> tuple[VisionQuery, int, int]:
     """Let three images pass at every hop, and ask at every tenth."""
     images, detector = image_channel(), Counting()
     looks = ImageLooks(images, detector, nanoseconds, (640, 480))
-    camera = LiveCamera(source, looks)
+    camera = source.camera_channel()
     image = np.zeros((480, 640, 3), np.uint8)
     for hop in range(hops):
         for part in range(3):
             images.put((0.1 * hop + 0.03 * part, image))
         if hop % 10 == 9:
+            looks.deliver(camera.see)
             camera.ask(nanoseconds(0.1 * hop + 0.06), AHEAD)
     return camera, detector.seen, images.dropped
 
@@ -116,17 +117,18 @@ def test_it_remembers_no_more_than_it_needs(source):
     camera, seen, dropped = camera_day(source, 300)
     assert seen == 30 * 4
     assert seen + dropped == 900
-    assert len(camera._looks) == REMEMBERED
+    assert camera.detections is not None
+    assert len(camera.detections.frames) == REMEMBERED
 
 
 def test_images_of_another_camera_are_refused(source):
     images = image_channel()
     images.put((0.0, np.zeros((720, 1280, 3), np.uint8)))
-    camera = LiveCamera(source, ImageLooks(images, Counting(), nanoseconds, (640, 480)))
+    looks = ImageLooks(images, Counting(), nanoseconds, (640, 480))
     with pytest.raises(
         InvalidArgumentError, match="expected images of 640 x 480 px as its lens, got 1280 x 720"
     ):
-        camera.ask(0, AHEAD)
+        looks.deliver(source.camera_channel().see)
 
 
 def sent(detections: DetectionSocket, *datagrams: bytes) -> list[tuple[int, DetectionFrame]]:
@@ -136,7 +138,7 @@ def sent(detections: DetectionSocket, *datagrams: bytes) -> list[tuple[int, Dete
             detector.sendto(datagram, ("127.0.0.1", detections.port))
         until_s = time.monotonic() + 5.0
         while len(looks) + detections.refused < len(datagrams) and time.monotonic() < until_s:
-            looks += list(detections())
+            detections.deliver(lambda *look: looks.append(look))
             time.sleep(0.01)
     return looks
 
@@ -219,5 +221,6 @@ def test_a_day_of_looks_uses_no_memory(source):
     hops = 24 * 3600 * 10 // 3
     camera, seen, dropped = camera_day(source, hops)
     assert seen + dropped == 3 * hops
-    assert len(camera._looks) == REMEMBERED
+    assert camera.detections is not None
+    assert len(camera.detections.frames) == REMEMBERED
     assert largest_kb() - before < 8 << 10

@@ -105,10 +105,9 @@ def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
     script = [sys.executable, "-m", "worldstate", *words]
     with subprocess.Popen(script, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ) as process:
         until_s = time.monotonic() + 20.0
-        # The file has its name only at the end: a temporary one stands beside it.
-        while not list(tmp_path.iterdir()) and time.monotonic() < until_s:
+        # The file has its name only at the end: a temporary one stands beside it until states are written.
+        while not any(one.stat().st_size for one in tmp_path.iterdir()) and time.monotonic() < until_s:
             time.sleep(0.05)
-        time.sleep(1.5)
         process.send_signal(signal.SIGTERM)
         printed, _ = process.communicate(timeout=20.0)
     assert process.returncode == 0
@@ -124,7 +123,7 @@ def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "worldstate.adapters.live.microphones.PortAudioInput",
-        lambda channels, sample_rate_hz: Playback(open_sound(street / "street.wav"), speed=10.0),
+        lambda channels, sample_rate_hz: Playback(open_sound(street / "street.wav"), speed=2.0),
     )
     found = DetectionFrame(np.array([[260.0, 100.0, 380.0, 300.0]]), np.array([0.9]), ("car",))
     published = []
@@ -170,8 +169,8 @@ def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys)
     lens.write_text(json.dumps({"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}))
     asked = "--camera-device", 0, "--camera", lens, "--out", states, "--json"
     assert main(command(street, *asked)) == 0
-    # In the first second there is no state yet, for which images would be looked at; four of them wait.
-    assert 0 < json.loads(capsys.readouterr().out)["images_dropped"] < 15
+    # Every image is looked at before the next block of sound is taken.
+    assert json.loads(capsys.readouterr().out)["images_dropped"] < 15
     assert "camera" in looked_at(states)
 
 
@@ -211,6 +210,44 @@ def test_a_detector_of_ones_own_is_asked(street, tmp_path, capsys):
     assert report["detections_refused"] > 0
     assert "expected" in report["last_refusal"] or "JSON" in report["last_refusal"]
     assert "camera" in looked_at(states)
+
+
+def test_several_cameras_are_asked_and_a_box_outside_an_image_is_refused(street, tmp_path, capsys):
+    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}
+    cameras = [{"name": name, **lens, "yaw_deg": yaw} for name, yaw in (("front", 0.0), ("aside", 60.0))]
+    car, states = tmp_path / "car.json", tmp_path / "states.jsonl"
+    positions_m = np.loadtxt(street / "mics.csv", delimiter=",").tolist()
+    car.write_text(json.dumps({"array": {"positions_m": positions_m}, "cameras": cameras}))
+    ports = [free_port(), free_port()]
+    empty = json.dumps({"boxes": [], "scores": [], "classes_str": []}).encode()
+    outside = {"boxes": [[600, 100, 700, 300]], "scores": [0.9], "classes_str": ["car"]}
+    told = [word for name, port in zip(("front", "aside"), ports, strict=True)
+            for word in ("--detections", f"{name}=127.0.0.1:{port}")]  # fmt: skip
+    words = ["live", "--play", street / "street.wav", "--car", car, "--uncalibrated", *told, "--out", states]
+    with sending(ports[0], empty), sending(ports[1], empty, json.dumps(outside).encode()):
+        assert main([*map(str, words), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["detections_refused"] > 0
+    assert "640 x 480 px" in report["last_refusal"]
+    assert {"front", "aside"} == {*looked_at(states)}
+    assert main([*map(str, words), "--detections", "back=127.0.0.1:0"]) == 2
+    assert "camera: expected one of front, aside" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command_name", ["live", "run"])
+def test_odometry_chooses_the_model_of_a_moving_ego_and_says_so(street, tmp_path, capsys, command_name):
+    positions_m = np.loadtxt(street / "mics.csv", delimiter=",").tolist()
+    (tmp_path / "odometry.csv").write_text("time_s,speed_mps\n0,4\n")
+    play = ["--speed", "20", "--play"] if command_name == "live" else []
+    for moves in (False, True):
+        car = {"array": {"positions_m": positions_m}} | ({"odometry": "odometry.csv"} if moves else {})
+        (tmp_path / "car.json").write_text(json.dumps(car))
+        states = tmp_path / "states.jsonl"
+        sound, given = str(street / "street.wav"), ["--car", str(tmp_path / "car.json"), "--uncalibrated"]
+        assert main([command_name, *play, sound, *given, "--out", str(states)]) == 0
+        assert ("model of a moving ego" in capsys.readouterr().err) == moves
+        last = json.loads(states.read_text().splitlines()[-1])
+        assert last["context"]["ego_speed_mps"] == (4.0 if moves else None)
 
 
 def test_odometry_that_is_told_moves_the_ego(street, tmp_path, capsys):

@@ -210,11 +210,11 @@ def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path
     [
         (
             ["--car", "CAR", "--camera", "left", "--detections", "front=a.json"],
-            "--detections: expected NAME=PATH of different cameras, without --camera",
+            "--detections: expected NAME=... of different cameras, without --camera",
         ),
         (
             ["--car", "CAR", "--detections", "left=a", "--detections", "left=b"],
-            "expected NAME=PATH of different cameras",
+            "expected NAME=... of different cameras",
         ),
         (
             ["--car", "CAR", "--detections", "rear=a.json"],

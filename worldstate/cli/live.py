@@ -9,12 +9,13 @@ silence. Ctrl-C ends the run, and what it wrote is complete.
 
 --detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
   {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
-with "age_s" from the capture of the image to the sending; an image without boxes is sent, too.
+with "age_s" from the capture of the image to the sending; an image without boxes is sent, too. Several
+cameras of --car have an address each: NAME=HOST:PORT, repeated.
 
 --odometry HOST:PORT takes how the car moves in the same way, as often as it is known:
   {"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}
-with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. The model of a moving ego is taken
-where --model or --context says so.
+with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. With it, or with the odometry of --car,
+the model of a moving ego is taken where --model names none.
 
 --save-state keeps belief and site at the end, --resume goes on from them: from the time at which they end, or
 by --start from a later one.
@@ -22,11 +23,12 @@ by --start from a later one.
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from worldstate.cli.common import exports, inputs, listening, sensors
 from worldstate.cli.common.command import stopped_by_signals
@@ -35,11 +37,13 @@ from worldstate.cli.common.progress import can_draw
 from worldstate.ground.values import seconds
 
 if TYPE_CHECKING:
-    from worldstate.adapters.live.datagram_socket import DetectionSocket, OdometrySocket
+    from worldstate.adapters.listener import Listener
+    from worldstate.adapters.live.datagram_socket import DatagramSocket
     from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
     from worldstate.adapters.source import Source
 
+    HandIn = Callable[[Listener], None]
     Losses = Callable[[], dict[str, object]]
 
 EXAMPLE = """\
@@ -78,7 +82,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("camera")
     which = group.add_mutually_exclusive_group()
     which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
-    which.add_argument("--detections", metavar="HOST:PORT", help="listen there to a detector of your own")
+    told = "listen there to a detector of your own; NAME=HOST:PORT of a camera of --car, repeated"
+    which.add_argument("--detections", action="append", default=[], metavar="HOST:PORT", help=told)
     sensors.add_lens_options(parser, group)
     sensors.add_detector_option(parser)
     add = exports.add_output_options(parser).add_argument
@@ -89,6 +94,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
+    from worldstate.adapters.live.live_listening import live_steps
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
     check_outputs(arguments, "out", "keep_sound", "save_state")
@@ -100,9 +106,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         sound = LiveSound(feed, keep)
         source = _source(arguments, given, sound) if recorded is None else replace(recorded, sound=sound)
         sound.start_ns = source.start_ns
-        source, camera_losses = _with_camera(given, source, sound, opened)
-        source, odometry_losses = _with_odometry(arguments, source, sound, opened)
-        figures = _listen(arguments, given, source, sound) | camera_losses() | odometry_losses()
+        source, look, looks_lost = _with_cameras(given, source, sound, opened)
+        tell, odometry_lost = _odometry(arguments, sound, opened)
+        steps = live_steps(source, look, tell)
+        figures = _listen(arguments, given, source, sound, steps) | looks_lost() | odometry_lost()
         return CommandResult(figures | {"array": inputs.stance(source.array)})
 
 
@@ -110,8 +117,12 @@ def _source(
     arguments: argparse.Namespace, given: sensors.GivenSensors, sound: "LiveSound | Path"
 ) -> "Source":
     from worldstate.adapters.files.checkpoint_file import read_checkpoint
+    from worldstate.adapters.files.odometry_file import read_odometry
 
     before = None if arguments.resume is None else read_checkpoint(arguments.resume)
+    # Of a running car the file tells that it moves, and where it was only of a recording that is played.
+    path = None if arguments.odometry is not None else given.car.odometry
+    drive = None if path is None else read_odometry(path)
     ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
     return listening.open_given(
         given,
@@ -119,6 +130,8 @@ def _source(
         boxes=given.setup.boxes if arguments.camera_device is None else given.boxes(),
         mask_dead=True,  # a channel that is silent is told by the front-end, which leaves it out
         array=given.car.array,
+        ego=drive if arguments.play is not None else None,
+        moving_ego=arguments.odometry is not None or (drive is not None and drive.moves),
         resume=before,
         start_s=ended_s if arguments.start is None else arguments.start,
     )
@@ -147,53 +160,86 @@ def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
     return Playback(audio, arguments.speed, arguments.duration)
 
 
-def _with_camera(
+def _with_cameras(
     given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
-) -> "tuple[Source, Losses]":
-    """Return the source with the camera that was asked for, and what tells what was lost of its looks."""
+) -> "tuple[Source, HandIn, Losses]":
+    """Return the source with the cameras that were asked for, what hands their looks in, and their losses."""
+    from worldstate.adapters.camera.vision_query import NO_LOOKS, SENSOR
     from worldstate.adapters.live.datagram_socket import DetectionSocket
-    from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, LiveCamera, image_channel
+    from worldstate.operations.recordings.car_cameras import with_cameras
 
-    arguments = given.arguments
-    if arguments.detections is not None:
-        told = opened.enter_context(DetectionSocket(arguments.detections, sound.stamp_ns))
-        return replace(source, co_evidence=LiveCamera(source, told)), _losses(told, "detections")
-    if arguments.camera_device is None:
-        return source, dict
-    images, detector = image_channel(), sensors.detector_maker(arguments.detector, given.setup.labels)()
+    if given.arguments.camera_device is not None:
+        return _with_device(given, source, sound, opened)
+    named = given.named()
+    addresses = named or dict(zip([SENSOR], given.arguments.detections, strict=False))
+    sockets = {
+        name: opened.enter_context(DetectionSocket(address, sound.stamp_ns))
+        for name, address in addresses.items()
+    }
+    if named:
+        source = with_cameras(source, given.car, dict.fromkeys(named, NO_LOOKS))
+    elif sockets:
+        source = replace(source, detections=NO_LOOKS)
+
+    def hand_in(listener: "Listener") -> None:
+        for name, told in sockets.items():
+            told.deliver(partial(listener.look, camera=name))
+
+    return source, hand_in, _losses(sockets.values(), "detections")
+
+
+def _with_device(
+    given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, HandIn, Losses]":
+    """Return the source with a camera of this machine."""
+    from worldstate.adapters.camera.vision_query import NO_LOOKS
+    from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, image_channel
+
+    arguments, images = given.arguments, image_channel()
+    detector = sensors.detector_maker(arguments.detector, given.setup.labels)()
     size = source.camera.width_px, source.camera.height_px
     looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
     opened.enter_context(CameraFeed(arguments.camera_device, images))
-    camera = LiveCamera(source, looks, looks.degradation)
-    return replace(source, co_evidence=camera), lambda: {"images_dropped": images.dropped}
+    seen = replace(source, detections=NO_LOOKS, degradation=looks.degradation)
+    return seen, lambda to: looks.deliver(to.look), lambda: {"images_dropped": images.dropped}
 
 
-def _with_odometry(
-    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
-) -> "tuple[Source, Losses]":
-    """Return the source with the odometry that was asked for, and what tells what was lost of it."""
+def _odometry(
+    arguments: argparse.Namespace, sound: "LiveSound", opened: ExitStack
+) -> "tuple[HandIn, Losses]":
+    """Return what hands the odometry in that was asked for, and its losses."""
     from worldstate.adapters.live.datagram_socket import OdometrySocket
 
     if arguments.odometry is None:
-        return source, dict
+        return lambda to: None, dict
     told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns))
-    return replace(source, told=told.until), _losses(told, "odometry", "odometry_")
+
+    def hand_in(listener: "Listener") -> None:
+        told.deliver(lambda stamp_ns, record: listener.tell(record.at(stamp_ns)))
+
+    return hand_in, _losses([told], "odometry", "odometry_")
 
 
-def _losses(told: "DetectionSocket | OdometrySocket", name: str, last: str = "") -> "Losses":
+def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
+    if not told:
+        return dict
     return lambda: {
-        f"{name}_dropped": told.dropped,
-        f"{name}_refused": told.refused,
-        f"last_{last}refusal": told.problem or None,
+        f"{name}_dropped": sum(one.dropped for one in told),
+        f"{name}_refused": sum(one.refused for one in told),
+        f"last_{last}refusal": next((one.problem for one in told if one.problem), None),
     }
 
 
 def _listen(
-    arguments: argparse.Namespace, given: sensors.GivenSensors, source: "Source", sound: "LiveSound"
+    arguments: argparse.Namespace,
+    given: sensors.GivenSensors,
+    source: "Source",
+    sound: "LiveSound",
+    steps: "Iterator[LiveStep]",
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
-    from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter, live_steps
+    from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
     from worldstate.adapters.state_log import states_writer
     from worldstate.operations.recordings.warning import WarningMeter
 
@@ -206,7 +252,7 @@ def _listen(
         _view(arguments) as show,
         stopped_by_signals(sound.close),
     ):
-        for live in live_steps(source):
+        for live in steps:
             write(live.step.state.to_json())
             export(live.step)
             warnings.update(live.step.state)

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from .sensors import MOVING, GivenSensors, given_sensors
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionFilter
+    from worldstate.adapters.files.odometry_file import OdometryLog
     from worldstate.adapters.listener import Step
     from worldstate.adapters.live.live_sound import LiveSound
     from worldstate.adapters.source import Source
@@ -125,6 +127,8 @@ def open_given(
     *,
     boxes: "DetectionFilter",
     mask_dead: bool,
+    ego: "OdometryLog | None" = None,
+    moving_ego: bool = False,
     **own: Any,
 ) -> "Source":
     """Return what is listened to, as the options say; `own` are further arguments of `open_source`."""
@@ -152,8 +156,12 @@ def open_given(
         boxes=boxes,
         mask_dead=mask_dead,
     )
+    if given.model is None and (moving_ego or (ego is not None and ego.moves)):
+        print("worldstate: the model of a moving ego is used, as odometry is given", file=sys.stderr)
     return open_source(
         sound,
+        ego=ego,
+        moving_ego=moving_ego,
         camera=given.camera,
         miss_rates=given.miss_rates,
         model=given.model,

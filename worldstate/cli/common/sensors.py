@@ -110,31 +110,37 @@ class GivenSensors:
         name = self.arguments.detector
         return None if name is None else detector_maker(name, self.setup.labels)
 
-    def several(self) -> dict[str, Path]:
-        """Return what several cameras of --car reported, by their names; empty where one is asked."""
+    def named(self) -> dict[str, str]:
+        """Return what --detections has for several cameras of --car, by their names; empty for one camera."""
         from worldstate.adapters.own_parts import part_and_target
         from worldstate.ground.errors import InvalidArgumentError
 
         given = list(map(str, self.arguments.detections))
         if self.arguments.car is None or not any("=" in text for text in given):
-            known = {name: one.detections for name, one in self.car.setups.items()}
-            files = {name: path for name, path in known.items() if path is not None}
-            return files if len(files) > 1 and not given and self.arguments.camera is None else {}
+            if len(given) > 1:
+                problem = "expected one, or --car with NAME=... of its cameras"
+                raise InvalidArgumentError(f"--detections: {problem}")
+            return {}
         pairs = [part_and_target("--detections", text) for text in given]
         if len(dict(pairs)) < len(pairs) or self.arguments.camera is not None:
-            problem = "expected NAME=PATH of different cameras, without --camera"
+            problem = "expected NAME=... of different cameras, without --camera"
             raise InvalidArgumentError(f"--detections: {problem}, got {' '.join(given)}")
-        return {name: Path(path) for name, path in pairs}
+        return dict(pairs)
+
+    def several(self) -> dict[str, Path]:
+        """Return what several cameras of --car reported, by their names; empty where one is asked."""
+        if self.arguments.detections or self.arguments.camera is not None:
+            return {name: Path(path) for name, path in self.named().items()}
+        known = {name: one.detections for name, one in self.car.setups.items()}
+        files = {name: path for name, path in known.items() if path is not None}
+        return files if len(files) > 1 else {}
 
     def detections(self) -> "Path | DetectionLog | None":
         """Return what the one camera that is asked reported, read where its images do not come at 10 Hz."""
         from worldstate.adapters.camera.detections import read_any_detections
         from worldstate.adapters.camera.pinhole import PinholeCamera
-        from worldstate.ground.errors import InvalidArgumentError
 
         given = self.arguments.detections
-        if len(given) > 1:
-            raise InvalidArgumentError("--detections: expected one, or --car with NAME=PATH of its cameras")
         path = given[0] if given else self.setup.detections
         if path is None or self.setup.image_rate_hz is None:
             return path
