@@ -2,13 +2,17 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worldstate_lab.passes.followed_stream import EVERYBODY, PassedStream, followed
+from worldstate_lab.cli.streams import worst_of
+from worldstate_lab.passes.band_levels import above_place_db, added_db, level_db
+from worldstate_lab.passes.followed_stream import EVERYBODY, FollowedStream, PassedStream, followed
 from worldstate_lab.passes.pass_outcomes import pass_figures
+from worldstate_lab.passes.second_vehicle import hearing_allows, second_figures
 from worldstate_lab.passes.stream_camera import stream_detections
 
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter, nanoseconds
@@ -23,14 +27,19 @@ from worldstate.belief.site_geometry import SideGeometry
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 
 Vehicle = tuple[str, str, float]  # flow, arm, T0; "from_ahead" comes along the ego's own street
 CORNER_RAD, STREET_M, PACE_MPS = math.radians(32.0), 9.0, 4.5
+STEP_40_DB = 32767.0 * 2e-5 * 10.0 ** (40.0 / 20.0) / FULL_SCALE_PA
 DUMB = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 
 
-def stream(vehicles: list[Vehicle], duration_s: float = 60.0) -> HeardStream:
+def stream(
+    vehicles: list[Vehicle], duration_s: float = 60.0, band_db: list[float] | None = None
+) -> HeardStream:
     """Return vehicles that cross the street ahead, seen between the corners, or come down the ego's own."""
+    loud_db = band_db or [60.0] * len(vehicles)
     rows, edge_m = [], STREET_M * math.tan(CORNER_RAD)
     for number, (flow, arm, entry_s) in enumerate(vehicles):
         for time_s in np.round(np.arange(max(entry_s - 8.0, 0.0), entry_s + 4.0, 0.1), 1):
@@ -38,7 +47,7 @@ def stream(vehicles: list[Vehicle], duration_s: float = 60.0) -> HeardStream:
             if flow == "from_ahead":
                 x_m, y_m = 22.0 - 4.0 * (time_s - entry_s), 0.5
             seen = bool(time_s > entry_s and abs(y_m) <= edge_m and x_m > 4.0)
-            rows.append((number, time_s, x_m, y_m, seen, 60.0))
+            rows.append((number, time_s, x_m, y_m, seen, loud_db[number]))
     flow, arm, entry_s = zip(*vehicles, strict=True)
     told = {
         "vehicle": np.arange(len(vehicles)),
@@ -48,10 +57,15 @@ def stream(vehicles: list[Vehicle], duration_s: float = 60.0) -> HeardStream:
         "entry_s": np.array(entry_s, np.float64),
         "hazard": np.array([one != "from_ahead" for one in flow]),
     }
-    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    hops = HopTable({"time_s": np.round(np.arange(1.0, duration_s, 0.1), 1)}, about={"site": "SB2"})
-    return HeardStream(hops, HopTable(told), HopTable(dict(zip(names, columns, strict=True))))
+    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "band_db")
+    columns = dict(zip(names, (np.array(column) for column in zip(*rows, strict=True)), strict=True))
+    time_s = np.round(np.arange(1.0, duration_s, 0.1), 1)
+    # A pascal of noise is 94 dB: 40 dB of background, of which the band of 1.7 kHz is five ninths.
+    middle = np.random.default_rng(4).normal(0.0, STEP_40_DB, (len(time_s), 600)).round().astype(np.int16)
+    about = {"site": "SB2", "sample_rate_hz": 6000.0}
+    hops = HopTable({"time_s": time_s, "middle": middle}, about=about)
+    columns["loudness_db"] = columns["band_db"]
+    return HeardStream(hops, HopTable(told), HopTable(columns))
 
 
 def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
@@ -100,6 +114,86 @@ def test_of_a_street_where_nobody_comes_what_cannot_be_told_is_none() -> None:
     told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
     assert (told["onsets_per_hour"], told["detected"], told["time_rmse_of_constant"]) == (0.0, None, None)
     json.dumps(told, allow_nan=False)
+
+
+PAIR: list[Vehicle] = [("both", "left", 12.0), ("both", "right", 15.0)]
+SINGLES: list[Vehicle] = [("left", "left", 30.0), ("right", "right", 48.0)]
+
+
+def stated(made_up: HeardStream, chance: float, *, masked: bool = False) -> PassedStream:
+    """Return a stream of which nothing is believed but one chance of either side at every hop."""
+    n = len(made_up.hops)
+    none = np.zeros((n, 2), bool)
+    within, times = np.full((n, 2, 4), chance), np.full((n, 2, 3), np.nan)
+    follow = FollowedStream(
+        made_up.hops.time_s, none, none * 0.0, within, times, np.full(n, masked), ((),) * n, frozenset()
+    )
+    return PassedStream(made_up, stream_truth(made_up), follow)
+
+
+def test_second_vehicles_are_judged_at_the_odds_of_the_street() -> None:
+    """One of three firsts has a second one from the other side: stated as a third, it costs nothing."""
+    group = "other, 1.5 to 4 s"
+    told = second_figures([stated(stream(PAIR + SINGLES), 1.0 / 3.0, masked=True)])
+    # As loud as the first, it adds three decibels: nothing is masked.
+    assert (told[f"{group}: approaches"], told[f"{group}: hops of 1 dB"]) == (1, 29)
+    assert told[f"{group}: skill"] == pytest.approx(0.0, abs=1e-9)
+    assert told[f"{group}: ECE"] is None and told["behind, 1.5 to 4 s: approaches"] == 0
+    faint = stream(PAIR + SINGLES, band_db=[60.0, 50.0, 60.0, 60.0])
+    told = second_figures([stated(faint, 1.0 / 3.0, masked=True)])
+    assert (told[f"{group}: hops of 1 dB"], told[f"{group}: skill"]) == (0, None)
+    assert told[f"{group}: true"] == told[f"{group}: stated"] == pytest.approx(1.0 / 3.0)
+    assert (told[f"{group}: ECE"], told[f"{group}: said masked"]) == pytest.approx((0.0, 1.0))
+    told = second_figures([stated(faint, 0.0)])
+    assert (told[f"{group}: ECE"], told[f"{group}: said masked"]) == pytest.approx((1.0 / 3.0, 0.0))
+
+
+def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
+    made_up = stream([*PAIR, ("queue", "left", 30.0), ("follows", "left", 33.0), *SINGLES[1:]])
+    follow = followed(WorldFilter(Context()), heard(made_up))
+    passed = PassedStream(made_up, stream_truth(made_up), follow)
+    told = second_figures([passed])
+    group = "other, 1.5 to 4 s"
+    assert (told[f"{group}: stated apart"], told[f"{group}: merged"]) == (1, 0.0)
+    assert told[f"{group}: identity kept"] == 1.0
+    # What ends in another one was merged, whatever is seen later.
+    ids = frozenset(one.id for hop in follow.entities for one in hop)
+    merged = PassedStream(made_up, passed.truth, replace(follow, merged=ids))
+    assert second_figures([merged])[f"{group}: merged"] == 1.0
+
+
+def test_what_a_vehicle_adds_is_its_power_over_all_others() -> None:
+    made_up = stream(PAIR, band_db=[60.0, 63.0])
+    background_db = 10.0 * math.log10(np.mean(10.0 ** (level_db(made_up)[10:] / 10.0)))
+    assert background_db == pytest.approx(40.0 + 10.0 * math.log10(1.7 / 3.0), abs=0.5)
+    added = added_db(made_up)
+    at = np.searchsorted(made_up.hops.time_s, 12.0)
+    expected = [10.0 * math.log10(1.0 + 10.0 ** (one / 10.0)) for one in (-3.0, 3.0)]
+    assert added[:, at].tolist() == pytest.approx(expected, abs=0.05)
+    assert added[:, -1].tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
+    median = hearing_allows([stated(made_up, 0.1)])["-2 s"]
+    assert median["other, 1.5 to 4 s (1)"] == pytest.approx(expected[1], abs=0.05)
+
+
+def test_the_meter_reads_decibels_above_the_place_as_it_was() -> None:
+    made_up = stream([("left", "left", 12.0)])
+    louder = made_up.hops.middle.copy()
+    louder[300:320] *= 10
+    hops = made_up.hops.replace(middle=louder)
+    above = above_place_db(replace(made_up, hops=hops))
+    assert np.abs(above[50:300]).max() < 2.0
+    assert above[305:320] == pytest.approx(np.full(15, 20.0), abs=2.0)
+    # After the burst the place is what it was: a fifth of the past is below either.
+    assert np.abs(above[330:]).max() < 2.0
+
+
+def test_the_worst_junction_is_the_worst_of_those_with_eight_cases() -> None:
+    few, bad, good = (
+        {"approaches": n, "detected": share, "a: hops of 1 dB": n, "a: skill": share, "hours": 1.0}
+        for n, share in ((7, 0.1), (8, 0.5), (20, 0.9))
+    )
+    worst = worst_of({"SA1": few, "SB1": bad, "SB2": good})
+    assert (worst["detected"], worst["a: skill"], worst["hours"]) == (0.5, 0.5, None)
 
 
 def test_boxes_stand_where_the_truth_has_a_vehicle_in_view() -> None:

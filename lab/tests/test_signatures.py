@@ -1,13 +1,13 @@
 """The signature study: what a linear signature tells, on other recordings and on the other corpus."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulated_clips import CITY_STREET, RATE_HZ, TOWN_ROAD, simulated_recording
 from worldstate_lab.cli.main import main
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, signature, signature_edges_hz
 from worldstate_lab.signatures.signature_study import (
@@ -18,12 +18,6 @@ from worldstate_lab.signatures.signature_study import (
     scores_of,
     signature_study,
     transferred,
-)
-from worldstate_lab.signatures.simulated_corpora import (
-    CITY_STREET,
-    RATE_HZ,
-    TOWN_ROAD,
-    simulated_recording,
 )
 
 from worldstate.adapters.datasets.traffic_clips import BACKGROUND, KINDS, ClipLabels
@@ -92,7 +86,7 @@ def write_as_melaudis(root, clips):
 
 def corpus(clips, street):
     rows = [(labels, signature(samples, RATE_HZ)) for labels, samples in clips[street]]
-    return ClipSignatures.of(street.name, rows, simulated=True)
+    return ClipSignatures.of(street.name, rows)
 
 
 def drawn(rng, recordings, clips, *, fingerprint=0.0, lift=0.0):
@@ -171,18 +165,6 @@ def test_a_simulated_recording_is_a_function_of_its_generator(clips):
     np.testing.assert_array_equal(samples, clips[TOWN_ROAD][0][1])
 
 
-def test_simulated_corpora_fill_every_row_and_leave_the_published_ones_open(clips):
-    study = signature_study(*(corpus(clips, street) for street in RECORDINGS), np.random.default_rng(0))
-    filled = [row for row in study.rows if row.value is not None]
-    opened = [row for row in study.rows if row.value is None]
-    assert len(filled) == len(opened)
-    assert all("SIMULATED" in row.corpus for row in filled)
-    assert {row.name for row in filled} == {row.name for row in opened}
-    assert all("SIMULATED" not in row.corpus and row.note for row in opened)
-    areas = [row.value for row in filled if row.figure != "Hz"]
-    assert areas == sorted(areas)
-
-
 def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_path, capsys):
     idmt, melaudis = folders
     broken = next((idmt / "audio").glob("*_CL_SE_*"))
@@ -207,8 +189,6 @@ def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_p
     assert code == 0
     assert report == json.loads((tmp_path / "signatures.json").read_text())
     assert (tmp_path / "signatures.png").stat().st_size > 10_000
-    assert not report["simulated"]
-    assert "SIMULATED" not in (tmp_path / "signatures.txt").read_text()
     rows = {(row["name"], row["corpus"], row["figure"]): row for row in report["rows"]}
     assert {row["name"].split()[0] for row in rows.values() if row["value"] is None} == {"electric"}
     studio = rows["vehicle by level, studio microphones", "IDMT-Traffic", "AUROC"]
@@ -222,7 +202,7 @@ def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_p
 
 
 def test_the_rows_of_a_corpus_that_is_not_there_say_what_fills_them(clips):
-    city = replace(corpus(clips, CITY_STREET), simulated=False)
+    city = corpus(clips, CITY_STREET)
     rows = signature_study(None, city, np.random.default_rng(0)).rows
     notes = {row.note for row in rows if row.value is None}
     assert "worldstate-lab corpora --idmt DIR" in notes
@@ -235,8 +215,6 @@ def test_a_wrong_folder_is_one_line_and_exit_code_two(tmp_path, capsys):
     assert "missing: annotation/idmt_traffic_all.txt" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_without_a_folder_the_command_simulates_and_says_so(tmp_path, capsys):
-    assert main(["corpora", "--recordings", "4", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.startswith("SIMULATED sound")
-    assert json.loads((tmp_path / "signatures.json").read_text())["simulated"]
+def test_without_a_corpus_the_command_says_what_it_needs(capsys):
+    assert main(["corpora"]) == 2
+    assert "expected --idmt, --melaudis or both" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from worldstate.commissioning.stream_exam import (
     ExaminedStream,
     alarm_elsewhere,
     alarm_for,
+    alarm_outcomes,
     approaches,
     auroc_before,
     examine,
@@ -84,6 +85,27 @@ def test_approaches_are_put_together_by_who_came_with_whom() -> None:
         ("queue", (46.0, 48.5), (1, 1), False),
         ("single", (55.0,), (0,), True),
     ]
+
+
+def test_a_second_vehicle_belongs_to_the_first_however_near_the_next_approach_is() -> None:
+    pairs: list[Vehicle] = [
+        *(("both", "light", "left", 10.0), ("both", "light", "right", 15.9)),
+        *(("both", "light", "right", 16.5), ("both", "light", "left", 22.4)),
+        *(("queue", "light", "left", 40.0), ("follows", "light", "left", 46.2)),
+    ]
+    found = approaches(heard(pairs))
+    assert [one.entries_s for one in found] == [(10.0, 15.9), (16.5, 22.4), (40.0, 46.2)]
+
+
+def test_an_alarm_counts_from_the_horizon_of_the_risk_on_or_from_less() -> None:
+    """What a stream's vehicle is announced by seven seconds ahead is not about something else."""
+    stream = heard([("left", "light", "left", 20.0)])
+    time_s = stream.hops.time_s
+    raised = np.column_stack([(time_s > 12.95) & (time_s < 14.5), np.zeros(len(time_s), bool)])
+    (early,) = alarm_outcomes(stream, time_s, raised)
+    assert early.lead_s == pytest.approx(7.0) and early.onsets == 1
+    (late,) = alarm_outcomes(stream, time_s, raised, longest_s=5.0)
+    assert (late.lead_s, late.onsets) == (0.0, 0)
 
 
 def test_figures_are_those_counted_by_hand() -> None:

@@ -25,7 +25,6 @@ from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, wrap_
 from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate.operations.metrics.approach_table import (
     AFTER_S,
-    LONGEST_LEAD_S,
     SECONDS_PER_HOUR,
     SLACK_S,
     ApproachOutcome,
@@ -40,9 +39,11 @@ from worldstate.operations.recordings.hop_table import HOP_S
 
 from .heard_stream import ROW_S, HeardStream
 from .sequence_training import QUIET_KINDS, StreamTruth
-from .stream_outcomes import hop_outcome, visible_errors
+from .stream_outcomes import HORIZON_S, hop_outcome, visible_errors
 
-TOGETHER_S, FOLLOWING_S = 4.0, 6.0
+# A second vehicle arrives up to six seconds after the first; drivers differ by half a second more.
+TOGETHER_S = 7.0
+_SECOND = {"both": "both", "queue": "follows"}  # Flow of the second vehicle by that of the first
 # A junction counts for no more than so many times the onsets that are asked for. Up to 2, 3, 4 and 6 times at
 # 20 an hour leave .22, .17, .13 and .08 of other junctions above that, and detect .888, .881, .870 and .849.
 LOUDEST = 3.0
@@ -70,11 +71,15 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
     while left:
         first = left.pop(0)
         flow, entry_s = vehicles.flow[first], vehicles.entry_s[first]
-        with_it = [i for i in left if _belongs(flow, vehicles.flow[i], vehicles.entry_s[i] - entry_s)]
         # A follower's leader is the only one of its arm so shortly before it.
-        with_it = [i for i in with_it if (vehicles.arm[i] == vehicles.arm[first]) == (flow == "queue")]
-        left = [i for i in left if i not in with_it]
-        every = [first, *with_it]
+        second = [
+            i
+            for i in left
+            if vehicles.flow[i] == _SECOND.get(flow) and vehicles.entry_s[i] - entry_s < TOGETHER_S
+            if (vehicles.arm[i] == vehicles.arm[first]) == (flow == "queue")
+        ][:1]
+        left = [i for i in left if i not in second]
+        every = [first, *second]
         found.append(
             StreamApproach(
                 flow if flow in ("both", "queue") else "single",
@@ -87,17 +92,20 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
     return found
 
 
-def _belongs(flow: str, other: str, later_s: float) -> bool:
-    if flow == "both":
-        return other == "both" and later_s < TOGETHER_S
-    return flow == "queue" and other == "follows" and later_s < FOLLOWING_S
-
-
 def alarm_for(quiet: Sequence[SequencePosterior], onsets_per_hour: float) -> SequenceAlarm:
     """Return the lowest threshold at which hazard-free streams have no more onsets an hour."""
+    return SequenceAlarm(threshold_for(list(map(_louder, quiet)), onsets_per_hour), onsets_per_hour)
+
+
+def threshold_for(quiet: Sequence[FloatArray], onsets_per_hour: float) -> float:
+    """Return the lowest threshold with no more onsets an hour of what alarms are read from, shapes (n,)."""
     thresholds, onsets, hours = _onsets(quiet)
     rates = np.maximum.accumulate(onsets.sum(axis=0)) / hours.sum()
-    return SequenceAlarm(float(thresholds[np.sum(rates <= onsets_per_hour) - 1]), onsets_per_hour)
+    return float(thresholds[np.sum(rates <= onsets_per_hour) - 1])
+
+
+def _louder(posterior: SequencePosterior) -> FloatArray:
+    return np.asarray(smoothed_log_odds(posterior).max(axis=1))
 
 
 def alarm_elsewhere(quiet: Sequence[Sequence[SequencePosterior]], onsets_per_hour: float) -> SequenceAlarm:
@@ -105,7 +113,7 @@ def alarm_elsewhere(quiet: Sequence[Sequence[SequencePosterior]], onsets_per_hou
 
     Takes the hazard-free streams of each junction, of two at least.
     """
-    thresholds, *counted = _onsets([one for there in quiet for one in there])
+    thresholds, *counted = _onsets([_louder(one) for there in quiet for one in there])
     first = np.cumsum([0, *map(len, quiet[:-1])])
     onsets, hours = (np.add.reduceat(one, first) for one in counted)
     kept = risk_controlling(onsets / hours[:, None], onsets_per_hour, LOUDEST * onsets_per_hour)
@@ -114,9 +122,8 @@ def alarm_elsewhere(quiet: Sequence[Sequence[SequencePosterior]], onsets_per_hou
     return SequenceAlarm(float(thresholds[kept - 1]), onsets_per_hour)
 
 
-def _onsets(quiet: Sequence[SequencePosterior]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _onsets(louder: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return thresholds from one that nothing reaches downwards, onsets of each stream at each, and hours."""
-    louder = [smoothed_log_odds(one).max(axis=1) for one in quiet]
     if not louder:
         raise InvalidArgumentError("quiet: expected at least one hazard-free stream, got none")
     pooled = np.sort(np.concatenate(louder))
@@ -131,7 +138,7 @@ def _onsets(quiet: Sequence[SequencePosterior]) -> tuple[FloatArray, FloatArray,
 def examine(streams: Sequence[ExaminedStream]) -> Figures:
     """Return the figures of some streams together, ready for a table and for JSON."""
     every = _table(streams)
-    loud = _loud(every)
+    loud = every.loud()
     found = loud.detections()
     for flow in ("single", "both", "queue"):
         found[f"detected_{flow}"] = loud.of_flow(flow).detections()["detected"]
@@ -142,26 +149,29 @@ def examine(streams: Sequence[ExaminedStream]) -> Figures:
     return found | _calibration(streams) | _times(streams) | _by_kind(every.outcomes)
 
 
-def alarm_outcomes(heard: HeardStream, time_s: FloatArray, raised: BoolArray) -> list[ApproachOutcome]:
+def alarm_outcomes(
+    heard: HeardStream, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
+) -> list[ApproachOutcome]:
     """Return the outcome of every approach that lies whole within the hops, shapes (n,) and (n, 2)."""
     return [
-        hop_outcome(one, time_s, raised)
+        hop_outcome(one, time_s, raised, longest_s)
         for one in approaches(heard)
-        if one.entries_s[0] - LONGEST_LEAD_S >= time_s[0] and max(one.entries_s) + AFTER_S <= time_s[-1]
+        if one.entries_s[0] - HORIZON_S >= time_s[0] and max(one.entries_s) + AFTER_S <= time_s[-1]
     ]
 
 
 def _table(streams: Sequence[ExaminedStream]) -> ApproachTable:
-    raised = [np.asarray(one.alarm.raised(one.posterior)) for one in streams]
-    pairs = list(zip(streams, raised, strict=True))
+    return approach_table([(one.heard, np.asarray(one.alarm.raised(one.posterior))) for one in streams])
+
+
+def approach_table(
+    alarms: Sequence[tuple[HeardStream, BoolArray]], longest_s: float = HORIZON_S
+) -> ApproachTable:
+    """Return the table of streams and their alarms by side, shape (n, 2)."""
     return ApproachTable(
-        [told for one, alarm in pairs for told in alarm_outcomes(one.heard, one.heard.hops.time_s, alarm)],
-        [alarm for one, alarm in pairs if one.heard.hazard_free],
+        [told for one, on in alarms for told in alarm_outcomes(one, one.hops.time_s, on, longest_s)],
+        [on for one, on in alarms if one.hazard_free],
     )
-
-
-def _loud(table: ApproachTable) -> ApproachTable:
-    return ApproachTable([one for one in table.outcomes if not one.approach.quiet], table.hazard_free)
 
 
 def _ranking(streams: Sequence[ExaminedStream]) -> Figures:
@@ -188,7 +198,7 @@ def _worst(streams: Sequence[ExaminedStream]) -> Figures:
     """Return what is detected at the junction with the least of it, and the most onsets of any junction."""
     sites = np.array([one.heard.site for one in streams])
     there = [
-        _loud(_table([streams[i] for i in np.flatnonzero(sites == site).tolist()])).figures()
+        _table([streams[i] for i in np.flatnonzero(sites == site).tolist()]).loud().figures()
         for site in np.unique(sites)
     ]
     shares, rates = ([one[name] for one in there] for name in ("detected", "onsets_per_hour"))
@@ -201,6 +211,11 @@ def _worst(streams: Sequence[ExaminedStream]) -> Figures:
 def _calibration(streams: Sequence[ExaminedStream]) -> Figures:
     within = np.concatenate([one.posterior.within().reshape(-1, len(HORIZONS_S)) for one in streams])
     coming_s = np.concatenate([one.truth.coming_s.reshape(-1) for one in streams])
+    return chance_figures(within, coming_s)
+
+
+def chance_figures(within: FloatArray, coming_s: FloatArray) -> Figures:
+    """Return Brier skill and ECE of the chances at 1, 2 and 3 s, shapes (n, horizons) and (n,)."""
     found: Figures = {}
     for horizon_s in _CALIBRATED_S:
         said, true = within[:, HORIZONS_S.index(horizon_s)], coming_s <= horizon_s
@@ -232,13 +247,13 @@ def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:
 
 def warned_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
     """Return the share of approaches whose alarm stood that long before T0 or earlier, shape (times,)."""
-    leads = np.array([one.lead_s for one in _loud(_table(streams)).outcomes])
+    leads = np.array([one.lead_s for one in _table(streams).loud().outcomes])
     return np.array([np.mean(leads > before) if leads.size else np.nan for before in before_s])
 
 
 def auroc_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
     """Return the AUROC of what alarms are read from, so long before T0 against hazard-free hops, (times,)."""
-    quiet = [smoothed_log_odds(one.posterior).max(axis=1) for one in streams if one.heard.hazard_free]
+    quiet = [_louder(one.posterior) for one in streams if one.heard.hazard_free]
     if not quiet:
         return np.full(len(before_s), np.nan)
     none = np.concatenate(quiet)
@@ -252,7 +267,7 @@ def auroc_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> Flo
 
 
 def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
-    time_s, scores = stream.heard.hops.time_s, smoothed_log_odds(stream.posterior).max(axis=1)
+    time_s, scores = stream.heard.hops.time_s, _louder(stream.posterior)
     entries = [one.entries_s[0] for one in approaches(stream.heard) if not one.quiet]
     at = np.searchsorted(time_s, np.array(entries) - before_s + SLACK_S) - 1
     return np.asarray(scores[at[(at >= 0)]])

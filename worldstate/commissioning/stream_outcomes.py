@@ -5,20 +5,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.ground.checks import check_shape
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.approach_table import (
     AFTER_S,
-    LONGEST_LEAD_S,
     SLACK_S,
     ApproachOutcome,
     StreamApproach,
     rising_edges,
 )
 
+HORIZON_S = COMING_S[-1]  # Of the risk: an alarm earlier than that is about something else
 
-def hop_outcome(approach: StreamApproach, time_s: FloatArray, raised: BoolArray) -> ApproachOutcome:
+
+def hop_outcome(
+    approach: StreamApproach, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
+) -> ApproachOutcome:
     """Return the outcome of one approach of a stream: time_s (n,), alarm of either side (n, 2).
+
+    Alarms count from `longest_s` before T0 on.
 
     Examples
     --------
@@ -29,24 +35,24 @@ def hop_outcome(approach: StreamApproach, time_s: FloatArray, raised: BoolArray)
     (2.4, False, True)
     """
     first_s, last_s = approach.entries_s[0], max(approach.entries_s)
-    before, any_side = shortly_before(time_s, first_s), np.asarray(raised.any(axis=1))
+    before, any_side = shortly_before(time_s, first_s, longest_s), np.asarray(raised.any(axis=1))
     alarms_s, onsets_s = time_s[before & any_side], time_s[rising_edges(any_side)]
     named = np.asarray(raised[before].any(axis=0))
     pairs = zip(approach.entries_s, approach.sides, strict=True)
     return ApproachOutcome(
         lead_s=first_s - float(alarms_s[0]) if alarms_s.size else 0.0,
-        onsets=int(((onsets_s > first_s - LONGEST_LEAD_S) & (onsets_s < first_s)).sum()),
+        onsets=int(((onsets_s > first_s - longest_s) & (onsets_s < first_s)).sum()),
         onsets_after=int(((onsets_s >= last_s) & (onsets_s < last_s + AFTER_S)).sum()),
         own_side=bool(named[approach.sides[0]]),
         other_side=bool(named[1 - approach.sides[0]]),
-        every_side=all(raised[shortly_before(time_s, entry_s), side].any() for entry_s, side in pairs),
+        every_side=all(raised[shortly_before(time_s, t0_s, longest_s), side].any() for t0_s, side in pairs),
         approach=approach,
     )
 
 
-def shortly_before(time_s: FloatArray, entry_s: float) -> BoolArray:
-    """Return the hops of the five seconds before a T0, shape (n,)."""
-    return np.asarray((time_s > entry_s - LONGEST_LEAD_S) & (time_s < entry_s - SLACK_S))
+def shortly_before(time_s: FloatArray, entry_s: float, longest_s: float = HORIZON_S) -> BoolArray:
+    """Return the hops of the last seconds before a T0, shape (n,)."""
+    return np.asarray((time_s > entry_s - longest_s) & (time_s < entry_s - SLACK_S))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,6 @@ bicycles and trams are rows of their own, by models that never heard them.
 
   --idmt      the folder of IDMT-Traffic, with audio/ and annotation/ (doi:10.5281/zenodo.7551553)
   --melaudis  a folder with MELAUDIS_Vehicles/ and MELAUDIS_BG/ (doi:10.6084/m9.figshare.27115870)
-
-Without either, two stand-ins are made from the simulator's emission models, --recordings each: a passage of
-every kind of road user (on the roads: of cars and trucks) and three clips without one a recording. Their rows
-say SIMULATED, and the rows of the published corpora are listed with the command that would fill them.
 """
 
 import argparse
@@ -29,6 +25,7 @@ from worldstate.adapters.files.atomic import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.figure_style import BLUE, ORANGE, RED, figure_file, legend_beside
 from worldstate_lab.report.table import plain
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, hear_clips
@@ -42,7 +39,6 @@ from worldstate_lab.signatures.signature_study import (
     SignatureStudy,
     signature_study,
 )
-from worldstate_lab.signatures.simulated_corpora import STREETS, simulated_corpora
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,7 +73,7 @@ def write_signature_figure(path: Path, study: SignatureStudy) -> None:
     # A row keeps its height however many there are, or labels of two lines would overlap.
     heights = [0.3 * max(len(bars), 1), 2.4] if study.profile is not None else [0.3 * max(len(bars), 1)]
     with figure_file(path, 9.0, sum(heights) + 1.6) as figure:
-        figure.suptitle("Signatures of single clips" + (", SIMULATED sound" if study.simulated else ""))
+        figure.suptitle("Signatures of single clips")
         axes = iter(np.atleast_1d(figure.subplots(len(heights), 1, height_ratios=heights)))
         _draw_bars(next(axes), bars)
         if study.profile is not None:
@@ -113,7 +109,7 @@ NAMES = ("signatures.json", "signatures.txt", "signatures.png")
 
 EXAMPLE = """\
 examples:
-  worldstate-lab corpora --out signatures
+  worldstate-lab corpora --idmt IDMT_Traffic --json
   worldstate-lab corpora --idmt IDMT_Traffic --melaudis MELAUDIS --jobs 4 --out signatures"""
 
 
@@ -123,27 +119,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--idmt", type=Path, metavar="DIR", help="IDMT-Traffic")
     add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, both archives unpacked")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(NAMES)}")
-    recordings = "simulated ones of each corpus, 1 s of work each (default: %(default)s)"
-    add("--recordings", type=int, default=12, metavar="N", help=recordings)
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--seed", type=int, default=0, help="simulation, folds and bootstrap (default: %(default)s)")
+    add("--seed", type=int, default=0, help="folds and bootstrap (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     in_range("--jobs", arguments.jobs, 1, 256)
-    # Two for training and two for the test: fewer cannot fill a row.
-    in_range("--recordings", arguments.recordings, 4, 10_000)
+    if arguments.idmt is None and arguments.melaudis is None:
+        raise InvalidArgumentError("expected --idmt, --melaudis or both: the folders of published corpora")
     if arguments.out is not None:
         output_folder(arguments.out, *NAMES)
-    # Apart, so that more recordings leave the folds and draws of a row as they are.
-    simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
-    given = arguments.idmt is not None or arguments.melaudis is not None
-    corpora, stated = (published_corpora(arguments), []) if given else _simulated(arguments, simulation)
+    # The second of two, as when clips were simulated by the first: folds and draws stay what they were.
+    _, draws = np.random.default_rng(arguments.seed).spawn(2)
+    corpora = published_corpora(arguments)
     with progress_bar("measuring", len(QUESTIONS)) as bar:
         study = signature_study(*corpora, draws, bar.advance)
-    report = plain(study) | {"assumptions": stated}
-    lines = [*stated, *study_lines(study)]
+    report, lines = plain(study), study_lines(study)
     if study.left_out:
         lines += ["", f"left out: {len(study.left_out)} clips; the first: {study.left_out[0]}"]
     if arguments.out is not None:
@@ -167,11 +159,3 @@ def _heard(name: str, clips: list[TrafficClip] | None, jobs: int) -> ClipSignatu
         return None
     with progress_bar(f"listening to {name}", len(clips)) as bar:
         return hear_clips(name, clips, jobs, bar.advance)
-
-
-def _simulated(arguments: argparse.Namespace, rng: np.random.Generator) -> tuple[Corpora, list[str]]:
-
-    with progress_bar("simulating passages", arguments.recordings * len(STREETS)) as bar:
-        corpora = simulated_corpora(arguments.recordings, rng, arguments.jobs, bar.advance)
-    stated = ["SIMULATED sound: no published corpus was given", *(one.assumptions() for one in STREETS)]
-    return corpora, stated

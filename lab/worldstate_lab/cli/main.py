@@ -35,7 +35,6 @@ STUDIES = {
 BENCHES = {
     "bench": f"{BENCH}.cost",
     "bench cost": f"{BENCH}.cost",
-    "bench ego-noise": f"{BENCH}.ego_noise",
     "bench gospa": f"{BENCH}.gospa",
     "bench import": f"{BENCH}.imports",
 }

@@ -2,22 +2,29 @@
 
 Streams that were listened to, as `worldstate model make` keeps them, go through the filter hop by hop, with
 boxes of a camera drawn from their truth. Printed for every junction and for all: approaches warned of and how
-early, onsets an hour where no vehicle comes, whether both of two are found, whether a vehicle keeps its
-identity when it comes into view, what is warned of after it has passed, and how true times and bearings are.
+early (from eight seconds before T0 on; from five, too), onsets an hour where no vehicle comes, whether both
+of two are found, whether a vehicle keeps its identity when it comes into view, what is warned of after it has
+passed, how true times and bearings are, and what a meter reaches that measures how much louder it is than the
+place was. Then, of the second vehicle from the other side and of the one behind, by the gap to the first: the
+chance to come within three seconds where it adds a decibel to the sound and where it adds less, and what
+becomes of its entity. How much it adds stands first. "worst" is of the junctions with eight cases or more.
 
 The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
 """
 
 import argparse
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
+from worldstate.operations.metrics.approach_table import Figures
 from worldstate.simulation.parallel import in_processes
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import pass_figures
+from worldstate_lab.passes.second_vehicle import hearing_allows, second_figures
 from worldstate_lab.report.table import figure_lines
 
 EXAMPLE = """\
@@ -50,7 +57,50 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     passed = in_processes(follow, arguments.streams, arguments.jobs)
     for one in track(passed, "following", len(arguments.streams)):
         streams.setdefault(one.heard.site, []).append(one)
-    figures = {site: pass_figures(streams[site]) for site in sorted(streams)}
-    figures["all"] = pass_figures([one for every in streams.values() for one in every])
-    report = {**given, "junctions": figures}
-    return CommandResult(report, table={}, lines=figure_lines(figures, ".3f"))
+    every = [one for some in streams.values() for one in some]
+    figures = {site: _figures(streams[site]) for site in sorted(streams)}
+    columns = figures | {"worst": worst_of(figures), "all": _figures(every)}
+    added = hearing_allows(every)
+    report = {**given, "junctions": columns, "second_adds_db": added}
+    heads = ("dB that a second vehicle adds, so long before its own T0", "")
+    lines = [heads[0], *figure_lines(added, ".1f"), heads[1], *figure_lines(columns, ".3f")]
+    return CommandResult(report, table={}, lines=lines)
+
+
+def _figures(streams: Sequence[PassedStream]) -> Figures:
+    return pass_figures(streams) | second_figures(streams)
+
+
+FEWEST_CASES = 8
+# By the end of a figure's name: where its cases stand, and whether the least or the most is worst.
+_WORST: Mapping[str, tuple[str, Callable[[Iterable[float]], float]]] = {
+    **dict.fromkeys(("detected", "detected_5s", "meter_detected"), ("approaches", min)),
+    **dict.fromkeys(("skill_1s", "skill_2s", "skill_3s", "kept_after_t0"), ("approaches", min)),
+    **dict.fromkeys(("ece_1s", "ece_2s", "ece_3s", "onsets_per_hour"), ("approaches", max)),
+    **{"identity_kept": ("identity_judged", min), "took_hidden_identity": ("seen_ahead", max)},
+    **{"other_side_too": ("singles", max), "both_sides_found": ("both", min)},
+    **{"both_near_found": ("both_near", min), "skill": ("hops of 1 dB", min), "ECE": ("approaches", max)},
+    **{
+        "said masked": ("approaches", min),
+        "identity kept": ("stated apart", min),
+        "merged": ("stated apart", max),
+    },
+}
+
+
+def worst_of(junctions: Mapping[str, Figures]) -> Figures:
+    """Return the worst figure of the junctions with eight cases or more, None where that means nothing."""
+    return {name: _worst(junctions.values(), name) for name in next(iter(junctions.values()))}
+
+
+def _worst(junctions: Iterable[Figures], name: str) -> float | None:
+    group, colon, figure = name.rpartition(": ")
+    if figure not in _WORST:
+        return None
+    cases, worst = _WORST[figure]
+    known = [
+        value
+        for one in junctions
+        if (one[f"{group}{colon}{cases}"] or 0) >= FEWEST_CASES and (value := one[name]) is not None
+    ]
+    return worst(known) if known else None

@@ -91,7 +91,9 @@ class FollowedStream:
     risk: FloatArray  # shape (n, 2)
     within: FloatArray  # shape (n, 2, horizons); NaN where nothing is said
     time_to_visible_s: FloatArray  # shape (n, 2, 3): Low, best, high; NaN where none is stated
+    masked: BoolArray  # shape (n,): Whether a reason is given why not all could be heard
     entities: tuple[tuple[Entity, ...], ...]  # Of every hop
+    merged: frozenset[str]  # Ids that ended in another one
 
     def hidden(self, hop: int, side: int, least: float = 0.0) -> list[Entity]:
         """Return the entities hidden on a side at a hop that exist with at least this probability."""
@@ -129,7 +131,9 @@ def followed(
         risk=np.array([[cue.risk for cue in hop] for hop in cues]),
         within=np.array([[list((cue.within or {}).values()) or nothing for cue in hop] for hop in cues]),
         time_to_visible_s=np.array([[cue.time_to_visible_s or never for cue in hop] for hop in cues]),
+        masked=np.array([any(one.reason for one in state.heard or ()) for state in states]),
         entities=tuple(state.entities for state in states),
+        merged=frozenset(one.entity_id for state in states for one in state.events if one.kind == "merged"),
     )
 
 

@@ -1,7 +1,7 @@
 """What became of every vehicle of a stream in the world-state: warned of, followed, lost, confused.
 
-An advisory belongs to an approach from five seconds before the first T0 on. Identity is kept where the entity
-that was hidden on the vehicle's side at T0 is the one seen at its place a second later.
+An advisory belongs to an approach from the risk's horizon, eight seconds, before the first T0 on. Identity is
+kept where the entity that was hidden on the vehicle's side at T0 is the one seen at its place a second later.
 """
 
 import math
@@ -11,12 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
-from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, LONGEST_S, held
 from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.stream_exam import alarm_outcomes, approaches, time_figures
-from worldstate.commissioning.stream_outcomes import shortly_before
+from worldstate.commissioning.stream_exam import (
+    alarm_outcomes,
+    approach_table,
+    approaches,
+    chance_figures,
+    threshold_for,
+    time_figures,
+)
+from worldstate.commissioning.stream_outcomes import HORIZON_S, shortly_before
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
+    LONGEST_LEAD_S,
     SLACK_S,
     ApproachOutcome,
     ApproachTable,
@@ -27,9 +35,11 @@ from worldstate.operations.metrics.approach_table import (
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.state import Entity
 
+from .band_levels import above_place_db
 from .followed_stream import PassedStream
 
 EXISTS, NEAR_RAD, SEEN_AFTER_S = 0.5, np.radians(10.0), 1.0
+NEAR_S = 1.5  # Between two whose sound cannot be told apart in a window
 HIDDEN_S, KEPT_S, KEPT_RAD = 3.0, 3.0, np.radians(20.0)
 
 
@@ -64,13 +74,13 @@ def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
     hop = int(np.searchsorted(followed.time_s, entry_s - SLACK_S)) - 1
     hidden = followed.hidden(hop, one.sides[0])
     later = int(np.searchsorted(followed.time_s, entry_s + SEEN_AFTER_S))
-    seen = _seen_at(stream, _vehicle(stream.heard, entry_s), later)
+    seen = seen_at(stream, vehicle_at(stream.heard, entry_s), later)
     if not hidden or seen is None:
         return None
     return seen.id in {entity.id for entity in hidden}
 
 
-def _vehicle(heard: HeardStream, entry_s: float) -> int:
+def vehicle_at(heard: HeardStream, entry_s: float) -> int:
     """Return the number of the vehicle that came into view at a time."""
     return int(heard.vehicles.vehicle[np.nanargmin(np.abs(heard.vehicles.entry_s - entry_s))])
 
@@ -82,7 +92,8 @@ def _true_azimuth(heard: HeardStream, vehicle: int, time_s: float) -> float | No
     return None if not at.size else float(np.arctan2(rows.y_m[at[0]], rows.x_m[at[0]]))
 
 
-def _seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
+def seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
+    """Return the entity in view at the place of a vehicle; None where none is."""
     azimuth = _true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
     if azimuth is None:
         return None
@@ -99,22 +110,47 @@ def pass_figures(streams: Sequence[PassedStream]) -> Figures:
     """Return the figures of some streams together, ready for a table and for JSON."""
     loud = [one for stream in streams for one in outcomes(stream) if not one.alarm.approach.quiet]
     judged = [one.identity for one in loud if one.identity is not None]
-    table = ApproachTable(
-        [one.alarm for one in loud], [one.followed.advisory for one in streams if one.heard.hazard_free]
-    )
-    figures = table.figures() | table.sides()
-    named = ("approaches", "detected", "lead_missed_as_0_s", *table.sides())
-    found = {name: figures[name] for name in named} | {
+    table, short = (_table(streams, longest_s) for longest_s in (HORIZON_S, LONGEST_LEAD_S))
+    singles, both = (table.of_flow(flow).outcomes for flow in ("single", "both"))
+    near = [
+        one.every_side for one in both if max(one.approach.entries_s) - min(one.approach.entries_s) < NEAR_S
+    ]
+    found = _detected(table) | {f"{name}_5s": value for name, value in _detected(short).items()}
+    found |= {
+        **{"singles": len(singles), "both": len(both), "both_near": len(near)},
+        "both_near_found": mean_of(near),
         "onsets_per_approach": mean_of([one.onsets for one in table.outcomes if one.detected]),
         "phantom_third": mean_of(
             [one.hidden_before > 2 for one in loud if one.alarm.approach.flow == "both"]
         ),
         "identity_judged": len(judged),
         "identity_kept": mean_of(judged),
-        "onset_after_pass": mean_of([one.onsets_after > 0 for one in table.of_flow("single").outcomes]),
+        "onset_after_pass": mean_of([one.onsets_after > 0 for one in singles]),
     }
+    figures = table.false_alarms()
     found |= {name: figures[name] for name in ("hazard_free_hours", "onsets_per_hour", "hazard_free_share")}
-    return found | _ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams)
+    found |= _ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams)
+    return {"approaches": len(table.outcomes)} | found | _meter(streams, figures["onsets_per_hour"])
+
+
+def _table(streams: Sequence[PassedStream], longest_s: float) -> ApproachTable:
+    return approach_table([(one.heard, one.followed.advisory) for one in streams], longest_s).loud()
+
+
+def _detected(table: ApproachTable) -> Figures:
+    figures = table.detections()
+    return {name: figures[name] for name in ("detected", "lead_missed_as_0_s")} | table.sides()
+
+
+def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Figures:
+    """Return what "louder than the place was" reaches at as many onsets an hour."""
+    quiet = [above_place_db(one.heard) for one in streams if one.heard.hazard_free]
+    if onsets_per_hour is None:
+        return dict.fromkeys(("meter_detected", "meter_lead_missed_as_0_s", "meter_onsets_per_hour"))
+    least_db = threshold_for(quiet, onsets_per_hour)
+    louder = ((one.heard, held(above_place_db(one.heard) >= least_db)) for one in streams)
+    figures = approach_table([(heard, np.stack([on, on], axis=1)) for heard, on in louder]).loud().figures()
+    return {f"meter_{name}": figures[name] for name in ("detected", "lead_missed_as_0_s", "onsets_per_hour")}
 
 
 def _ahead(streams: Sequence[PassedStream]) -> Figures:
@@ -131,7 +167,7 @@ def _ahead(streams: Sequence[PassedStream]) -> Figures:
             later = int(np.searchsorted(stream.followed.time_s, seen_s[0] + SEEN_AFTER_S))
             if first < 1 or later >= len(stream.followed.time_s):
                 continue
-            entity = _seen_at(stream, number, later)
+            entity = seen_at(stream, number, later)
             before = {one.id for side in (0, 1) for one in stream.followed.hidden(first - 1, side)}
             if entity is not None:
                 taken.append(entity.id in before)
@@ -144,7 +180,7 @@ def _hops_beside(
     """Yield the hops so long after the T0 of loud approaches, with the azimuth of the first vehicle then."""
     for stream in streams:
         for one in approaches(stream.heard):
-            vehicle = _vehicle(stream.heard, one.entries_s[0])
+            vehicle = vehicle_at(stream.heard, one.entries_s[0])
             since_s = stream.followed.time_s - one.entries_s[0]
             within = () if one.quiet else np.flatnonzero((since_s >= first_s) & (since_s < end_s)).tolist()
             for hop in within:
@@ -165,17 +201,16 @@ def _kept(streams: Sequence[PassedStream]) -> Figures:
 
 
 def _forecast(streams: Sequence[PassedStream]) -> Figures:
-    within = np.concatenate([one.followed.within[:, :, HORIZONS_S.index(2.0)].ravel() for one in streams])
+    within = np.concatenate([one.followed.within.reshape(-1, len(HORIZONS_S)) for one in streams])
     coming_s = np.concatenate([one.truth.coming_s.ravel() for one in streams])
     risk = np.concatenate([one.followed.risk.ravel() for one in streams])
-    said = np.isfinite(within)
+    said = np.isfinite(within).all(axis=1)
     stated = np.concatenate([one.followed.time_to_visible_s.reshape(-1, 3) for one in streams])
     return {
-        "skill_2s": brier_skill(within[said], coming_s[said] <= 2.0),
-        "ece_2s": expected_calibration_error(within[said], coming_s[said] <= 2.0),
+        **chance_figures(within[said], coming_s[said]),
         # The risk is of a hidden vehicle that comes into view within the time that the sequence foresees.
-        "risk_skill": brier_skill(risk, coming_s <= COMING_S[-1]),
-        "risk_ece": expected_calibration_error(risk, coming_s <= COMING_S[-1]),
+        "risk_skill": brier_skill(risk, coming_s <= HORIZON_S),
+        "risk_ece": expected_calibration_error(risk, coming_s <= HORIZON_S),
         **time_figures(stated, coming_s),
         "times_stated": mean_of(np.isfinite(stated[coming_s <= LONGEST_S][:, 1])),
     }

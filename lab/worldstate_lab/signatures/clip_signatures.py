@@ -29,7 +29,6 @@ class ClipSignatures:
     """One row a clip."""
 
     name: str
-    simulated: bool
     energy: FloatArray  # shape (n, 16): Log-energies
     kinds: TextArray  # shape (n,), as the others: see `ClipLabels`
     microphones: TextArray
@@ -44,14 +43,12 @@ class ClipSignatures:
         name: str,
         rows: Sequence[tuple[ClipLabels, FloatArray]],
         *,
-        simulated: bool = False,
         left_out: tuple[str, ...] = (),
     ) -> "ClipSignatures":
         """Put clips one below the other."""
         labels = [one for one, _ in rows]
         return cls(
             name=name,
-            simulated=simulated,
             energy=np.array([energy for _, energy in rows]),
             kinds=np.array([one.kind for one in labels]),
             microphones=np.array([one.microphone for one in labels]),

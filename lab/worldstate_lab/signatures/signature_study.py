@@ -181,7 +181,6 @@ class SignatureStudy:
     """All figures, the worst first, and the Fisher profile of the roadside corpus."""
 
     rows: tuple[SignatureRow, ...]
-    simulated: bool
     profile: BandProfile | None
     left_out: tuple[str, ...]  # Why clips could not be heard
 
@@ -194,22 +193,17 @@ def signature_study(
 ) -> SignatureStudy:
     """Fill every row that the corpora allow, and say which command fills the others.
 
-    `roadside` has studio and MEMS microphones, `city` phones; either may be simulated or None.
+    `roadside` has studio and MEMS microphones, `city` phones; either may be None.
     """
     given: dict[Corpus, ClipSignatures | None] = {IDMT: roadside, MELAUDIS: city}
     tables = {name: one for name, one in given.items() if one is not None}
     rows, ranges = _rows(tables, rng, on_row)
-    simulated = any(one.simulated for one in tables.values())
-    if simulated:
-        # What the published corpora would say stays open, and stands beside what the simulation says.
-        unfilled = _rows({}, rng)
-        rows, ranges = rows + unfilled[0], ranges + unfilled[1]
     studio = _studio(roadside)
     known = studio is not None and enough(studio)
     profile = profile_of(studio.energy, studio.motor, signature_edges_hz()) if studio and known else None
     left_out = tuple(problem for one in tables.values() for problem in one.left_out)
     worst_first = sorted(rows, key=lambda row: (row.value is None, row.value))
-    return SignatureStudy((*worst_first, *ranges), simulated, profile, left_out)
+    return SignatureStudy((*worst_first, *ranges), profile, left_out)
 
 
 def _rows(

@@ -12,8 +12,8 @@ alarm of each hazard-free stream, and asks the table of both for its figures:
 
 A detection is defined in two ways, and each kind of data keeps its own. A recording holds one approach,
 and the first *onset* counts: `onset_outcome`. In a stream an alarm may stand since the approach before,
-and either side may be named; the first *hop* in alarm counts: `hop_outcome` in `stream_outcomes`. Onsets and
-hops more than five seconds before T0 belong to something else.
+and either side may be named; the first *hop* in alarm counts: `hop_outcome` in `stream_outcomes`. Onsets more
+than five seconds before T0, and hops before the risk's horizon of eight, belong to something else.
 """
 
 from collections.abc import Sequence
@@ -57,11 +57,11 @@ class ApproachOutcome:
     """
 
     lead_s: float  # From the first alarm that counts to T0; 0 where missed
-    onsets: int = 0  # In the five seconds before T0
+    onsets: int = 0  # In the seconds before T0 that count
     onsets_earlier: int = 0  # Before those
     onsets_after: int = 0  # In the six seconds after the last T0, of a stream
     # Whether the side of the first vehicle, the other one and the side of every vehicle were named, each in
-    # the five seconds before its T0; of a stream.
+    # the seconds before its T0 that count; of a stream.
     own_side: bool = False
     other_side: bool = False
     every_side: bool = False
@@ -166,6 +166,10 @@ class ApproachTable:
     def of_flow(self, flow: str) -> "ApproachTable":
         """Return the table of the approaches of one flow."""
         return ApproachTable([one for one in self.outcomes if one.approach.flow == flow], self.hazard_free)
+
+    def loud(self) -> "ApproachTable":
+        """Return the table without the approaches of quiet road users."""
+        return ApproachTable([one for one in self.outcomes if not one.approach.quiet], self.hazard_free)
 
     def _alarms(self) -> list[BoolArray]:
         return [one if one.ndim == 1 else np.asarray(one.any(axis=1)) for one in self.hazard_free]

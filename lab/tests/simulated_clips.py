@@ -1,10 +1,10 @@
-"""Stand-ins for the two published corpora, made from the simulator's emission models.
+"""Clips of passing vehicles for tests of the signature study, made from the simulator's emission models.
 
 Every kind of road user drives past one microphone in an open street, in the ambience of the simulator. What
-differs between the two streets, and what a microphone adds, are assumptions; each is stated where it stands.
+differs between the two streets, and what a microphone adds, are assumptions.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,6 @@ import numpy as np
 from worldstate.adapters.datasets.traffic_clips import BACKGROUND, CLIP_S, ClipLabels
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import site
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
@@ -22,8 +21,6 @@ from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, add_delayed, emission_times
 from worldstate.simulation.sound.diffraction import air_gain, ground_gain
 from worldstate.simulation.sound.receiver import NEAREST_M, Receiver
-
-from .clip_signatures import ClipSignatures, signature
 
 # Twice the highest band and some, at half the cost of 48 kHz.
 RATE_HZ = 24_000.0
@@ -84,20 +81,6 @@ class Roadside:
     windshield_db: float = 0.0  # What it takes from the simulator's wind
     official_split: bool = False  # Every second recording is for training
 
-    def assumptions(self) -> str:
-        """Say in one line what was assumed."""
-        grades = "; ".join(
-            f"{one.name} {one.self_noise_db:g} dB self-noise, from {one.low_cut_hz:g} Hz, "
-            f"gain {one.gain_db:g} +- {one.gain_spread_db:g} dB"
-            for one in self.microphones
-        )
-        (slow, fast), (near, far) = self.speed_kmh, self.distance_m
-        return (
-            f"{self.name}: ambience {self.ambient_db:+g} dB against {preset().name}, windshield of "
-            f"{self.windshield_db:g} dB, {self.far_rate:g} distant vehicles in 10 s, {slow:g}-{fast:g} km/h, "
-            f"{near:g}-{far:g} m; {grades}"
-        )
-
 
 # Roads of 30 to 70 km/h at the edge of a small town, and streets of several lanes and trams in a large one.
 TOWN_ROAD = Roadside(
@@ -120,41 +103,6 @@ CITY_STREET = Roadside(
     distance_m=(4.0, 14.0),
     kinds=(*WORDS,),
 )
-STREETS = (TOWN_ROAD, CITY_STREET)
-
-
-def simulated_corpora(
-    recordings: int,
-    rng: np.random.Generator,
-    jobs: int = 1,
-    on_recording: Callable[[], None] = lambda: None,
-) -> tuple[ClipSignatures, ClipSignatures]:
-    """Return the stand-ins of both published corpora, each of so many recordings, for `signature_study`."""
-    roads, city = (
-        _corpus(street, recordings, one, jobs, on_recording)
-        for street, one in zip(STREETS, rng.spawn(len(STREETS)), strict=True)
-    )
-    return roads, city
-
-
-def _corpus(
-    street: Roadside,
-    recordings: int,
-    rng: np.random.Generator,
-    jobs: int,
-    on_recording: Callable[[], None],
-) -> ClipSignatures:
-    """Return the signatures of recordings, each with a passage of every kind and some without."""
-    items = [(street, number, one) for number, one in enumerate(rng.spawn(recordings))]
-    rows = []
-    for heard in in_processes(_signatures, items, jobs):
-        rows += heard
-        on_recording()
-    return ClipSignatures.of(street.name, rows, simulated=True)
-
-
-def _signatures(item: tuple[Roadside, int, np.random.Generator]) -> list[tuple[ClipLabels, FloatArray]]:
-    return [(labels, signature(samples, RATE_HZ)) for labels, samples in simulated_recording(*item)]
 
 
 def simulated_recording(
