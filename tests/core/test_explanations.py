@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.belief.window_belief import ExplanationBelief, equilibrium, generator, transition
-from worldstate.core.step import log_co_evidence
+from worldstate.core.side_update import log_co_evidence
 
 DIRECTIONS = ("left", "right")
 rates = st.tuples(*[st.floats(0.0, 3.0)] * 6)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Annotated, TypeAlias, TypeVar
 from uuid import UUID, uuid5
 
@@ -16,7 +17,7 @@ from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 
 from .side_belief import SideBelief
-from .site_geometry import SiteGeometry
+from .site_geometry import SideGeometry, SiteGeometry
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
@@ -125,13 +126,13 @@ def predict_tracks(
     tracks: Sequence[Track], hidden_shares: Sequence[float], step_s: float, site: SiteGeometry
 ) -> tuple[Track, ...]:
     """Return the tracks after a time step without a measurement; shares are P(hidden | exists)."""
-    moved = list(_driven_on(tracks, step_s, site))
+    moved = _driven_on(tracks, step_s, site)
     polar = [i for i, track in enumerate(moved) if track.place is None]
-    if polar:
-        relaxed = _relaxed([moved[i] for i in polar], [hidden_shares[i] for i in polar], step_s, site)
-        for i, track in zip(polar, relaxed, strict=True):
-            moved[i] = track
-    return tuple(moved)
+    if not polar:
+        return moved
+    relaxed = _relaxed([moved[i] for i in polar], [hidden_shares[i] for i in polar], step_s, site)
+    after = dict(zip(polar, relaxed, strict=True))
+    return tuple(after.get(i, track) for i, track in enumerate(moved))
 
 
 def turned(track: Track, faster_rad_s: float) -> Track:
@@ -172,18 +173,27 @@ def _relaxed(
     tracks: list[Track], hidden_shares: list[float], step_s: float, site: SiteGeometry
 ) -> Iterator[Track]:
     """Yield tracks without a place after a step, drawn to what is expected of vehicles in view or hidden."""
-    accelerations = np.array([acceleration_psd(track) for track in tracks])
+    seen = np.array([track.seen for track in tracks])
+    accelerations = np.where([track.moving for track in tracks], _ACCELERATION, _PARKED_ACCELERATION)
     motion = predict(MotionBelief.stacked([track.motion for track in tracks]), step_s, accelerations)
     # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle still hidden has not passed the
     # corner, whatever its last rates said.
-    kept = np.exp(-step_s * np.where([track.seen for track in tracks], 0.0, hidden_shares) / _RELAXATION_S)
-    towards = MotionBelief.stacked([_IN_VIEW if one.seen else site.sides[one.side].prior() for one in tracks])
+    kept = np.exp(-step_s * np.where(seen, 0.0, hidden_shares) / _RELAXATION_S)
+    expected = _expected(site.sides)
+    of = [-1 if one.seen else one.side for one in tracks]
+    towards = MotionBelief(expected.mean[of], expected.covariance[of])
     relaxed = relax(motion, towards, kept, math.exp(-step_s / _RELAXATION_S))
     for track, moved in zip(tracks, relaxed.each(), strict=True):
         existence = track.existence
         if track.seen:
             existence *= math.exp(-step_s / _VISIBLE_LIFE_S)
         yield replace(track, motion=moved, existence=existence)
+
+
+@lru_cache(maxsize=64)
+def _expected(sides: tuple[SideGeometry, ...]) -> MotionBelief:
+    """Return what is expected of vehicles that are hidden on each side, and last of those in view."""
+    return MotionBelief.stacked([*(side.prior() for side in sides), _IN_VIEW])
 
 
 def follow_places(tracks: Sequence[Track], site: SiteGeometry) -> tuple[Track, ...]:

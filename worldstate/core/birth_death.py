@@ -182,11 +182,13 @@ def past_edges(
     `handed_over` is P(it was another vehicle than the one believed hidden there), by side; `unheard` are
     sides from which one came that was not believed.
     """
+    if not handed_over and not unheard:
+        return memory
     windows, sequence = memory.windows, memory.sequence
     for side, residual in handed_over.items():
         emerge = partial(ExplanationBelief.emerge, direction=side, residual=residual)
         windows = windows and windows.map(emerge)
-    if sequence is not None and (handed_over or unheard):
+    if sequence is not None:
         hidden = [one for one in memory.tracks if not one.seen]
         # One that is still believed hidden where another came from was not what came.
         left = {k: float(any(one.side == k for one in hidden)) for k in unheard}

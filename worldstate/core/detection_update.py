@@ -1,4 +1,4 @@
-"""Update the entities with the detections of one instant: found, missed, announced, handed over."""
+"""Update by detections: the looks that count, and the entities that they find, miss or announce."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, Association, associated
-from worldstate.belief.detection import Detection, Scan, fused
+from worldstate.belief.detection import Detection, Scan, camera_scan, fused, position_scan
+from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import (
     CartesianBelief,
     at_position,
@@ -24,6 +26,7 @@ from worldstate.belief.kinematics.motion import (
     MotionBelief,
     update,
 )
+from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry, normal_share
 from worldstate.belief.track import (
     Track,
@@ -35,10 +38,14 @@ from worldstate.belief.track import (
     relabelled,
 )
 from worldstate.ground import BoolArray, FloatArray, seconds, wrap_angle
-from worldstate.measurement import Sector
+from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
+from .advisories import NO_LOOK, claimed_nats, ruled
 from .birth_death import REOCCLUSION_NS, after_look
-from .memory import NEWS_HOLDS_NS, Memory
+from .fixed_lag import LAG_NS
+from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory, SourceRule
+from .sequence_memory import alerted
+from .site_model import FilterModel
 
 # Of (theta_dot rad/s, rho 1/s) at the first box: a car at 50 km/h passing at 15 m has .9 rad/s, two
 # deviations. A parked one has none, but zero would make the covariance singular.
@@ -46,6 +53,77 @@ _NEW_RATE_STD = (0.5, 0.5)
 _PARKED_RATE_STD = (1e-3, 1e-3)
 _ROUNDING = 1e-12  # Odds of certainty have no quotient
 _Found = Mapping[int, Detection]  # By the index of the track
+
+
+def new_looks(
+    memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings
+) -> tuple[Memory, Measurement, list[tuple[CameraLook, float]]]:
+    r"""Return the memory that knows of the looks of a measurement, it, and the new ones, weighed.
+
+    .. math:: \kappa = \min(dt / T, 1), \quad T = look interval
+
+    by the time since the last look of the sensor. A look belongs to the sensor that looked. Carried by a
+    second source, or delivered again, it says nothing new; the source that carried it first keeps its answer,
+    since each of its windows is weighed anew.
+    """
+    new = []
+    for one in measurement.looks:
+        look, last = one.look, memory.last_look(one.look.sensor)
+        # One stray stamp must not hide the looks after it, nor an image of long ago be new for ever.
+        in_time = -FORGOTTEN_NS < look.stamp_ns - measurement.stamp_ns <= LAG_NS
+        if in_time and (last is None or look.stamp_ns > last.stamp_ns):
+            since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
+            new.append((one, min(max(since_s, 0.0) / settings.look_interval_s, 1.0)))
+            counted = CountedLook(
+                look.sensor, look.stamp_ns, measurement.source, look.answer, look.sector_rad
+            )
+            memory = memory.with_look(counted)
+        elif not in_time or (last is not None and last.source != measurement.source):
+            when = "was counted before" if in_time else "is of another time"
+            said = Unqueried(f"this look of {look.sensor} {when}")
+            measurement = replace(measurement, co_evidence=said)
+    return memory, measurement, new
+
+
+def update_looks(
+    memory: Memory, measurement: Measurement, looks: Sequence[tuple[CameraLook, float]], model: FilterModel
+) -> Memory:
+    """Return the memory after the new looks of a measurement, all cameras at once."""
+    if not looks:
+        return memory
+    scans = [camera_scan(seen, model.site.view(seen.look), weight) for seen, weight in looks]
+    return detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
+
+
+def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> Memory:
+    """Return the memory after the positions of a radar or a radio: entities, and announced hidden ones."""
+    settings, last = model.site.settings, memory.last_look(scan.source)
+    elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
+    weight = min(elapsed_s / settings.look_interval_s, 1.0)
+    memory = detection_update(memory, [position_scan(scan, weight)], None, scan.stamp_ns, model.site)
+    memory = replace(memory.with_look(_scan_look(scan)), seq=memory.seq + 1)
+    if memory.sequence is not None:
+        memory = replace(memory, sequence=alerted(memory.sequence, model.context))
+    chances = announced(memory.tracks, model.site)
+    if not any(chances):
+        # An entity that has come into view, or is gone, ends the rule of the source that announced it.
+        return replace(memory, rules=tuple(one for one in memory.rules if one.source != scan.source))
+    if scan.searched is not None:
+        return memory
+    said = SignatureEvidence(model.context.directions, tuple(map(claimed_nats, chances)), 0.0, 0.0)
+    sides = tuple(k for k, chance in enumerate(chances) if chance > 0.5)
+    return ruled(memory, SourceRule(scan.source, scan.stamp_ns, announced=sides), said, NO_LOOK, model)
+
+
+def _scan_look(scan: PositionScan) -> CountedLook:
+    """Return a scan as a look at its sector, or at none where it is of messages."""
+    source, stamp_ns, searched = scan.source, scan.stamp_ns, scan.searched
+    if searched is None:
+        return CountedLook(source, stamp_ns, source)
+    miss, half_rad = 1.0 - searched.detection_probability, searched.sector.half_width_rad
+    answer = (Present if scan.positions else Absent)(miss, searched.clutter_rate)
+    ends_rad = (searched.sector.centre_rad - half_rad, searched.sector.centre_rad + half_rad)
+    return CountedLook(source, stamp_ns, source, answer, ends_rad)
 
 
 def detection_update(
@@ -86,6 +164,8 @@ def _born(
     memory: Memory, new: Sequence[Detection], scan: Scan, stamp_ns: int, site: SiteGeometry
 ) -> tuple[Memory, list[Track]]:
     """Return new entities before their detections count; hidden where messages say so."""
+    if not new:
+        return memory, []
     fresh, births, sighted = list[Track](), list(memory.births), memory.sighted
     for one in new:
         side = site.hiding_side(one.azimuth_rad) if one.found is None else None

@@ -11,18 +11,22 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.detection import BY_ALL
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
-from worldstate.core import step
-from worldstate.ground import LEAST_HEARD, InvalidArgumentError, in_range, integer_ns, nanoseconds
+from worldstate.ground import LEAST_HEARD, InvalidArgumentError, in_range, integer_ns, nanoseconds, seconds
 from worldstate.ground.serialisation import Layout, decode, encode
 from worldstate.measurement import Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 
+from .acoustic_update import acoustic_update
 from .advisories import update_advisories
 from .birth_death import published
+from .chronicle import chronicled, update_entities
 from .cue_builder import cues_of
+from .detection_update import new_looks, update_looks, update_positions
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import NEWS_HOLDS_NS, Memory, first_memory
+from .prediction import advance, update_odometry
 from .relations import relations_at
+from .side_update import update_sequence, update_windows
 from .site_model import FilterModel, from_here, published_belief, site_geometry_of, without_open_sides
 from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
 
@@ -123,7 +127,7 @@ class WorldFilter:
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
             entities=entities_of(tracks, memory, model.site),
-            relations=relations_at(memory, tracks, context),
+            relations=relations_at(memory, tracks, memory.relations, context),
             context=replace(context, priors=Priors(*(memory.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
             calibrated=self.policy.alpha > 0.0 and not deaf,
@@ -165,7 +169,7 @@ class WorldFilter:
         if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
             return self
         # From the last measurement on, so that many small steps are one step to the bit.
-        return replace(self, memory=step.advance(self._lag.latest, stamp_ns, self._model), lag=self._lag)
+        return replace(self, memory=advance(self._lag.latest, stamp_ns, self._model), lag=self._lag)
 
     def update(self, measurement: Timed) -> "WorldFilter":
         """Return the filter after a measurement or a scan, at its stamp or, if that has passed, the belief's.
@@ -201,27 +205,30 @@ class WorldFilter:
             memory = self._memory  # It was predicted there before
         # Within the slack the belief is not moved back.
         elif measurement.stamp_ns > memory.stamp_ns:
-            memory = step.advance(memory, measurement.stamp_ns, self._model)
+            memory = advance(memory, measurement.stamp_ns, self._model)
         carried, model = memory, from_here(self._model, memory.ego)
         if isinstance(measurement, Odometry):
-            memory = step.update_odometry(memory, measurement)
+            memory = update_odometry(memory, measurement)
         elif isinstance(measurement, PositionScan):
-            memory = step.update_positions(memory, measurement, model)
+            memory = update_positions(memory, measurement, model)
         else:
             memory = self._perceived(memory, measurement, model)
-        return step.chronicled(before, carried, _with_likeliest(memory), model)
+        return chronicled(before, carried, _with_likeliest(memory), model)
 
     def _perceived(self, memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
         """Return the memory after a measurement with its signature, its looks and its sequence."""
         measurement = without_open_sides(measurement, model.context)
-        weight = step.sound_weight(memory, measurement, self.start_ns, self.settings)
-        memory, measurement, looks = step.new_looks(memory, measurement, self.start_ns, self.settings)
+        since_ns = measurement.stamp_ns - memory.rule_of(measurement.source, self.start_ns).stamp_ns
+        memory, measurement, looks = new_looks(memory, measurement, self.start_ns, self.settings)
         # Evidence first: association and births need the explanations of this very window.
-        memory = step.update_evidence(memory, measurement, weight, model)
-        memory = step.update_looks(memory, measurement, looks, model)
+        memory = update_windows(memory, measurement, model)
+        # Of windows that overlap, what is new counts.
+        weight = min(max(seconds(since_ns), 0.0) / self.settings.window_s, 1.0)
+        memory = acoustic_update(memory, measurement, weight)
+        memory = update_looks(memory, measurement, looks, model)
         memory = update_advisories(memory, measurement, model)
-        memory = step.update_sequence(memory, measurement, [seen for seen, _ in looks], model)
-        return step.update_entities(memory, measurement, model)
+        memory = update_sequence(memory, measurement, [seen for seen, _ in looks], model)
+        return update_entities(memory, measurement, model)
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery
@@ -334,7 +341,8 @@ def _with_likeliest(memory: Memory) -> Memory:
 
 def _counting_boxes(measurement: Measurement) -> tuple[Measurement, int]:
     """Return a measurement with the boxes of each image that count, and the number of the others."""
-    left_out = sum(max(len(one.sightings) - MOST_BOXES, 0) for one in measurement.looks)
+    every = (measurement.sightings, *(one.sightings for one in measurement.further))
+    left_out = sum(max(len(boxes) - MOST_BOXES, 0) for boxes in every)
     if not left_out:
         return measurement, 0
     further = tuple(replace(one, sightings=_counting(one.sightings)) for one in measurement.further)

@@ -112,6 +112,15 @@ class Memory:
         others = (one for one in self.rules if one.source != rule.source)
         return replace(self, rules=tuple(sorted((*others, rule), key=attrgetter("source"))))
 
+    def last_look(self, sensor: str) -> CountedLook | None:
+        """Return the last look of a sensor; None where it has made none."""
+        return next((one for one in self.looks if one.sensor == sensor), None)
+
+    def with_look(self, look: CountedLook) -> "Memory":
+        """Return the memory with the last look of a sensor."""
+        others = (one for one in self.looks if one.sensor != look.sensor)
+        return replace(self, looks=tuple(sorted((*others, look), key=attrgetter("sensor"))))
+
     @cached_property
     def sides(self) -> SideBelief:
         """What is believed of the sides, by whichever evidence there is; messages not yet taken in."""
@@ -138,9 +147,9 @@ def first_memory(context: Context, start_ns: int) -> Memory:
     )
 
 
-def without_forgotten(memory: Memory) -> Memory:
-    """Return the memory without sources and sensors that have been unheard for an hour."""
-    since_ns = memory.stamp_ns - FORGOTTEN_NS
+def without_forgotten(memory: Memory, stamp_ns: int) -> Memory:
+    """Return the memory without sources and sensors that have then been unheard for an hour."""
+    since_ns = stamp_ns - FORGOTTEN_NS
     stamps_ns = [one.stamp_ns for one in memory.rules] + [one.stamp_ns for one in memory.looks]
     if min(stamps_ns, default=since_ns) >= since_ns:  # Nearly always: what else is kept has their names
         return memory

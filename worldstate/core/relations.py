@@ -26,12 +26,15 @@ _BESIDE = 10.0  # Metres ahead that a metre beside the lane counts for
 _LEAST = 0.05  # What is less likely is not named
 
 
-def relations_at(memory: Memory, tracks: Sequence[Track], context: Context) -> tuple[Relation, ...]:
-    """Return the relations of some tracks, with the interval in which each has held."""
-    before = {(one.src, one.dst, one.kind): one for one in memory.relations}
+def relations_at(
+    memory: Memory, tracks: Sequence[Track], known: Sequence[Relation], context: Context
+) -> tuple[Relation, ...]:
+    """Return the relations of some tracks, with the interval in which each has held, by those `known`."""
+    before = {(one.src, one.dst, one.kind): one for one in known}
     edges = [one for track in tracks for one in _edges(track, memory, context)]
     placed = [one for one in tracks if one.place and one.place.known]
-    edges += _between(placed, memory.stamp_ns, context)
+    if placed:
+        edges += _between(placed, memory.stamp_ns, context)
     now = {(one.src, one.dst, one.kind): one for one in edges}
     names = {track.id for track in tracks}
     for key, edge in before.items():

@@ -1,0 +1,83 @@
+"""Update the belief of the sides: by windows and their looks, or by a sequence."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from worldstate.abduction.co_evidence import CoEvidence, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground import FloatArray
+from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.measurement import CameraLook, Measurement
+
+from .memory import Memory
+from .sequence_memory import informed
+from .site_model import FilterModel
+
+
+def update_windows(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
+    """Return the memory after the signature of a window with its co-evidence."""
+    windows = memory.windows
+    memory = replace(memory, predicted=memory.sides.hypotheses)
+    if windows is not None and measurement.heard.usable:
+        source, stamp_ns = measurement.source, measurement.stamp_ns
+        window_ns, rates_hz = nanoseconds(model.site.settings.window_s), model.context.rates.values_hz
+        looked = log_co_evidence(measurement.co_evidence, len(model.site.sides))
+        said = masked_by(measurement.signature, measurement.heard.share)
+        signature = _with_hand_overs(said, memory.handover_ns, stamp_ns - window_ns)
+        windows, prior = windows.update(source, stamp_ns, signature, looked, rates_hz, window_ns)
+        memory = replace(memory, windows=windows, predicted=prior.sides.hypotheses)
+    return memory
+
+
+def masked_by(signature: SignatureEvidence, share: float) -> SignatureEvidence:
+    r"""Return the evidence of a window in which a hidden vehicle is noticed with a probability s.
+
+    .. math:: l'_{hid,k} = s\, l_{hid,k} + (1 - s)\, \tfrac{1}{2} (l_{vis} + l_0)
+
+    One that is masked sounds as if it were not there.
+    """
+    if share >= 1.0:
+        return signature
+    rest = float(np.logaddexp(signature.visible, signature.none)) + math.log(0.5 * (1.0 - share))
+    heard = np.logaddexp(np.array(signature.hidden) + math.log(share), rest)
+    return replace(signature, hidden=tuple(heard.tolist()))
+
+
+def _with_hand_overs(
+    signature: SignatureEvidence, handover_ns: tuple[int | None, ...], begin_ns: int
+) -> SignatureEvidence:
+    """Return the evidence, its visible likelihood at least the hidden one for a window after a hand-over."""
+    # A window that begins before a hand-over holds sound of the vehicle while it was hidden; without this,
+    # that sound would give birth to a second hidden entity.
+    pairs = zip(signature.hidden, handover_ns, strict=True)
+    before = [hidden for hidden, stamp_ns in pairs if stamp_ns is not None and stamp_ns > begin_ns]
+    # At least, not equal: what already sounds like a source in view stays that.
+    return replace(signature, visible=max([signature.visible, *before])) if before else signature
+
+
+def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
+    """Return log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
+    hidden, visible, none = answer.log_likelihoods().tolist()
+    return np.array([*[hidden] * directions, visible, none])
+
+
+def update_sequence(
+    memory: Memory, measurement: Measurement, looks: Iterable[CameraLook], model: FilterModel
+) -> Memory:
+    """Return the memory after what a sequence model and the cameras say of vehicles that come into view."""
+    said, site = measurement.sequence, model.site
+    if said is None and memory.sequence is None:
+        return memory
+    told = [site.in_sight(one) for one in looks if not isinstance(one.look.answer, Unqueried)]
+    refused = said if isinstance(said, NotUsable) else None
+    sequence = informed(memory.sequence, measurement, told, model.context)
+    return replace(
+        memory,
+        sequence=sequence,
+        windows=memory.windows if sequence is None else None,
+        # Other sources do not speak of it: what was said last holds.
+        no_sequence=memory.no_sequence if said is None else refused,
+    )
