@@ -245,7 +245,7 @@ def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_b
     np.testing.assert_allclose(per_hop[bench.SILENCE], [[0.0, 30.0, 0.0]] * 2, atol=1e-9)
     hidden, visible = per_hop[bench.WORLD].sum(axis=1)
     assert hidden < 15.0 and visible < 15.0
-    for tracker in (bench.UNHEARING, bench.OC_SORT, bench.GM_PHD, bench.JPDA):
+    for tracker in (bench.UNHEARING, bench.OC_SORT, bench.GM_PHD, bench.GM_PHD_ENDS, bench.JPDA):
         hidden, visible = per_hop[tracker].sum(axis=1)
         # Without the sound nobody knows of whom no box has shown; a box, each of them follows.
         assert hidden >= 29.0 and visible < 20.0 and per_hop[tracker][1, 0] < 10.0

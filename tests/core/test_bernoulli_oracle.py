@@ -1,11 +1,13 @@
-"""Existence of a target that a radar finds half the time, and that goes: Stone Soup's particles and ours."""
+"""Existence of a target that is found half the time, and goes or is half hidden: Stone Soup's and ours."""
 
 from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
 
-from worldstate import FilterSettings, WorldFilter
+from worldstate import FilterSettings, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent
+from worldstate.belief.window_belief import ExplanationBelief
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 
 # A detection raises the odds to .5 / .3 + .5 = 2.2 times, a miss halves them: existence stays off 0 and 1.
@@ -38,9 +40,25 @@ def ours(places):
     return np.array(exists)
 
 
-def stone_soup(places, start, corrected):
+def corrected(updater):
+    """Return a Bernoulli updater that counts empty scans, at which the stock one leaves all as it was."""
+
+    class Counting(updater):
+        def update(self, hypotheses, **given):
+            after, before = super().update(hypotheses, **given), hypotheses.single_hypotheses[0].prediction
+            if not any(hypotheses):
+                found = np.exp(self.get_log_detection_probability(before))
+                missed, r = before.weight.astype(float) * (1.0 - found), float(before.existence_probability)
+                after.existence_probability = r * missed.sum() / (1.0 - r + r * missed.sum())
+                if self.resampler is None:
+                    after.log_weight = np.log(missed / missed.sum())
+            return after
+
+    return Counting
+
+
+def stone_soup(places, start, corrects):
     """Return the existence of its Bernoulli particle filter, which begins at `start` after the first scan."""
-    from scipy.special import logsumexp
     from stonesoup.models.measurement.linear import LinearGaussian
     from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
     from stonesoup.predictor.particle import BernoulliParticlePredictor
@@ -51,17 +69,6 @@ def stone_soup(places, start, corrected):
     from stonesoup.types.multihypothesis import MultipleHypothesis
     from stonesoup.types.state import BernoulliParticleState
     from stonesoup.updater.particle import BernoulliParticleUpdater
-
-    class Counting(BernoulliParticleUpdater):
-        """Counts empty scans, at which the stock one leaves the existence as it is."""
-
-        def update(self, hypotheses, **given):
-            after, before = super().update(hypotheses, **given), hypotheses.single_hypotheses[0].prediction
-            if not any(hypotheses):
-                missed = np.exp(logsumexp(self.get_log_detection_probability(before) + before.log_weight))
-                r = float(before.existence_probability)
-                after.existence_probability = r * (1.0 - missed) / (1.0 - r * missed)
-            return after
 
     class Births:
         """A handful of particles where the target is not: nobody is born."""
@@ -84,7 +91,7 @@ def stone_soup(places, start, corrected):
     predictor = BernoulliParticlePredictor(
         motion, birth_probability=1e-9, survival_probability=1.0 - 1e-9, birth_sampler=Births()
     )
-    updater = (Counting if corrected else BernoulliParticleUpdater)(
+    updater = (corrected(BernoulliParticleUpdater) if corrects else BernoulliParticleUpdater)(
         measurement_model=model,
         resampler=SystematicResampler(),
         clutter_rate=1,
@@ -107,8 +114,60 @@ def test_a_target_that_goes_is_forgotten_as_stone_soups_particles_forget_it(seed
     pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
     places = scripted(np.random.default_rng(seed))
     mine = ours(places)
-    theirs, stock = (stone_soup(places, mine[0], corrected) for corrected in (True, False))
+    theirs, stock = (stone_soup(places, mine[0], corrects) for corrects in (True, False))
     np.testing.assert_allclose(mine, theirs, atol=2e-3)
     assert mine[:GONE].max() > 0.95 and mine[GONE + 9] < 0.05
     # Stock, a scan that finds nobody tells it nothing: ten scans later it is as sure as ever.
     assert stock[GONE + 9] > 0.95
+
+
+def half_hidden(updater, number=200):
+    """Return the existence after each of ten empty scans of a lane of which every second place is hidden."""
+    from stonesoup.types.array import StateVectors
+    from stonesoup.types.detection import MissedDetection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.multihypothesis import MultipleHypothesis
+    from stonesoup.types.prediction import Prediction
+    from stonesoup.types.state import BernoulliParticleState
+
+    class Edge:
+        """A sensor that sees nothing beyond the edge."""
+
+        def is_detectable(self, state):
+            return np.asarray(state.state_vector[0, :], float) > 0.0
+
+    along = StateVectors(np.linspace(-20.0, 20.0, number)[None])
+    even = np.full(number, 1.0 / number)
+    target = BernoulliParticleState(along, weight=even, existence_probability=0.5, timestamp=EPOCH)
+    made = updater(measurement_model=None, sensors=[Edge()], detection_probability=FOUND)
+    exists = []
+    for step in range(1, 11):
+        now = EPOCH + timedelta(seconds=STEP_S * step)
+        predicted = Prediction.from_state(target, timestamp=now)
+        missed = SingleHypothesis(predicted, MissedDetection(timestamp=now))
+        target = made.update(MultipleHypothesis([missed]))
+        exists.append(float(target.existence_probability))
+    return np.array(exists)
+
+
+def test_ten_empty_scans_of_a_lane_half_hidden_leave_what_the_hidden_half_may_hold():
+    """r (1 - pd) / (1 - r pd), with pd the share in view times the sensor's: down to 1/3, and no further."""
+    pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
+    from stonesoup.updater.particle import VisibilityInformedBernoulliParticleUpdater as Stock
+
+    law, r, in_view = [], 0.5, 0.5
+    for _ in range(10):
+        pd = FOUND * in_view
+        r, in_view = r * (1.0 - pd) / (1.0 - r * pd), in_view * (1.0 - FOUND) / (1.0 - pd)
+        law.append(r)
+    belief, mine = ExplanationBelief.from_priors(2, hidden=0.25, visible=0.25, none=0.5), []
+    hidden, visible, none = Absent(miss_rate=1.0 - FOUND).log_likelihoods()
+    even = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    for _ in range(10):
+        belief = belief.update(even, np.array([hidden, hidden, visible, none]))
+        mine.append(sum(belief.sides.hypotheses[:2]))
+    np.testing.assert_allclose(mine, law, atol=1e-9)
+    np.testing.assert_allclose(half_hidden(corrected(Stock)), law, atol=0.01)
+    # Stock, ten scans that find nothing change nothing.
+    np.testing.assert_array_equal(half_hidden(Stock), 0.5)
+    assert law[-1] == pytest.approx(1.0 / 3.0, abs=1e-3)

@@ -5,7 +5,7 @@ of turn, and the sector that the camera searches. In Stone Soup the probability 
 that a target outside that sector is kept from the camera's scan.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
@@ -42,13 +42,13 @@ PEAK_DETECTION, PEAK_CLUTTER = 0.25, 1.0 / np.pi
 BOX_DETECTION, BOX_CLUTTER = 0.94, 0.01
 TURN_PSD = 0.014  # 2 m^2/s^3 at 12 m, rad^2/s^3
 START_STD, START_RATE_STD = 0.7, 0.4  # Ahead within 80 degrees; 5 m/s at 12 m
+END_STD = 0.1  # Of the ends of the view: half the width of a car at 9 m
 BIRTHS = 0.01  # A hop: one vehicle in ten seconds
 HITS = 3  # Boxes that make a track, as OC-SORT has it
 MISSED_S, UNSEEN_S = 0.35, 3.0  # Without a box where the camera looks, and in any case
 _EPOCH = datetime(2000, 1, 1)
 _TURN = CombinedLinearGaussianTransitionModel([ConstantVelocity(TURN_PSD)])
 _PREDICTOR, _UPDATER = KalmanPredictor(_TURN), KalmanUpdater(None)
-_START = np.diag([START_STD**2, START_RATE_STD**2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +89,14 @@ def _detected(found: Iterable[Bearing | Sighting], when: datetime) -> tuple[Any,
 
 
 class GmPhd:
-    """The Gaussian-mixture PHD filter: azimuths of the components that weigh more than a half."""
+    """The Gaussian-mixture PHD filter: azimuths of the components that weigh more than a half.
 
-    def __init__(self) -> None:
+    Vehicles are born anywhere ahead, or at the ends of the view, where they come out of hiding, if these are
+    given (J. Menezes and M. Campbell, arXiv 2605.20666, without its semantic part).
+    """
+
+    def __init__(self, ends_rad: Sequence[float] = ()) -> None:
+        self._born = [(end, END_STD) for end in ends_rad] or [(0.0, START_STD)]
         self._reducer = GaussianMixtureReducer(
             prune_threshold=1e-3, merge_threshold=4.0, max_number_components=20
         )
@@ -109,16 +114,23 @@ class GmPhd:
         return [float(one.state_vector[0]) for one in self._components if one.weight > 0.5]
 
     def _updated(self, components: list[Any], scan: Scan, survival: float, when: datetime) -> list[Any]:
-        birth = TaggedWeightedGaussianState(
-            np.zeros((2, 1)), _START, when, weight=BIRTHS, tag=TaggedWeightedGaussianState.BIRTH
-        )
+        births = [
+            TaggedWeightedGaussianState(
+                [[azimuth], [0.0]],
+                np.diag([std**2, START_RATE_STD**2]),
+                when,
+                weight=BIRTHS / len(self._born),
+                tag=TaggedWeightedGaussianState.BIRTH,
+            )
+            for azimuth, std in self._born
+        ]
         updater = PHDUpdater(
             _UPDATER,
             clutter_spatial_density=scan.clutter_density,
             prob_detection=scan.detection_probability,
             prob_survival=survival,
         )
-        hypotheses = self._hypothesiser.hypothesise([*components, birth], scan.detections, when)
+        hypotheses = self._hypothesiser.hypothesise([*components, *births], scan.detections, when)
         return list(self._reducer.reduce(list(updater.update(hypotheses))))
 
 

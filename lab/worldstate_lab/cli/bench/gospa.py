@@ -38,6 +38,7 @@ EXAMPLE = "example: worldstate-lab bench gospa streams/S??-*.npz --seconds 120"
 
 SILENCE, WORLD, BOXES, UNHEARING = "silence", "world-state", "boxes as they are", "world-state without sound"
 OC_SORT, GM_PHD, JPDA = "OC-SORT on the boxes", "GM-PHD (Stone Soup)", "JPDA (Stone Soup)"
+GM_PHD_ENDS = "GM-PHD, born at the view's ends"
 PHASES, PARTS = ("hidden", "visible"), ("localised", "missed", "false")
 EXISTS, ALPHA = 0.5, 0.02
 Row = dict[str, float | None]
@@ -55,7 +56,8 @@ def stated(
 
     taken = list(measured)
     view, boxes = _view(taken), _oc_sort(heard)
-    world, deaf, phd, jpda = start, start, GmPhd(), Jpda()
+    world, deaf, jpda = start, start, Jpda()
+    phds = {GM_PHD: GmPhd(), GM_PHD_ENDS: GmPhd(view)}
     for one in taken:
         world, deaf = world.update(one), deaf.update(_unheard(one))
         both, when, hop = scans(one, view), scan_time(one), round(one.stamp_ns * 1e-9 / HOP_S)
@@ -67,7 +69,7 @@ def stated(
                 BOXES: ((), [box.azimuth_rad for box in one.sightings]),
                 UNHEARING: _by_phase(deaf.state),
                 OC_SORT: ((), boxes[hop]),
-                GM_PHD: _by_place(phd.step(both, when), view),
+                **{name: _by_place(phd.step(both, when), view) for name, phd in phds.items()},
                 JPDA: _by_place(jpda.step(both, when), view),
             },
         )
@@ -191,11 +193,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     junctions, lines = [name for name in found if name != "all"], []
     for k, phase in enumerate(PHASES):
         parts = "".join(f"{part:>12}" for part in PARTS)
-        lines.append(f"{phase:28}{'GOSPA':>8}{parts}  of {(SILENCE, OC_SORT)[k]}, worst")
+        lines.append(f"{phase:32}{'GOSPA':>8}{parts}  of {(SILENCE, OC_SORT)[k]}, worst")
         for method, rows in found["all"].items():
             row, shares = rows[phase], {one: found[one][method][phase]["share"] or 0.0 for one in junctions}
             worst = max(shares, key=lambda one: shares[one])
             parts = "".join(f"{row[part]:12.2f}" for part in PARTS)
             share = f"  {row['share']:.3f}  {shares[worst]:.3f} ({worst})"
-            lines.append(f"{method:28}{row['gospa_deg']:8.2f}{parts}{share}")
+            lines.append(f"{method:32}{row['gospa_deg']:8.2f}{parts}{share}")
     return CommandResult(found, table={}, lines=lines)
