@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Protocol
 
+import numpy as np
+
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
 from worldstate.abduction.grounding.grounded_likelihood import (
@@ -27,8 +29,8 @@ from worldstate.abduction.road_users import (
     likeliest,
     with_siren,
 )
-from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.abduction.sequence.sequence_reader import SequenceReader
+from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
+from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
 from worldstate.abduction.signature.domain_guard import (
     DomainGuard,
     DomainVerdict,
@@ -59,8 +61,8 @@ from worldstate.measurement.measurement import (
     Side,
 )
 
-from .acoustic_sequence import LEVEL_BAND_HZ, read_hop
-
+# Loudness is the mean of these bands: of others it would not be what a sequence was trained on.
+LEVEL_BAND_HZ = (50.0, 2700.0)
 # Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
 # would take a wrong guess of the ear for a look at the right thing.
 _ASKED = 0.95
@@ -307,48 +309,17 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         The bearing of direct sound votes for its side; that of reflected sound, or a coarse one, says which
         half of the street the peak is in, not where the vehicle is: then the side is the signature's.
         """
-        self.last_frame = frame
-        heard_well = heard_of(frame)
-        if not heard_well.usable:
-            return asked_again(self._unheard(frame, heard_well), self._vision, self._settings)
-        heard = signature = self._model.evidence(frame.feature)
-        self._directions = signature.directions
-        bearing, looming = _bearing(frame, self._settings), frame.looming
-        approach = (
-            looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
-        )
-        if isinstance(bearing, Bearing):
-            direct = direct_probability(frame.peaks)
-            signature = with_bearing_vote(signature, bearing.azimuth_rad, bearing.std_rad, direct)
-        if self._grounding is not None:
-            signature = self._grounding.answer(signature, observe(bearing, approach)).evidence
-        domain = self._judged(frame)
-        kinds = self._heard_kinds(frame, domain)
-        if isinstance(domain, Foreign) and self._guard is not None:
-            signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
-        # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
-        reader = self._sequence
-        sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
-        measured = Measurement(
-            stamp_ns=frame.stamp_ns,
-            signature=signature,
-            co_evidence=Unqueried("no camera"),
-            bearing=bearing,
-            approach=approach,
-            domain=domain,
-            kinds=kinds,
-            sequence=sequence,
-            source=self.source,
-            fault=_array_fault(frame.health),
-            heard=heard_well,
-        )
+        self.last_frame, heard = frame, heard_of(frame)
+        measured = self._unheard(frame, heard)
+        if heard.usable:
+            measured = self._read(frame, measured)
+        elif isinstance(self._sequence, SequenceReader):
+            self._sequence.miss()
         return asked_again(measured, self._vision, self._settings)
 
     def _unheard(self, frame: AcousticFrame, heard: Heard) -> Measurement:
         """Return the measurement of a hop that could not be heard, with even likelihoods."""
         refused = NotUsable(heard.reason or "not heard")
-        if isinstance(self._sequence, SequenceReader):
-            self._sequence.miss()
         return Measurement(
             stamp_ns=frame.stamp_ns,
             signature=SignatureEvidence(self._directions, (0.0,) * len(self._directions), 0.0, 0.0),
@@ -361,15 +332,63 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             heard=heard,
         )
 
-    def _judged(self, frame: AcousticFrame) -> DomainVerdict | None:
-        if self._guard is None or isinstance(frame.character, NotUsable):
-            return None
-        return self._guard.judge(frame.character[: len(MEASURES)])
+    def _read(self, frame: AcousticFrame, unheard: Measurement) -> Measurement:
+        """Return the measurement of a hop with what the models read in it."""
+        heard = signature = self._model.evidence(frame.feature)
+        self._directions = signature.directions
+        bearing, approach = _bearing(frame, self._settings), _approach(frame)
+        if isinstance(bearing, Bearing):
+            direct = direct_probability(frame.peaks)
+            signature = with_bearing_vote(signature, bearing.azimuth_rad, bearing.std_rad, direct)
+        if self._grounding is not None:
+            signature = self._grounding.answer(signature, observe(bearing, approach)).evidence
+        domain, kinds = self._recognised(frame)
+        if isinstance(domain, Foreign) and self._guard is not None:
+            signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
+        # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
+        reader = self._sequence
+        sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
+        return replace(
+            unheard,
+            signature=signature,
+            bearing=bearing,
+            approach=approach,
+            domain=domain,
+            kinds=kinds,
+            sequence=sequence,
+        )
 
-    def _heard_kinds(self, frame: AcousticFrame, domain: DomainVerdict | None) -> ClassShares:
-        if self._road_users is None or isinstance(frame.character, NotUsable):
-            return ()
-        return heard_kinds(self._road_users, frame.character, domain)
+    def _recognised(self, frame: AcousticFrame) -> tuple[DomainVerdict | None, ClassShares]:
+        """Return whether the models know such sound, and which road users it may be of."""
+        character, guard, model = frame.character, self._guard, self._road_users
+        if isinstance(character, NotUsable):
+            return None, ()
+        domain = None if guard is None else guard.judge(character[: len(MEASURES)])
+        return domain, () if model is None else heard_kinds(model, character, domain)
+
+
+def read_hop(
+    reader: SequenceReader, signature: SignatureEvidence, frame: AcousticFrame
+) -> SequenceReading | NotUsable:
+    """Return what a sequence says after one more hop, from what its window model and the front-end say."""
+    sides = signature.sides
+    if sides is None:
+        return NotUsable("the model says nothing of single sides")
+    looming = frame.looming
+    rate_hz = std_hz = np.nan
+    if not isinstance(looming, NotUsable):
+        rate_hz, std_hz = looming.inverse_tta_hz, looming.std_hz
+    evidence = HopEvidence.heard(
+        np.array([sides.log_ratios]),
+        np.array([sides.visible]),
+        feature=frame.feature[None],
+        band_log_energy=frame.band_log_energy[None],
+        prominence=np.array([frame.prominence]),
+        looming_hz=np.array([rate_hz]),
+        looming_std_hz=np.array([std_hz]),
+        bearing_rad=np.array([frame.bearing_rad]),
+    )
+    return reader.read(evidence, frame.feature)
 
 
 def heard_of(frame: AcousticFrame) -> Heard:
@@ -423,6 +442,11 @@ def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotU
         ratio = f"{frame.prominence:.2f}, not above {least:.2f}"
         return NotUsable(f"peak-to-median ratio {ratio}")
     return Bearing(wrap_angle(frame.bearing_rad), frame.bearing_std_rad, frame.prominence)
+
+
+def _approach(frame: AcousticFrame) -> Approach | NotUsable:
+    looming = frame.looming
+    return looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
 
 
 def _array_fault(health: ArrayHealth | NotUsable) -> str | None:

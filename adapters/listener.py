@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Unpack
 
+from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
+from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
@@ -21,7 +23,6 @@ from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
-from .acoustic_sequence import learn_passes
 from .own_parts import OtherModality
 from .source import Source
 from .source_files import SourceParts, open_source
@@ -328,6 +329,17 @@ def listened(source: Source) -> Iterator[tuple[Listener, Float32Array]]:
         listener = Listener(source, audio.sample_rate_hz)
         for block in audio.blocks(max(audio.sample_rate_hz // PARTS_PER_SECOND, 1)):
             yield listener, block
+
+
+def learn_passes(street: StreetListener | None, state: WorldState) -> None:
+    """Tell a street who has just come into view out of which of its arms."""
+    if street is None:
+        return
+    arms = {one.id: one.direction for one in state.entities}
+    came = {arms.get(event.entity_id) for event in state.events if event.kind == "handed_over"}
+    for arm in SIDES:
+        if arm in came:
+            street.passed(arm)
 
 
 class _Waiting:

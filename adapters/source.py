@@ -1,5 +1,6 @@
 """What is listened to: a recording with its array, model, camera and what was believed before."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,15 +9,17 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
-from worldstate.abduction.sequence.street_sides import SidePatterns
+from worldstate.abduction.sequence.street_sides import SidePatterns, StreetHearing, StreetListener
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, path_of
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
+from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -28,8 +31,9 @@ from worldstate.measurement.sector import Sector
 from worldstate.state import Context
 
 from .acoustic import Grounding, Signature
-from .acoustic_sequence import street_listener
 from .own_parts import OtherModality
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,3 +250,20 @@ def unoccluded_sector(context: Context) -> Sector:
     (True, False)
     """
     return Sector.in_sight(occluder.edge_azimuth_rad for occluder in context.occluders)
+
+
+def street_listener(
+    domain: ModelDomain | None, known: SidePatterns | None, before: StreetHearing | None
+) -> StreetListener | None:
+    """Return what learns a street while it is heard: from what was heard before, else from what is known.
+
+    What another array heard is left out, and a warning says so.
+    """
+    if domain is None:
+        return None
+    heard_by = heard_with(domain)
+    given = known if before is None else before.known
+    if given is not None and given.heard_by not in ("", heard_by):
+        _LOG.warning("the street's sides were heard by another array (%s) and are left out", given.heard_by)
+        before = known = None
+    return StreetListener(before or StreetHearing(replace(known or SidePatterns(), heard_by=heard_by)))

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypedDict, TypeVar
 
+from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.street_sides import SidePatterns
 from worldstate.adapters.audio.open_sound import SoundInput, SoundStream, as_sound, path_of
 from worldstate.adapters.camera.camera_channel import video_degradation, watched
@@ -14,7 +15,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.files.acoustic_domain import array_of, states_budget
+from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, states_budget
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model
@@ -22,10 +23,9 @@ from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
 from worldstate.state import Context
 
-from .acoustic_sequence import sequence_of
 from .own_parts import OtherModality
 from .source import ListenSettings, Source
 
@@ -190,8 +190,24 @@ def _heard(
         settings=settings,
         guard=model.guard,
         road_users=model.road_users,
-        sequence=sequence_of(model, moves, settings.uncalibrated),
+        sequence=_sequence_of(model, moves, settings.uncalibrated),
     )
+
+
+def _sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable:
+    """Return the sequence model of a file where it was made for what is heard, else why it is not used."""
+    if model.sequence is None:
+        return NotUsable("the model states no times: `worldstate model make` makes one that does")
+    if uncalibrated:
+        return NotUsable("uncalibrated: times are stated of the array that the model was made for")
+    if not model.provenance.fit_for_use:
+        return NotUsable(UNFIT)
+    if model.domain is None:
+        return NotUsable("the model names no array that it was made for")
+    motion = "moving" if moving_ego else "standing"
+    if model.domain.ego_motion not in (motion, "any"):
+        return NotUsable(f"the model was made for a {model.domain.ego_motion} ego, this one is {motion}")
+    return model.sequence
 
 
 def _with_camera(

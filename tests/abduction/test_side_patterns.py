@@ -20,11 +20,10 @@ from worldstate.abduction.sequence.street_sides import (
     StreetSides,
     arrival_pattern,
 )
-from worldstate.adapters.acoustic_sequence import street_listener
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import listen_steps
-from worldstate.adapters.source import ListenSettings
+from worldstate.adapters.source import ListenSettings, street_listener
 from worldstate.adapters.source_files import open_source
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode

@@ -20,7 +20,7 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.expert import Expert
 from worldstate.abduction.signature.site_reference import SiteReference
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
-from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
+from worldstate.adapters.acoustic import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model, save_model

@@ -104,12 +104,12 @@ def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
     words = command(street, "--duration", 60, "--out", out, "--json")
     script = [sys.executable, "-m", "worldstate", *words]
     with subprocess.Popen(script, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ) as process:
-        until_s = time.monotonic() + 20.0
+        until_s = time.monotonic() + 60.0
         # The file has its name only at the end: a temporary one stands beside it until states are written.
         while not any(one.stat().st_size for one in tmp_path.iterdir()) and time.monotonic() < until_s:
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
-        printed, _ = process.communicate(timeout=20.0)
+        printed, _ = process.communicate(timeout=60.0)
     assert process.returncode == 0
     assert json.loads(printed)["states"] == len(out.read_text().splitlines()) > 0
 

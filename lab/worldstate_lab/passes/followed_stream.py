@@ -15,11 +15,12 @@ from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import asked_again
-from worldstate.adapters.acoustic_sequence import learn_passes, street_listener
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import Model
+from worldstate.adapters.listener import learn_passes
+from worldstate.adapters.source import street_listener
 from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import StreamTruth, stream_truth
