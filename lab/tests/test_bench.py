@@ -17,6 +17,14 @@ from worldstate.ground.values import NotUsable
 WHOLE = "front_end", "everything", "evidence", "feature_chain"
 
 
+def test_the_files_of_a_hop_are_those_that_it_executes(capsys):
+    assert main(["bench", "--files", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["n_files"] == len(report["files"])
+    assert {"worldstate/adapters/listener.py", "worldstate/core/filter.py"} < {*report["files"]}
+    assert "worldstate/adapters/source_files.py" not in report["files"]
+
+
 def test_keys_and_consistency(capsys):
     assert main(["bench", "--rounds", "1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
