@@ -130,6 +130,14 @@ def write_state_figure(
         Line-of-sight entry.
     truth : sequence of TrueTrack
         True tracks of the vehicles of a simulated recording.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_state_figure([WorldState(0, 0)], Path(folder) / "quiet.png")
+    ...     (Path(folder) / "quiet.png").stat().st_size > 10_000
+    True
     """
     with figure_file(path, 10.0, 8.6 if sound is None else 9.6) as figure:
         heights = (1.0 if sound is None else 1.4, 0.42, 0.6, 0.6)
