@@ -1,1 +1,1 @@
-"""Approach: looming, engine line, Doppler shift."""
+"""Approach: looming, and the frequency of a tone."""
