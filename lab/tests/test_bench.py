@@ -4,9 +4,11 @@ import json
 
 import numpy as np
 from worldstate_lab.benchmarks.hop_costs import EVIDENCE, FRONT_END, RATE_HZ, made_up_adapter
+from worldstate_lab.benchmarks.tracker_costs import hops
 from worldstate_lab.cli.bench.cost import AGAINST, EVERYTHING, FEATURE_CHAIN, _source, processed, report_lines
 from worldstate_lab.cli.main import main
 
+from worldstate import WorldFilter
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
 from worldstate.frontend.approach.looming import Looming
@@ -14,6 +16,8 @@ from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.values import NotUsable
 
+FILTER = {f"{name}_{n}" for name in ("update", "state") for n in (1, 20, 64, 600)}
+BATCHES = {"numpy_batch_1", "numpy_batch_20"}
 WHOLE = "front_end", "everything", "evidence", "feature_chain"
 
 
@@ -30,13 +34,21 @@ def test_keys_and_consistency(capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["blas"]
     median_ms = {name: one["median_ms"] for name, one in report["costs"].items()}
-    assert set(median_ms) == {*FRONT_END, *EVIDENCE, *WHOLE, *AGAINST}
+    assert set(median_ms) == {*FRONT_END, *EVIDENCE, *WHOLE, *AGAINST, *FILTER, *BATCHES}
     parts = sum(median_ms[name] for name in FEATURE_CHAIN)
     assert 0.0 < parts < 3.0 * median_ms["feature_chain"]
     assert median_ms["everything"] > median_ms["feature_chain"]
     for name, ours in AGAINST.items():
         assert report["ratios"][name] == median_ms[name] / median_ms[ours] > 0.0
         assert report["settings"][name]
+
+
+def test_every_vehicle_of_the_timed_hops_is_followed():
+    for n, kept in ((1, 1), (20, 20), (600, 64)):
+        world = WorldFilter()
+        for one in hops(n, np.random.default_rng(0))[:10]:
+            world = world.update(one)
+        assert len(world.state.entities) == kept
 
 
 def test_text_names_kernel_threads_and_what_is_compared():

@@ -1,4 +1,4 @@
-"""`worldstate-lab bench`: what the front-end costs on this machine, beside its peers.
+"""`worldstate-lab bench`: what front-end and filter cost on this machine, beside their peers.
 
 56 channels, 47,998 Hz, nfft 512, half overlap, BLAS pinned to one thread. Milliseconds are the median over
 rounds of the median (and 99th percentile) over hops. The sound is a broadband source and an engine line in
@@ -39,6 +39,7 @@ from worldstate_lab.benchmarks.hop_costs import (
     published_chain_times,
     stage_times,
 )
+from worldstate_lab.benchmarks.tracker_costs import tracker_times
 
 EXAMPLE = "example: worldstate-lab bench"
 
@@ -51,8 +52,12 @@ AGAINST = {
     "published_chain": "feature_chain",
     "scikit_learn_trees": "sequence_reader",
     "scikit_learn_classifier": "window_evidence",
+    "jpda_1": "update_1",
+    "update_20": "numpy_batch_20",
+    "update_600": "update_64",
+    "state_20": "update_20",
 }
-"""Row of ours that does the work of a peer."""
+"""Row of ours that does the work of a peer; of ours, what it is held against."""
 SETTINGS = {
     "stages": "56 channels, 47,998 Hz, Hann 512, hop 256, 18 or 19 new frames a hop; STFT bins 1-18; SRP "
     "bins 3-18, 181 azimuths; feature bins 1-15, 30 azimuths x 2 halves",
@@ -63,6 +68,11 @@ SETTINGS = {
     "classifier; against sequence_reader, its inputs included",
     "scikit_learn_classifier": "the published linear machines on one window, without probabilities; against "
     "window_evidence: five experts, each on the window and its mirror image, the site learned",
+    "jpda_1": "Stone Soup's JPDA on one vehicle in view; against the whole filter on the same boxes",
+    "update_20": "boxes of twenty vehicles; against predict and update of as many Kalman filters of four states "
+    "by einsum, their association known",
+    "update_600": "boxes of 600 objects an image, of which 64 count; against 64",
+    "state_20": "a snapshot of twenty vehicles; against their update",
 }
 """Frame-exact settings of the stages and of every comparison."""
 
@@ -131,7 +141,7 @@ def _one_round(street: Float32Array) -> Mapping[str, Milliseconds]:
     ours = {name: times[WARM_UP_HOPS:] for name, times in ours.items()}
     installed = find_spec("pyroomacoustics") is not None
     peer = {"published_chain": published_chain_times(street)} if installed else {}
-    return ours | evidence_times(heard) | peer
+    return ours | evidence_times(heard) | peer | tracker_times(np.random.default_rng(1))
 
 
 def _hops(sound: Float32Array) -> list[Float32Array]:
