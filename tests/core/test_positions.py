@@ -251,6 +251,18 @@ def test_an_announced_vehicle_keeps_its_identity_when_camera_or_radar_find_it() 
         assert world.state.risk < 0.2
 
 
+@pytest.mark.parametrize("clutter", [1e-300, 1e-9])
+def test_detections_that_are_never_of_nothing_leave_existence_a_probability(clutter: float) -> None:
+    searched = replace(RADAR, clutter_rate=clutter)
+    there = Position((20.0, 2.0), diagonal(0.3, 0.3, 0.3, 0.3), (0.0, 0.0))
+    world = after(*[replace(radar(t, there), searched=searched) for t in (0.5, 1.0, 1.5)])
+    boxes = (Sighting(0.1, 0.03, "car", 0.9),)
+    world = after(replace(heard(1.6, boxes=boxes), co_evidence=Present(0.0, clutter)), world=world)
+    for found in (world, after(radar(2.0), world=world)):
+        (entity,) = found.state.entities
+        assert 0.4 < entity.existence_probability <= 1.0
+
+
 def test_a_message_joins_the_vehicle_that_is_heard() -> None:
     world = after(*[heard(hop / 10, left=4.0) for hop in range(1, 15)])
     (before,) = world.state.entities

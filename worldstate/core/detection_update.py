@@ -211,15 +211,20 @@ def _existence(
     r = before.clip(_ROUNDING, 1.0 - _ROUNDING)
     seen = np.array([one.seen for one in tracks])
     in_sight = np.where(seen, 1.0, 1.0 - np.array([one.behind for one in tracks]))
-    odds = ratio = r / (1.0 - r)
+    odds = ratio = _odds(r)
     for hit, scan in zip(hits.T, scans, strict=True):
         detected = _searched(tracks, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
         missed = after_empty_look(r, 1.0 - detected)
         missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
         now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
-        ratio = ratio * (now / (1.0 - now)) / odds
+        ratio = ratio * _odds(now) / odds
     existence: list[float] = np.where(counts, ratio / (1.0 + ratio), before).tolist()
     return existence
+
+
+def _odds(probabilities: FloatArray) -> FloatArray:
+    bounded = probabilities.clip(_ROUNDING, 1.0 - _ROUNDING)
+    return np.asarray(bounded / (1.0 - bounded))
 
 
 def _searched(tracks: Sequence[Track], scan: Scan) -> FloatArray:

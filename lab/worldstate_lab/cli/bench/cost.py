@@ -69,8 +69,8 @@ SETTINGS = {
     "scikit_learn_classifier": "the published linear machines on one window, without probabilities; against "
     "window_evidence: five experts, each on the window and its mirror image, the site learned",
     "jpda_1": "Stone Soup's JPDA on one vehicle in view; against the whole filter on the same boxes",
-    "update_20": "boxes of twenty vehicles; against predict and update of as many Kalman filters of four states "
-    "by einsum, their association known",
+    "update_20": "boxes of twenty vehicles; against predict and update of as many Kalman filters of four "
+    "states by einsum, their association known",
     "update_600": "boxes of 600 objects an image, of which 64 count; against 64",
     "state_20": "a snapshot of twenty vehicles; against their update",
 }
