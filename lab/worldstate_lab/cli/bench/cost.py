@@ -179,7 +179,8 @@ def executed_files(street: Float32Array) -> list[str]:
         sys.setprofile(follow)
         listener.push(hop)
         sys.setprofile(None)
-    return sorted(max(passed, key=len))
+    fullest = max(passed, key=len)
+    return sorted(fullest)
 
 
 def _report(runs: list[Mapping[str, Milliseconds]], kernels: tuple[str, ...]) -> dict[str, Any]:
