@@ -4,6 +4,7 @@ The exchangeable unit is a recording, because the windows of one recording are s
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -217,18 +218,13 @@ def _smallest_threshold(losses: _Losses, allowed: float) -> float:
 
 def _largest_sum(losses: _Losses, alpha: float, delta: float) -> float:
     """Return the largest sum of losses from which "the mean exceeds alpha" is refuted at level delta."""
-    sums = np.concatenate([[0.0], np.cumsum(losses.shares)])
-    low, high = -1, sums.size - 1
-    while low < high:
-        middle = (low + high + 1) // 2
-        if _p_value(float(sums[middle]), losses, alpha) <= delta:
-            low = middle
-        else:
-            high = middle - 1
-    return float(sums[low]) if low >= 0 else -1.0
+    sums = [0.0, *np.cumsum(losses.shares).tolist()]
+    refuted = bisect_right(sums, delta, key=lambda total: _p_value(total, losses, alpha))
+    return sums[refuted - 1] if refuted else -1.0
 
 
 def _p_value(total: float, losses: _Losses, alpha: float) -> float:
+    from scipy.special import rel_entr
     from scipy.stats import binom
 
     n = losses.recordings
@@ -236,10 +232,6 @@ def _p_value(total: float, losses: _Losses, alpha: float) -> float:
     if losses.single:
         return tail
     mean = min(total / n, alpha)
-    divergence = -math.log1p(-alpha) if mean == 0.0 else _divergence(mean, alpha)
+    # Kullback-Leibler divergence of the two laws of one loss, nats.
+    divergence = float(rel_entr(mean, alpha) + rel_entr(1.0 - mean, 1.0 - alpha))
     return min(math.exp(-n * divergence), math.e * tail)
-
-
-def _divergence(a: float, b: float) -> float:
-    """Kullback-Leibler divergence of Bernoulli(a) from Bernoulli(b), 0 < a <= b < 1, nats."""
-    return a * math.log(a / b) + (1.0 - a) * math.log((1.0 - a) / (1.0 - b))

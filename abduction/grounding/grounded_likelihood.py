@@ -143,25 +143,8 @@ _AZIMUTH_CELL_RAD = float(np.radians(1.0))
 _RANGES_M = np.geomspace(5.0, 60.0, 24)
 
 
-@dataclass(frozen=True, slots=True)
-class Background:
-    """Density of an observable that belongs to no source; all other densities are relative to it."""
-
-    mean: float  # Of a broad normal law, in the observable's unit
-    std: float
-
-    def log_density(self, value: float) -> float:
-        r"""Return the log density at a value, nats.
-
-        .. math:: \log p = -\tfrac12 (x - \mu)^2 / \sigma^2 - \log(\sigma \sqrt{2 \pi})
-        """
-        return float(-0.5 * ((value - self.mean) / self.std) ** 2 - np.log(self.std * np.sqrt(2 * pi)))
-
-
-BACKGROUNDS = {
-    "radial_speed_m_s": Background(0.0, 10.0),
-    "inverse_tta_hz": Background(0.0, 1.0),
-}
+# Of the broad normal laws about zero of what belongs to no source; all other densities are relative to these.
+BACKGROUND_STD = {"radial_speed_m_s": 10.0, "inverse_tta_hz": 1.0}
 
 
 # Deviation of the azimuth of a source in plain view, and of the strongest direction of a hidden one: it is a
@@ -316,14 +299,17 @@ def _log_approach(observation: GroundedObservation, settings: GroundedSettings) 
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
     if isinstance(speed, Observable) and "radial_speed_m_s" not in settings.without:
-        background = BACKGROUNDS["radial_speed_m_s"].log_density(speed.value)
-        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - background
+        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - _log_background("radial_speed_m_s", speed)
     if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in settings.without:
-        background = BACKGROUNDS["inverse_tta_hz"].log_density(inverse_tta.value)
+        background = _log_background("inverse_tta_hz", inverse_tta)
         ranges = _SPEED_CELL_M_S / _RANGES_M
         over_range = _log_normal(inverse_tta, _SPEEDS_M_S[:, None] / _RANGES_M, ranges)
         return np.asarray(np.logaddexp.reduce(over_range, axis=1) - np.log(_RANGES_M.size) - background)
     return np.zeros(_SPEEDS_M_S.size)
+
+
+def _log_background(name: str, seen: Observable) -> FloatArray:
+    return _log_normal(Observable(seen.value, BACKGROUND_STD[name]), np.zeros(()), 0.0)
 
 
 def _over_azimuth(bearing: Observable | NotUsable, std_rad: float) -> FloatArray:

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import (
-    BACKGROUNDS,
+    BACKGROUND_STD,
     Descriptor,
     GroundedObservation,
     Observable,
@@ -40,8 +40,7 @@ def test_the_integral_over_speed_is_that_of_adaptive_quadrature(speed_m_s):
 
     mass = norm.cdf(30.0, 8.0, 3.0) - norm.cdf(-5.0, 8.0, 3.0)
     oracle = quad(integrand, -5.0, 30.0, limit=400, points=[0.0, 2.0, 5.0, 10.0])[0] / mass
-    background = BACKGROUNDS["radial_speed_m_s"]
-    relative = math.log(oracle) - norm.logpdf(speed_m_s, background.mean, background.std)
+    relative = math.log(oracle) - norm.logpdf(speed_m_s, 0.0, BACKGROUND_STD["radial_speed_m_s"])
     answer = ground(SCORES, GroundedObservation(radial_speed_m_s=Observable(speed_m_s, 2.0)), [vehicle])
     assert answer.evidence.hidden[0] - SCORES.hidden[0] == pytest.approx(relative, abs=0.01)
     assert answer.evidence.visible - SCORES.visible == pytest.approx(relative, abs=0.01)
