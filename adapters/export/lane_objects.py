@@ -60,11 +60,12 @@ def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[
     .. math:: p = d\,(1, \tan\theta), \qquad
         \Sigma = \sigma_\theta^2\, \partial_\theta p\, \partial_\theta p^T + \sigma_d^2\, p p^T / d^2
 
-    and a hidden one comes towards the axis of the ego at the pace of its occluder.
+    and a hidden one comes towards the axis of the ego at the pace of its occluder, on each of its sides.
     """
     paces = {occluder.direction: occluder.pace_hz for occluder in state.context.occluders}
     coming = {cue.direction: (cue.within or {}).get("3") for cue in state.cues}
-    for entity in (one for one in state.entities if one.moving):
+    moving = (part for one in state.entities if one.moving for part in one.on_each_side())
+    for entity in moving:
         hidden, within = entity.status == "hidden", coming.get(entity.direction or "")
         # That somebody comes into view is said given all that was heard, so of one that exists it is more.
         given = within / max(entity.existence_probability, 1e-6) if hidden and within is not None else 1.0

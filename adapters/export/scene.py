@@ -57,7 +57,7 @@ def scene_update(state: WorldState) -> SceneUpdate:
         *(_occluder(state, one) for one in state.context.occluders),
         *(_searched(state, one) for one in state.searched),
         *(_cue(state, one) for one in state.cues),
-        *(_entity(state, one) for one in state.entities if one.moving),
+        *(_entity(state, part) for one in state.entities if one.moving for part in one.on_each_side()),
     ]
     return SceneUpdate((SceneRemoval(SceneTime.of_ns(state.stamp_ns)),), tuple(items))
 

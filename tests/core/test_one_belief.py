@@ -163,6 +163,89 @@ def test_one_vehicle_of_unknown_side_is_gone_from_the_other_side_when_it_is_seen
     assert cue_of(before, "left").hypotheses.none < 0.2
 
 
+def heard_as(*said: SequenceReading, hops: int = 6) -> list[WorldState]:
+    """Return the states of some readings, each for a while, with nothing seen."""
+    world, quiet, states = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0), []
+    for number in range(hops * len(said)):
+        reading_ = said[number // hops]
+        world = world.update(
+            Measurement((number + 1) * 10**8, quiet, Unqueried("-"), SILENT, SILENT, sequence=reading_)
+        )
+        states.append(world.state)
+    return states
+
+
+ONE = both_sides((0.55, 0.42), (0.42, 0.55), "coming_2s")
+OTHER_WAY = both_sides((0.42, 0.55), (0.55, 0.42), "coming_2s")
+TWO = both_sides((0.9, 0.95), (0.08, 0.03), "coming_2s")
+
+
+def test_one_vehicle_of_unknown_side_is_one_entity_with_a_share_on_each_side() -> None:
+    state = heard_as(ONE)[-1]
+    (entity,) = state.entities
+    shares = {one.direction: one.probability for one in entity.sides}
+    risks = {cue.direction: cue.risk for cue in state.cues}
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert shares["left"] / shares["right"] == pytest.approx(risks["left"] / risks["right"])
+    assert entity.existence_probability == pytest.approx(sum(risks.values()), abs=0.01)
+    assert entity.direction == "left" and {cue.entity_id for cue in state.cues} == {entity.id}
+    for one in entity.sides:
+        assert one.azimuth_rad == pytest.approx(cue_of(state, one.direction).azimuth_rad)
+    left, right = entity.on_each_side()
+    assert left.id == entity.id != right.id and right.azimuth_rad < 0.0 < left.azimuth_rad
+    assert left.existence_probability + right.existence_probability == pytest.approx(
+        entity.existence_probability
+    )
+    assert WorldState.from_json(state.to_json()) == state
+
+
+def test_a_vehicle_heard_likelier_on_the_other_side_keeps_its_id() -> None:
+    *_, before = heard_as(ONE)
+    *_, after = heard_as(ONE, OTHER_WAY)
+    assert [one.id for one in after.entities] == [one.id for one in before.entities]
+    assert [one.direction for one in (*before.entities, *after.entities)] == ["left", "right"]
+
+
+def test_two_are_two_when_both_are_likely_and_one_again_by_the_joint() -> None:
+    states = heard_as(OTHER_WAY, TWO, ONE)
+    one, two, last = (states[hop].entities for hop in (5, 11, 17))
+    # The id goes on at the side that was likelier when it became two.
+    assert {entity.direction: entity.id == one[0].id for entity in two} == {"left": False, "right": True}
+    assert all(not entity.sides for entity in two)
+    assert [entity.id for entity in last] == [one[0].id] and len(last[0].sides) == 2
+    (merged,) = (event for state in states for event in state.events if event.kind == "merged")
+    assert merged.into == one[0].id
+
+
+def test_a_share_that_fades_merges_nothing() -> None:
+    """Where next to nothing is left on one side, the vehicle there is gone, and not part of the other."""
+    states = heard_as(TWO, both_sides((0.9, 0.02), (0.02, 0.9), "coming_2s"))
+    assert len(states[5].entities) == 2
+    kinds = [event.kind for state in states[6:] for event in state.events]
+    assert len(states[-1].entities) == 1 and states[-1].entities[0].direction == "left"
+    assert "merged" not in kinds and kinds.count("died") == 1
+
+
+@pytest.mark.parametrize("edge_rad", [0.53, -0.53])
+def test_one_of_unknown_side_is_handed_over_where_it_is_seen(edge_rad: float) -> None:
+    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    near = both_sides((0.55, 0.42), (0.42, 0.55), "coming_0.5s")
+    for number in range(1, 9):
+        seen = number == 8
+        answer = Present(0.04, 0.01) if seen else Absent(0.04, 0.01)
+        look = Look("camera", number * 10**8, answer)
+        boxes = (Sighting(edge_rad, 0.02, "car", 0.9),) if seen else ()
+        before = world.state
+        world = world.update(
+            Measurement(number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=look, sequence=near)
+        )
+    (hidden,), (car,) = before.entities, world.state.entities
+    assert len(hidden.sides) == 2 and car.sides == () and car.status == "visible"
+    assert car.id == hidden.id and car.azimuth_rad == pytest.approx(edge_rad, abs=0.05)
+    assert max(cue.risk for cue in world.state.cues) < 0.3
+    assert (hidden.azimuth_source, car.azimuth_source) == ("context", "measured")
+
+
 def test_a_second_vehicle_believed_apart_stays_when_the_first_is_seen() -> None:
     before, after = seen_from_left(both_sides((0.9, 0.85), (0.04, 0.08), "coming_1s"))
     assert cue_of(after, "right").risk > 0.95 * cue_of(before, "right").risk

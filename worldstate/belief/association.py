@@ -14,7 +14,7 @@ from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
 
 from .detection import Detection
 from .site_geometry import HIDDEN_BIAS_STD, SiteGeometry, normal_share
-from .track import Track
+from .track import Track, side_weights
 
 # Of a pair outside the gate; below any sum of scores within it.
 FORBIDDEN = -1e6
@@ -330,4 +330,4 @@ def emergence_density(tracks: Sequence[Track], azimuth_rad: FloatArray, site: Si
     for side in range(len(edges_rad)):
         others = np.delete(near, side, axis=1).max(axis=1) if len(edges_rad) > 1 else near[:, side]
         heard[:, side] = (1.0 - _SIDE_CONFUSION) * near[:, side] + _SIDE_CONFUSION * others
-    return np.asarray(heard[:, [track.side for track in tracks]])
+    return np.asarray(heard @ np.array([side_weights(track, len(edges_rad)) for track in tracks]).T)

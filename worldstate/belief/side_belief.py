@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 
 @dataclass(frozen=True, slots=True)
 class SideBelief:
@@ -11,9 +13,9 @@ class SideBelief:
 
     Examples
     --------
-    >>> both = SideBelief((0.9, 0.8), (0.0, 0.1), (0.9, 0.8), 0.95, (0.95, 0.0, 0.05))
-    >>> [round(both.existence(side), 2) for side in (0, 1)]
-    [0.9, 0.9]
+    >>> either = SideBelief((0.5, 0.4), (0.0, 0.1), (0.5, 0.4), 0.8, (0.8, 0.0, 0.2), both=0.1)
+    >>> [round(either.existence(side), 2) for side in (0, 1, None)]
+    [0.5, 0.5, 0.9]
     """
 
     hidden: tuple[float, ...]  # shape (K,): P(a vehicle is hidden on a side)
@@ -21,16 +23,29 @@ class SideBelief:
     risks: tuple[float, ...]  # shape (K,): P(one comes into view there within eight seconds)
     risk: float  # P(one comes into view anywhere)
     hypotheses: tuple[float, float, float]  # P(hidden), P(visible), P(none) of eq. (6)
+    # P(a vehicle is hidden on each of two sides); None by single windows, whose sides exclude each other.
+    both: float | None = None
 
-    def existence(self, side: int) -> float:
-        """Return the probability that there is such a vehicle."""
+    def hidden_on(self, side: int | None) -> float:
+        """Return P(a vehicle is hidden on a side), on any where None."""
+        return sum(self.hidden) - (self.both or 0.0) if side is None else self.hidden[side]
+
+    def existence(self, side: int | None) -> float:
+        """Return the probability that there is a vehicle of a side, of any where None."""
+        emerged = sum(self.emerged) if side is None else self.emerged[side]
         # The sum of two exponentials exceeds one by rounding where nothing else is possible.
-        return min(self.hidden[side] + self.emerged[side], 1.0)
+        return min(self.hidden_on(side) + emerged, 1.0)
 
-    def hidden_share(self, side: int) -> float:
+    def hidden_share(self, side: int | None) -> float:
         """Return P(hidden | exists)."""
-        either = self.hidden[side] + self.emerged[side]
-        return self.hidden[side] / either if either > 0.0 else 1.0
+        existence = self.existence(side)
+        return min(self.hidden_on(side) / existence, 1.0) if existence > 0.0 else 1.0
+
+    def side_shares(self, least: float) -> tuple[float, ...]:
+        """Return P(side | one vehicle of unknown side exists), zero below the least, shape (K,)."""
+        shares = np.array([self.existence(side) for side in range(len(self.hidden))])
+        shares = np.where(shares >= least * shares.sum(), shares, 0.0)
+        return tuple((shares / shares.sum()).tolist())
 
     def at_least(self, announced: Sequence[float]) -> "SideBelief":
         r"""Return the belief with the vehicles that messages announce, by side.

@@ -68,6 +68,17 @@ class Track:
     place: CartesianBelief | None = None  # Then `motion` follows from it
     behind: Probability = 1.0  # P(behind its side's occluder), by that place
     width_rad: float = 0.0  # Of its last box
+    # P(it is of a side | exists) of one only heard, whose side is not known; empty where it is.
+    side_shares: tuple[Probability, ...] = ()
+
+    @property
+    def of_side(self) -> int | None:
+        """The side that its existence is read from: None, of any, where it is not known."""
+        return None if self.side_shares and not self.detected else self.side
+
+    def may_be_on(self, side: int) -> bool:
+        """Tell whether it is, or may be, of a side."""
+        return self.side == side if self.of_side is not None else self.side_shares[side] > 0.0
 
     @property
     def detected(self) -> bool:
@@ -231,7 +242,13 @@ def hidden_share(track: Track, sides: SideBelief) -> float:
     """Return P(hidden | exists) of a track, 0 once it was seen."""
     if track.seen:
         return 0.0
-    return sides.hidden_share(track.side) if track.place is None else track.behind
+    return sides.hidden_share(track.of_side) if track.place is None else track.behind
+
+
+def side_weights(track: Track, sides: int) -> tuple[float, ...]:
+    """Return P(an entity is of a side | exists), shape (sides,)."""
+    known = tuple(float(k == track.side) for k in range(sides))
+    return track.side_shares if track.of_side is None else known
 
 
 def heard_as(track: Track, kinds: ClassShares) -> tuple[Label, ...]:

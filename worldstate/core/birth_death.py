@@ -3,12 +3,13 @@
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.association import EDGE_STD_RAD, HANDOVER_RESIDUAL, Association
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
+from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track, born, heard_as
 from worldstate.belief.window_belief import ExplanationBelief
@@ -26,9 +27,11 @@ _REARM_NS = nanoseconds(1.0)
 REOCCLUSION_NS, _REOCCLUSION_END_NS = nanoseconds(0.15), nanoseconds(3.0)
 # From the edge that it was last seen near: less than the 64 degrees between the edges of a default junction.
 _REOCCLUSION_RAD = 0.8
+HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 _LOST_RAD = 0.8  # Standard deviation; beyond, the azimuth is known to no more than half of the view
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
+_AGE = attrgetter("created_ns", "id")
 
 
 def birth_death(
@@ -38,51 +41,122 @@ def birth_death(
 
     Shapes: alarmed (K,).
     """
-    settings, sides, kept, counts = site.settings, memory.sides, list(memory.tracks), list(memory.births)
-    for k, before_ns in enumerate(memory.handover_ns):
-        current, existence = hidden_on(kept, k), sides.existence(k)
-        if current is not None:
-            kept.remove(current)
-            current = replace(current, labels=heard_as(current, measurement.kinds))
-            if current.place is not None:
-                # It was announced, and is there until its place is lost.
-                kept.append(current)
-            elif existence >= settings.death_probability or alarmed[k]:
-                kept.append(replace(current, existence=existence))
-            continue
-        rearmed = before_ns is None or memory.stamp_ns - before_ns > _REARM_NS
-        if rearmed and (sides.hidden[k] >= settings.birth_probability or alarmed[k]):
-            # What came into view from here before was another vehicle: the new one starts without its mass.
-            forget = partial(ExplanationBelief.forget_origin, direction=k)
-            memory = replace(memory, windows=memory.windows and memory.windows.map(forget))
-            returning = _returning(kept, k, measurement.stamp_ns, site)
-            if returning is None:
-                one = born(site.sides[k].label, counts[k], 0.0, measurement.stamp_ns, site)
-                # A detector adds to the kinds at the hand-over.
-                labels = measurement.kinds or one.labels
-                one = replace(one, labels=labels, sources=(measurement.source,))
-                counts[k] += 1
-            else:
-                kept.remove(one := returning)
-            one = replace(one, side=k, seen=False, came_from=1.0, existence=min(sides.hidden[k], 1.0))
-            stamp_ns, motion = measurement.stamp_ns, site.sides[k].prior()
-            kept.append(replace(one, motion=motion, updated_ns=stamp_ns, place=None, behind=1.0))
+    current = {
+        None if one is None else one.id for one in map(partial(hidden_on, memory.tracks), _sides(site))
+    }
+    updated = (
+        _heard_on(one, alarmed, measurement, memory.sides, site) if one.id in current else one
+        for one in memory.tracks
+    )
+    memory = replace(memory, tracks=tuple(one for one in updated if one is not None))
+    for k in _sides_of_births(memory, alarmed, site):
+        memory = _with_birth(memory, k, measurement, site)
+    hidden = _hidden(memory.tracks)
+    alone = len(hidden) == 1 and memory.sides.hidden_share(None) >= HIDDEN
+    tracks = (_on_its_side(one, alone, memory.sides, site) for one in memory.tracks)
+    return replace(memory, tracks=tuple(tracks))
+
+
+def _heard_on(
+    track: Track, alarmed: Sequence[bool], measurement: Measurement, sides: SideBelief, site: SiteGeometry
+) -> Track | None:
+    """Return a hidden entity after one more hop; None where it is no longer believed."""
+    track = replace(track, labels=heard_as(track, measurement.kinds))
+    if track.place is not None:
+        return track  # It was announced, and is there until its place is lost
+    existence = sides.existence(track.of_side)
+    named = any(alarmed[k] for k in _sides(site) if track.of_side in (k, None))
+    return (
+        replace(track, existence=existence) if existence >= site.settings.death_probability or named else None
+    )
+
+
+def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> list[int]:
+    """Return the sides on which a hidden entity is born: of one vehicle the likelier one."""
+    sides, least, hidden = memory.sides, site.settings.birth_probability, _hidden(memory.tracks)
+    rearmed = _rearmed(memory)
+    if sides.both is not None and not hidden and all(rearmed):
+        some = sides.hidden_on(None) >= least or any(alarmed)
+        return [max(_sides(site), key=sides.hidden_on)] if some else []
+    if sides.both is not None and sides.both < least and any(one.of_side is None for one in hidden):
+        return []
+    likely = (sides.hidden[k] >= least or alarmed[k] for k in _sides(site))
+    taken = {one.side for one in hidden}
+    return [
+        k
+        for k, (one, free) in enumerate(zip(likely, rearmed, strict=True))
+        if one and free and k not in taken
+    ]
+
+
+def _with_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> Memory:
+    """Return the memory with one more hidden entity on a side, of unknown side where it is the only one."""
+    kept, counts, sides = list(memory.tracks), list(memory.births), memory.sides
+    # After a hand-over it is another one, of the other side.
+    first = sides.both is not None and not _hidden(kept) and all(_rearmed(memory))
+    shares = sides.side_shares(site.settings.death_probability) if first else ()
+    # What came into view from here before was another vehicle: the new one starts without its mass.
+    forget = partial(ExplanationBelief.forget_origin, direction=k)
+    memory = replace(memory, windows=memory.windows and memory.windows.map(forget))
+    one = _returning(kept, k, measurement.stamp_ns, site)
+    if one is None:
+        one = born(site.sides[k].label, counts[k], 0.0, measurement.stamp_ns, site)
+        # A detector adds to the kinds at the hand-over.
+        one = replace(one, labels=measurement.kinds or one.labels, sources=(measurement.source,))
+        counts[k] += 1
+    else:
+        kept.remove(one)
+        shares = ()
+    stamp_ns, motion = measurement.stamp_ns, site.sides[k].prior()
+    one = replace(one, side=k, seen=False, came_from=1.0, existence=min(sides.hidden[k], 1.0))
+    kept.append(replace(one, motion=motion, updated_ns=stamp_ns, place=None, behind=1.0, side_shares=shares))
     return replace(memory, tracks=tuple(kept), births=tuple(counts))
 
 
-def merged_tracks(tracks: tuple[Track, ...], stamp_ns: int) -> tuple[tuple[Track, ...], dict[str, str]]:
+def _on_its_side(track: Track, alone: bool, sides: SideBelief, site: SiteGeometry) -> Track:
+    """Return an entity of unknown side on its likelier one: the only one, where it is hidden alone."""
+    if track.of_side is not None:
+        return replace(track, side_shares=()) if track.side_shares else track
+    shares = sides.side_shares(site.settings.death_probability)
+    side = shares.index(max(shares))
+    motion = track.motion if side == track.side else site.sides[side].prior()
+    track = replace(track, side=side, side_shares=shares if alone else (), motion=motion)
+    return replace(track, existence=sides.existence(track.of_side))
+
+
+def _rearmed(memory: Memory) -> list[bool]:
+    return [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in memory.handover_ns]
+
+
+def _sides(site: SiteGeometry) -> range:
+    return range(len(site.sides))
+
+
+def _hidden(tracks: Iterable[Track]) -> list[Track]:
+    return [one for one in tracks if not one.seen and one.behind >= HIDDEN]
+
+
+def merged_tracks(memory: Memory, site: SiteGeometry) -> tuple[tuple[Track, ...], dict[str, str]]:
     """Return the tracks with those that have become one as one, and by the ids that end those that go on.
 
     Of two at one place, of the same class, one has just been found and the other not for a second. They go
-    on where the first is, under the id that was known earlier.
+    on where the first is, under the id that was known earlier; so do the halves of one of unknown side.
     """
-    left, into = list(tracks), dict[str, str]()
+    left, stamp_ns, into = list(memory.tracks), memory.stamp_ns, dict[str, str]()
+    tracks = memory.tracks
+    if _are_halves(_hidden(tracks), memory.sides, site):
+        first, second = sorted(_hidden(tracks), key=_AGE)
+        shares = memory.sides.side_shares(site.settings.death_probability)
+        left.remove(second)
+        halves = replace(first, side_shares=shares)
+        left[left.index(first)] = _on_its_side(halves, True, memory.sides, site)
+        into[second.id] = first.id
     found = [one for one in tracks if one.seen and one.last_seen_ns == stamp_ns]
     lost = [one for one in tracks if one.seen and stamp_ns - (one.last_seen_ns or 0) >= _ALONE_NS]
     for other in lost:
         same = next((one for one in found if _at_one_place(one, other)), None)
         if same is not None:
-            first, second = sorted((same, other), key=lambda one: (one.created_ns, one.id))
+            first, second = sorted((same, other), key=_AGE)
             known = max(same.existence, other.existence)
             one = replace(
                 same, id=first.id, created_ns=first.created_ns, came_from=first.came_from, existence=known
@@ -91,6 +165,20 @@ def merged_tracks(tracks: tuple[Track, ...], stamp_ns: int) -> tuple[tuple[Track
             left[left.index(same)] = found[found.index(same)] = one
             into[second.id] = first.id
     return tuple(left), into
+
+
+def _are_halves(hidden: list[Track], sides: SideBelief, site: SiteGeometry) -> bool:
+    r"""Tell whether two entities that are only heard are one, by the joint of both sides.
+
+    .. math:: P(C_k, C_j) < p_{birth}^2
+
+    which is less than two vehicles have that are each believed just enough to be born.
+    """
+    told_apart = any(one.detected or one.last_seen_ns is not None for one in hidden)
+    if len(hidden) != 2 or told_apart or hidden[0].side == hidden[1].side:
+        return False
+    behind = all(sides.hidden_share(one.side) >= HIDDEN for one in hidden)
+    return behind and sides.both is not None and sides.both < site.settings.birth_probability**2
 
 
 def _at_one_place(one: Track, other: Track) -> bool:
@@ -108,9 +196,9 @@ def _likeliest(track: Track) -> str:
 
 
 def hidden_on(tracks: Iterable[Track], k: int) -> Track | None:
-    """Return the likeliest hidden entity of a side; None where there is none."""
-    hidden = [one for one in tracks if not one.seen and one.side == k and one.behind >= 0.5]
-    return max(hidden, key=lambda one: one.existence, default=None)
+    """Return the likeliest hidden entity of a side, or one that may be there; None where there is none."""
+    there = (one for one in _hidden(tracks) if one.may_be_on(k))
+    return max(there, key=lambda one: (one.side == k, one.existence), default=None)
 
 
 def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -> Track | None:
@@ -128,7 +216,6 @@ def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.
 MOST_EVENTS = 64
-HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 
 
 def published(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
@@ -162,7 +249,8 @@ def after_look(
     """Return the memory with the tracks after a look: those of before in their order, then the new ones."""
     before = memory.tracks
     emerged = (i for i in whose.found if tracks[i].seen and not before[i].seen)
-    handed_over = {before[i].side: max(HANDOVER_RESIDUAL, 1.0 - whose.chances[i]) for i in emerged}
+    # Of the side where it is: what was heard may have been believed on the other one.
+    handed_over = {tracks[i].side: max(HANDOVER_RESIDUAL, 1.0 - whose.chances[i]) for i in emerged}
     # First seen near an edge, it came past it unheard.
     unheard = {
         track.side

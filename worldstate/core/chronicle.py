@@ -52,7 +52,7 @@ def chronicled(before: Memory, carried: Memory, after: Memory, model: FilterMode
         (since_ns if since_ns is not None and held is not None else after.stamp_ns) if named else None
         for since_ns, held, named in zip(before.advised_ns, *told, strict=True)
     )
-    tracks, into = merged_tracks(after.tracks, after.stamp_ns)
+    tracks, into = merged_tracks(after, model.site)
     known, now = (published(one, model.site.settings) for one in (before.tracks, tracks))
     events = events_between(known, now, after.stamp_ns, into)
     relations = relations_at(after, now, before.relations, model.context)

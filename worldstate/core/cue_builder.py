@@ -55,9 +55,9 @@ def _cue(
 ) -> RiskCue:
     track = hidden_on(memory.tracks, k)
     motion = model.site.sides[k].prior() if track is None else track.motion
-    azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
-    if track is None or track.place is None:
-        azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, model.site)
+    azimuth_rad, std_rad, source = hidden_azimuth(k, track, memory.sequence, model.site)
+    if track is not None and track.place is not None:
+        azimuth_rad, std_rad, source = motion.azimuth_rad, motion.azimuth_std_rad, "measured"
     within, interval_s = times
     closing_hz = motion.inverse_tta_hz if track is not None and track.approach_heard else None
     arrival_s = time_to_arrival(closing_hz, motion.inverse_tta_std_hz)
@@ -75,6 +75,7 @@ def _cue(
         hypotheses=Priors(*sides.hypotheses),
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
+        azimuth_source=source,
         risk=sides.risks[k],
         confidence=sides.risks[k] / max(sum(sides.risks), 1e-300),
         advisory=advisory,

@@ -8,7 +8,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import STATED
 from worldstate.belief.site_geometry import normal_share
-from worldstate.belief.track import Track, hidden_share
+from worldstate.belief.track import Track, hidden_share, side_weights
 from worldstate.ground import FloatArray, nanoseconds
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
@@ -61,8 +61,12 @@ def _edges(track: Track, memory: Memory, context: Context) -> Iterator[Relation]
     occluder, stamp_ns = context.occluders[track.side].id, memory.stamp_ns
     if not track.seen:
         share = hidden_share(track, memory.sides)
-        yield Relation(track.id, occluder, "occluded_by", share, stamp_ns)
-        yield Relation(track.id, occluder, "approaching_from", share * _comes(track, memory), stamp_ns)
+        for k, one in enumerate(context.occluders):
+            hidden = share * side_weights(track, len(context.occluders))[k]
+            if track.may_be_on(k):
+                comes = hidden * _comes(track, k, memory)
+                yield Relation(track.id, one.id, "occluded_by", hidden, stamp_ns)
+                yield Relation(track.id, one.id, "approaching_from", comes, stamp_ns)
     elif track.came_from >= _LEAST:
         yield Relation(track.id, occluder, "emerged_from", track.came_from, stamp_ns)
     if track.approach_heard:
@@ -70,14 +74,14 @@ def _edges(track: Track, memory: Memory, context: Context) -> Iterator[Relation]
         yield Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns)
 
 
-def _comes(track: Track, memory: Memory) -> float:
+def _comes(track: Track, side: int, memory: Memory) -> float:
     """Return P(it comes into view from there within five seconds | hidden), by its place or the sound."""
     if track.place is not None:
         y, vy = track.place.mean[[1, 3]].tolist()
         return normal_share(-math.copysign(vy, y * vy) / math.sqrt(track.place.covariance[3, 3]))
     if memory.sequence is None:
         return 1.0
-    coming = memory.sequence.coming[track.side]
+    coming = memory.sequence.coming[side]
     return float(coming[:STATED].sum() / max(coming.sum(), 1e-12))
 
 

@@ -128,6 +128,8 @@ class SequenceMemory:
     looks: tuple[Look, ...] = ()  # The last one of each sensor, for as long as it holds
     # When a vehicle last came into view from a side.
     emerged_ns: tuple[int | None, ...] = (None,) * len(SIDES)
+    # When what was heard on a side was last that of a vehicle that then came into view, there or elsewhere.
+    masked_ns: tuple[int | None, ...] = (None,) * len(SIDES)
     # P(a vehicle has come into view from a side and no look has told), where no camera looks or none sees.
     unseen: tuple[Probability, ...] = (0.0,) * len(SIDES)
     # How often a vehicle has come into view past the edge of each side, while a camera looked.
@@ -145,7 +147,7 @@ class SequenceMemory:
             finite_array(f"memory.sequence.{name}", array, shape)
             if (array < 0.0).any() or not np.allclose(array.sum(axis=-1), 1.0, atol=1e-3):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected probabilities")
-        for name in ("decided", "over_ns", "emerged_ns", "unseen", "arrivals"):
+        for name in ("decided", "over_ns", "emerged_ns", "masked_ns", "unseen", "arrivals"):
             if (got := len(getattr(self, name))) != len(SIDES):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected {len(SIDES)}, got {got}")
 
@@ -194,6 +196,11 @@ class SequenceMemory:
         none = float((1.0 - comes - groups[:, _OTHER] - beside).mean())
         return min(max(none, 1.0 - float(comes.sum()), 0.0), 1.0 - float(comes.max()))
 
+    @property
+    def both_come(self) -> float:
+        """P(vehicles come into view on both sides)."""
+        return max(float(self.comes.sum()) - (1.0 - self.none_comes), 0.0)
+
     @cached_property
     def sides(self) -> SideBelief:
         """What the states say of the sides and of the explanations.
@@ -215,7 +222,7 @@ class SequenceMemory:
         seen = min(float((groups[:, _SEEN_GROUP] / rest).mean()), 1.0 - far)
         hypotheses = (1.0 - none * (1.0 - far), none * seen, none * (1.0 - far - seen))
         told = tuple(comes.tolist())
-        return SideBelief(told, tuple(emerged.tolist()), told, 1.0 - none, hypotheses)
+        return SideBelief(told, tuple(emerged.tolist()), told, 1.0 - none, hypotheses, self.both_come)
 
     def since_emerged_ns(self, stamp_ns: int) -> list[float]:
         """Return how long before a time a vehicle last came into view from each side."""
@@ -233,12 +240,12 @@ class SequenceMemory:
         vehicles that another one follows, and the gaps g of these. One vehicle of unknown side was believed
         on both sides; vehicles of sides that are `apart`, or that were likelier two than one, stay.
         """
-        belief, alone = self.states.belief.copy(), self.states.alone.copy()
-        unseen, comes = np.array(self.unseen), self.comes
-        both = float(comes.sum()) - (1.0 - self.none_comes)
+        belief, alone, masked = self.states.belief.copy(), self.states.alone.copy(), set(kept)
+        unseen, comes, both = np.array(self.unseen), self.comes, self.both_come
         for k, residual in kept.items():
             j = 1 - k
             if j not in kept and j not in apart and both <= _TWO:
+                masked.add(j)
                 given = both / max(comes[k], _LEAST_WEIGHT)
                 less = residual + (1.0 - residual) * min(given / max(comes[j], _LEAST_WEIGHT), 1.0)
                 moved = belief[j, COMES].sum() * (1.0 - less)
@@ -256,6 +263,7 @@ class SequenceMemory:
             self,
             states=SequenceBelief(belief, alone),
             emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
+            masked_ns=tuple(stamp_ns if k in masked else ns for k, ns in enumerate(self.masked_ns)),
             over_ns=tuple(None if k in kept else ns for k, ns in enumerate(self.over_ns)),
             unseen=tuple(unseen.tolist()),
             arrivals=tuple(
@@ -337,8 +345,8 @@ def informed(
         said = states_of(at_prior(reading.groups, reading.share, kept.prior(context)), reading.share)
         # Masked by whatever else is heard, or by a vehicle that has just come into view on that side.
         said = _as_heard(kept.states.alone, said, measurement.heard.share)
-        masked = np.array(kept.since_emerged_ns(kept.stamp_ns)) <= _MASKED_NS
-        said = np.where(masked[:, None], kept.states.alone, said)
+        masked = [ns is not None and kept.stamp_ns - ns <= _MASKED_NS for ns in kept.masked_ns]
+        said = np.where(np.array(masked)[:, None], kept.states.alone, said)
     if kept is None:
         return None
     # The chain of the hops since then was taken when the belief was carried here.

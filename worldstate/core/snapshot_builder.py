@@ -33,6 +33,7 @@ from worldstate.state import (
     SensorHealth,
     Visibility,
 )
+from worldstate.state.entity import AzimuthSource, SideShare
 from worldstate.state.sensor import Ego
 
 from .memory import NEWS_HOLDS_NS, CountedLook, Memory
@@ -110,9 +111,9 @@ def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track,
     heard_only = hidden and track.place is None
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
     closing_hz = -mean[RADIAL_RATE] if track.approach_heard else None
-    azimuth_rad, std_rad = mean[AZIMUTH], std[AZIMUTH]
+    azimuth_rad, std_rad, source = mean[AZIMUTH], std[AZIMUTH], _azimuth_source(track, track.motion, site)
     if heard_only:
-        azimuth_rad, std_rad = hidden_azimuth(track.side, track.motion, memory.sequence, site)
+        azimuth_rad, std_rad, source = hidden_azimuth(track.side, track, memory.sequence, site)
     return Entity(
         id=track.id,
         status="hidden" if hidden else "visible" if track.seen else "emerged",
@@ -137,6 +138,8 @@ def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track,
         sector_rad=sector(azimuth_rad, std_rad) if hidden else None,
         azimuth_covariance=None if heard_only else (variance, mixed, rate_variance),
         forecast=None if heard_only else forecast,
+        azimuth_source=source,
+        sides=_side_shares(track, memory, site),
     )
 
 
@@ -162,7 +165,7 @@ def existence_of(track: Track, sides: SideBelief) -> float:
     if track.seen or track.behind < 0.5:
         return track.existence
     if track.place is None:
-        return sides.existence(track.side)
+        return sides.existence(track.of_side)
     # Not combined: what is believed of the side may rest on the same messages.
     return max(track.existence, sides.hidden[track.side])
 
@@ -173,14 +176,37 @@ def time_to_arrival(closing_hz: float | None, std_hz: float) -> float | None:
 
 
 def hidden_azimuth(
-    side: int, motion: MotionBelief, kept: SequenceMemory | None, site: SiteGeometry
-) -> tuple[float, float]:
-    """Return where a hidden vehicle is and how far that may be off: by its time to visible, or as heard."""
+    side: int, track: Track | None, kept: SequenceMemory | None, site: SiteGeometry
+) -> tuple[float, float, AzimuthSource]:
+    """Return where a hidden vehicle is, how far that may be off, and what it rests on.
+
+    By its time to visible, or as heard.
+    """
     if kept is not None:
-        return hidden_bearing(kept.coming[side], site.sides[side])
+        return *hidden_bearing(kept.coming[side], site.sides[side]), "context"
+    heard = track if track is not None and track.side == side else None
+    motion = site.sides[side].prior() if heard is None else heard.motion
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
     # that.
-    return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, HIDDEN_BIAS_STD)
+    std_rad = math.hypot(motion.azimuth_std_rad, HIDDEN_BIAS_STD)
+    return motion.azimuth_rad, std_rad, _azimuth_source(heard, motion, site)
+
+
+def _azimuth_source(track: Track | None, motion: MotionBelief, site: SiteGeometry) -> AzimuthSource:
+    """Return what an azimuth rests on: bearings where they hold more of what is known than the context."""
+    if track is None or track.detected:
+        return "context" if track is None else "measured"
+    context_std = site.sides[track.side].std_rad
+    return "measured" if 2.0 * motion.azimuth_std_rad**2 <= context_std**2 else "context"
+
+
+def _side_shares(track: Track, memory: Memory, site: SiteGeometry) -> tuple[SideShare, ...]:
+    """Return the parts of the azimuth density of an entity that may be on several sides."""
+    shares = {k: share for k, share in enumerate(track.side_shares) if share > 0.0}
+    if track.of_side is not None or len(shares) < 2:
+        return ()
+    at = {k: hidden_azimuth(k, track, memory.sequence, site)[:2] for k in shares}
+    return tuple(SideShare(site.sides[k].label, round(share, _DIGITS), *at[k]) for k, share in shares.items())
 
 
 def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:

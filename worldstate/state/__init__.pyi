@@ -11,6 +11,7 @@ from .entity import Classification as Classification
 from .entity import Entity as Entity
 from .entity import Event as Event
 from .entity import Relation as Relation
+from .entity import SideShare as SideShare
 from .entity import Visibility as Visibility
 from .sensor import Delivery as Delivery
 from .sensor import Hearing as Hearing

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 from worldstate.ground.serialisation import Layout, Probability
 
 from .context import Priors
+from .entity import AzimuthSource
 from .sensor import SensorHealth
 
 
@@ -106,6 +107,8 @@ class RiskCue:
         Approach side.
     azimuth_rad, azimuth_std_rad : float
         Where to look, coarsely; left positive.
+    azimuth_source : {"measured", "context"} or None
+        What the azimuth rests on, as that of an `Entity`.
     risk : float
         r_k in [0, 1].
     confidence : float
@@ -126,7 +129,8 @@ class RiskCue:
         False-positive budget that the rule was calibrated for; None for an uncalibrated policy, and where the
         alarm of a sequence model stands in for the rule, which has a budget of onsets an hour.
     entity_id : str or None
-        The hidden entity that it speaks of, if one was born.
+        The hidden entity that it speaks of, if one was born; of one vehicle whose side is not known the cues
+        of all its sides speak.
     horizon_s : float or None
         Best time to visible where one is stated, else time to arrival of that entity; None where unknown.
     within : mapping of str to float, or None
@@ -151,8 +155,8 @@ class RiskCue:
     """
 
     LAYOUT: ClassVar = Layout(
-        order="entity_id direction azimuth_rad azimuth_std_rad sector_rad risk confidence statistic "
-        "log_lambda hypotheses horizon_s"
+        order="entity_id direction azimuth_rad azimuth_std_rad azimuth_source sector_rad risk confidence "
+        "statistic log_lambda hypotheses horizon_s"
     )
 
     direction: str
@@ -174,3 +178,4 @@ class RiskCue:
     evidence: EvidenceTerms | None = None
     held: Held | None = None
     not_advised: str | None = None
+    azimuth_source: AzimuthSource | None = None

@@ -1,13 +1,15 @@
 """Entities: road users of the world-state, seen or hidden; their relations, and events in their life."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, TypeAlias
+from uuid import NAMESPACE_OID, uuid5
 
 from worldstate.ground.serialisation import Layout, Probability
 from worldstate.ground.values import Answer
 
 Status: TypeAlias = Literal["hidden", "emerged", "visible"]
+AzimuthSource: TypeAlias = Literal["measured", "context"]
 Vector = tuple[float, float, float]
 
 
@@ -54,6 +56,31 @@ class Visibility:
 
 
 @dataclass(frozen=True, slots=True)
+class SideShare:
+    """One part of the azimuth density of a vehicle whose side is not known.
+
+    Parameters
+    ----------
+    direction : str
+        Approach side.
+    probability : float
+        P(it is on this side), given that it exists.
+    azimuth_rad, azimuth_std_rad : float
+        Where it is if so; left positive.
+
+    Examples
+    --------
+    >>> SideShare("left", 0.6, 0.9, 0.3).direction
+    'left'
+    """
+
+    direction: str
+    probability: Probability
+    azimuth_rad: float
+    azimuth_std_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class Entity:
     """One road user. Unknown is None, never 0; all quantities are in `base_link`.
 
@@ -69,6 +96,7 @@ class Entity:
         Probability that it exists and is hidden.
     azimuth_rad, azimuth_std_rad : float
         Left positive, in (-pi, pi]. Hidden entities have a coarse azimuth: their side is what can be known.
+        Where the side is not known, those of the likelier one.
     created_ns, updated_ns : int
         First and last time stamps of the belief, ns.
     classification : tuple of Classification
@@ -76,8 +104,8 @@ class Entity:
     moving : bool
         False for an object that vision holds for parked.
     direction : str or None
-        Approach side that it is hidden on; of one in view, the side it came from, or whose edge it was first
-        seen nearest to.
+        Approach side that it is hidden on, the likelier one where `sides` has several; of one in view, the
+        side it came from, or whose edge it was first seen nearest to.
     azimuth_rate_rad_s : float or None
         d azimuth / dt, rad/s; None while hidden.
     range_m : float or None
@@ -108,6 +136,12 @@ class Entity:
     forecast : mapping of str to (float, float), or None
         Azimuth and its standard deviation in so many seconds ("1", "2") if it goes on as it does; None while
         only heard: the cue of its side tells when it comes into view.
+    azimuth_source : {"measured", "context"} or None
+        What the azimuth rests on: a box, a position or bearings; or the context's corners, with the time to
+        visible where a sequence model gives one.
+    sides : tuple of SideShare
+        The parts of the azimuth density of one vehicle that may be hidden on several sides; empty where its
+        side is known to nine of ten.
 
     Examples
     --------
@@ -118,8 +152,8 @@ class Entity:
 
     LAYOUT: ClassVar = Layout(
         order="id status existence_probability hidden_probability classification moving direction "
-        "azimuth_rad azimuth_std_rad sector_rad azimuth_rate_rad_s range_m position_m velocity_mps "
-        "inverse_tta_hz inverse_tta_std_hz tta_s visibility sources created_ns updated_ns"
+        "sides azimuth_rad azimuth_std_rad azimuth_source sector_rad azimuth_rate_rad_s range_m position_m "
+        "velocity_mps inverse_tta_hz inverse_tta_std_hz tta_s visibility sources created_ns updated_ns"
     )
 
     id: str
@@ -149,6 +183,31 @@ class Entity:
     sector_rad: tuple[float, float] | None = None
     azimuth_covariance: Vector | None = None
     forecast: Mapping[str, tuple[float, float]] | None = None
+    azimuth_source: AzimuthSource | None = None
+    sides: tuple[SideShare, ...] = ()
+
+    def on_each_side(self) -> tuple["Entity", ...]:
+        """Return an entity of unknown side once for each, as likely as it is there; any other as it is.
+
+        The likelier one keeps the id, the others have names of their own that follow from it.
+        """
+        parts = (
+            replace(
+                self,
+                id=self.id
+                if one.direction == self.direction
+                else str(uuid5(NAMESPACE_OID, f"{self.id}/{one.direction}")),
+                existence_probability=self.existence_probability * one.probability,
+                hidden_probability=self.hidden_probability * one.probability,
+                direction=one.direction,
+                azimuth_rad=one.azimuth_rad,
+                azimuth_std_rad=one.azimuth_std_rad,
+                sector_rad=None,
+                sides=(),
+            )
+            for one in self.sides
+        )
+        return tuple(parts) or (self,)
 
 
 EventKind: TypeAlias = Literal["born", "handed_over", "coasting", "hidden_again", "died", "merged"]

@@ -101,9 +101,15 @@ class FollowedStream:
         return [
             one
             for one in self.entities[hop]
-            if one.status != "visible" and one.direction == SIDES[side]
-            if one.existence_probability >= least
+            if one.status != "visible" and _share(one, SIDES[side]) > 0.0
+            if one.existence_probability * _share(one, SIDES[side]) >= least
         ]
+
+
+def _share(entity: Entity, side: str) -> float:
+    """Return P(an entity is of a side | exists)."""
+    known = {one.direction: one.probability for one in entity.sides}
+    return known.get(side, 0.0) if known else float(entity.direction == side)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -176,7 +176,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
         axes.plot(time_s, np.degrees(azimuth_rad), ".", color="0.45", ms=3, label="bearing of the sound")
     tracks: dict[tuple[str, bool], list[tuple[float, ...]]] = {}
     for state in states:
-        for one in state.entities:
+        for one in (part for known in state.entities for part in known.on_each_side()):
             if one.moving and one.existence_probability >= _LIKELY:
                 sector = sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)
                 row = seconds(state.stamp_ns), *np.degrees([one.azimuth_rad, *sector]).tolist()
@@ -227,7 +227,7 @@ def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
 def _existence(state: WorldState, sides: Sequence[str]) -> list[float]:
     """Return the likeliest hidden entity of each side, and the likeliest that moves in view."""
     likeliest = dict.fromkeys((*sides, "in view"), 0.0)
-    for one in state.entities:
+    for one in (part for known in state.entities for part in known.on_each_side()):
         at = one.direction if one.status == "hidden" else "in view" if one.moving else None
         if at in likeliest:
             likeliest[at] = max(likeliest[at], one.existence_probability)
@@ -298,7 +298,7 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
         _wedge(axes, view.sector_rad, SEARCHED_M, PURPLE if view.found else GREEN, 0.25)
     for cue in state.cues:
         _draw_cue(axes, cue)
-    for entity in (one for one in state.entities if one.moving):
+    for entity in (part for one in state.entities if one.moving for part in one.on_each_side()):
         _draw_entity(axes, entity)
     axes.plot(0.0, 0.0, "^", color="black", ms=12)
     behind = any(abs(view.sector_rad[0]) > 0.6 * math.pi for view in state.searched)
