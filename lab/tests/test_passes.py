@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from worldstate_lab.cli.streams import worst_of
 from worldstate_lab.passes.band_levels import above_place_db, added_db, level_db
 from worldstate_lab.passes.followed_stream import EVERYBODY, FollowedStream, PassedStream, followed
-from worldstate_lab.passes.pass_outcomes import pass_figures
+from worldstate_lab.passes.pass_outcomes import pass_figures, sides_by_risk
 from worldstate_lab.passes.second_vehicle import hearing_allows, second_figures
 from worldstate_lab.passes.stream_camera import stream_detections
 
@@ -146,6 +146,16 @@ def test_second_vehicles_are_judged_at_the_odds_of_the_street() -> None:
     assert (told[f"{group}: ECE"], told[f"{group}: said masked"]) == pytest.approx((0.0, 1.0))
     told = second_figures([stated(faint, 0.0)])
     assert (told[f"{group}: ECE"], told[f"{group}: said masked"]) == pytest.approx((1.0 / 3.0, 0.0))
+
+
+def test_a_lower_risk_names_more_sides_of_two_and_more_wrong_ones() -> None:
+    made_up = stream([*PAIR, *SINGLES, ("both", "left", 56.0), ("both", "right", 57.0)], duration_s=75.0)
+    told = stated(made_up, 0.0)
+    risk = np.where(told.truth.coming_s <= 8.0, 0.6, 0.15)
+    curve = sides_by_risk([PassedStream(made_up, told.truth, replace(told.followed, risk=risk))])
+    assert curve["risk 0.1"] == {"other_side_too": 1.0, "both_sides_found": 1.0, "both_near_found": 1.0}
+    assert curve["risk 0.5"] == {"other_side_too": 0.0, "both_sides_found": 1.0, "both_near_found": 1.0}
+    assert curve["risk 0.7"] == {"other_side_too": 0.0, "both_sides_found": 0.0, "both_near_found": 0.0}
 
 
 def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:

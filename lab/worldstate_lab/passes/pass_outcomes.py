@@ -5,7 +5,7 @@ kept where the entity that was hidden on the vehicle's side at T0 is the one see
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +39,7 @@ from .band_levels import above_place_db
 from .followed_stream import PassedStream
 
 EXISTS, NEAR_RAD, SEEN_AFTER_S = 0.5, np.radians(10.0), 1.0
-NEAR_S = 1.5  # Between two whose sound cannot be told apart in a window
+RISKS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7)
 HIDDEN_S, KEPT_S, KEPT_RAD = 3.0, 3.0, np.radians(20.0)
 
 
@@ -108,38 +108,47 @@ def seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
 
 def pass_figures(streams: Sequence[PassedStream]) -> Figures:
     """Return the figures of some streams together, ready for a table and for JSON."""
+    advised = [(one.heard, one.followed.advisory) for one in streams]
+    table, short = (approach_table(advised, longest_s).loud() for longest_s in (HORIZON_S, LONGEST_LEAD_S))
+    figures, former = (one.detections() | one.sides() for one in (table, short))
+    named = ("approaches", "detected", "lead_missed_as_0_s", *table.sides())
+    false = table.false_alarms()
+    return {
+        **{name: figures[name] for name in named},
+        **{f"{name}_5s": former[name] for name in named if name in _OF_FIVE_SECONDS},
+        **_entities(streams, table),
+        **{name: false[name] for name in ("hazard_free_hours", "onsets_per_hour", "hazard_free_share")},
+        **_ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams),
+        **_meter(streams, false["onsets_per_hour"]),
+    }
+
+
+# What was printed before alarms counted from the risk's horizon on.
+_OF_FIVE_SECONDS = ("detected", "lead_missed_as_0_s", "other_side_too", "both_sides_found")
+
+
+def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
+    """Return how many advisories and entities there were of loud approaches, and which were kept."""
     loud = [one for stream in streams for one in outcomes(stream) if not one.alarm.approach.quiet]
     judged = [one.identity for one in loud if one.identity is not None]
-    table, short = (_table(streams, longest_s) for longest_s in (HORIZON_S, LONGEST_LEAD_S))
-    singles, both = (table.of_flow(flow).outcomes for flow in ("single", "both"))
-    near = [
-        one.every_side for one in both if max(one.approach.entries_s) - min(one.approach.entries_s) < NEAR_S
-    ]
-    found = _detected(table) | {f"{name}_5s": value for name, value in _detected(short).items()}
-    found |= {
-        **{"singles": len(singles), "both": len(both), "both_near": len(near)},
-        "both_near_found": mean_of(near),
+    both = [one.hidden_before for one in loud if one.alarm.approach.flow == "both"]
+    return {
         "onsets_per_approach": mean_of([one.onsets for one in table.outcomes if one.detected]),
-        "phantom_third": mean_of(
-            [one.hidden_before > 2 for one in loud if one.alarm.approach.flow == "both"]
-        ),
+        "phantom_third": mean_of([hidden > 2 for hidden in both]),
         "identity_judged": len(judged),
         "identity_kept": mean_of(judged),
-        "onset_after_pass": mean_of([one.onsets_after > 0 for one in singles]),
+        "onset_after_pass": mean_of([one.onsets_after > 0 for one in table.of_flow("single").outcomes]),
     }
-    figures = table.false_alarms()
-    found |= {name: figures[name] for name in ("hazard_free_hours", "onsets_per_hour", "hazard_free_share")}
-    found |= _ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams)
-    return {"approaches": len(table.outcomes)} | found | _meter(streams, figures["onsets_per_hour"])
 
 
-def _table(streams: Sequence[PassedStream], longest_s: float) -> ApproachTable:
-    return approach_table([(one.heard, one.followed.advisory) for one in streams], longest_s).loud()
-
-
-def _detected(table: ApproachTable) -> Figures:
-    figures = table.detections()
-    return {name: figures[name] for name in ("detected", "lead_missed_as_0_s")} | table.sides()
+def sides_by_risk(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
+    """Return how often the other side of a single, too, and both of two reach a risk before T0."""
+    names = ("other_side_too", "both_sides_found", "both_near_found")
+    found = {}
+    for least in RISKS:
+        table = approach_table([(one.heard, one.followed.risk >= least) for one in streams]).loud()
+        found[f"risk {least:g}"] = {name: table.sides()[name] for name in names}
+    return found
 
 
 def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Figures:

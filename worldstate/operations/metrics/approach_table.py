@@ -29,6 +29,7 @@ from worldstate.ground.typing import BoolArray, IndexArray
 Figures = dict[str, float | int | None]
 LONGEST_LEAD_S, AFTER_S = 5.0, 6.0
 SECONDS_PER_HOUR = 3600.0
+NEAR_S = 1.5  # Two vehicles with a smaller gap are heard in one window and its fades
 # A hop ends with a whole sample, T0 is a camera frame: one that ends at T0 misses it by 10 us and more.
 SLACK_S = 1e-3
 # With fewer, one recording moves a rate by more than 5 % and most intervals span what is of interest.
@@ -144,10 +145,17 @@ class ApproachTable:
     def sides(self) -> Figures:
         """Return how often single vehicles are announced from the other side, and both of two are found."""
         singles, both = (self.of_flow(flow).outcomes for flow in ("single", "both"))
+        near = [
+            one.every_side for one in both if one.approach.entries_s[-1] - one.approach.entries_s[0] < NEAR_S
+        ]
         return {
+            "singles": len(singles),
             "other_side_too": mean_of([one.other_side for one in singles]),
             "wrong_side_only": mean_of([one.other_side and not one.own_side for one in singles]),
+            "both": len(both),
             "both_sides_found": mean_of([one.every_side for one in both]),
+            "both_near": len(near),
+            "both_near_found": mean_of(near),
         }
 
     def false_alarms(self) -> Figures:
