@@ -246,8 +246,9 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             front_end_settings = replace(front_end_settings, feature_order=order)
         if guard is not None and guard.measures != MEASURES:
             raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
-        if road_users is not None:
-            check_road_users(road_users)
+        if road_users is not None and road_users.measures != (*MEASURES, *BANDS):
+            expected = f"one of {len(MEASURES) + len(BANDS)} measures of this version"
+            raise OutOfDomainError(f"road users: expected {expected}, got {len(road_users.measures)} others")
         if guard is not None or road_users is not None:
             front_end_settings = replace(front_end_settings, character=True)
         if isinstance(sequence, SequenceReader):
@@ -464,13 +465,6 @@ def _likelier_side(signature: SignatureEvidence) -> Side | None:
     if left is None or right is None or left == right:
         return None
     return "left" if left > right else "right"
-
-
-def check_road_users(model: RoadUserModel) -> None:
-    """Refuse a model that reads other numbers than the front-end measures."""
-    if model.measures != (*MEASURES, *BANDS):
-        expected = f"one of {len(MEASURES) + len(BANDS)} measures of this version"
-        raise OutOfDomainError(f"road users: expected {expected}, got {len(model.measures)} others")
 
 
 def heard_kinds(model: RoadUserModel, character: FloatArray, domain: DomainVerdict | None) -> ClassShares:
