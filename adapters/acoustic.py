@@ -66,6 +66,7 @@ LEVEL_BAND_HZ = (50.0, 2700.0)
 # Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
 # would take a wrong guess of the ear for a look at the right thing.
 _ASKED = 0.95
+LINE_SPACING = "line_spacing_hz"
 # Six simulated demos, error of the evidence of a side: .2 nats with 28 of 56 channels dead, 1.2 with 42, 2.1
 # with 50; .06 where a tenth of the samples clips, .7 with four tenths (the change within a second: .46).
 _DEAD, _CLIPPED = (0.5, 0.85), (0.1, 0.5)
@@ -127,14 +128,14 @@ class AcousticSettings:
 
 @dataclass(frozen=True, slots=True)
 class Grounding:
-    """Which road users are reckoned with, and which measurements of their motion.
+    """Which road users are reckoned with, and which ties between their sound and their motion.
 
     Parameters
     ----------
     descriptors : tuple of Descriptor
         Classes of road users, at least one.
     settings : GroundedSettings
-        What is left out.
+        Sectors, and couplings that are switched off.
 
     Examples
     --------
@@ -181,7 +182,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     front_end_settings : FrontEndSettings, optional
         Of the front-end.
     grounding : Grounding, optional
-        Weighs the model's scores with bearing and approach, eq. (5); the scores as they are
+        Weighs the model's scores with bearing, approach and engine line, eq. (5); the scores as they are
         without.
 
     guard : DomainGuard, optional
@@ -342,7 +343,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             direct = direct_probability(frame.peaks)
             signature = with_bearing_vote(signature, bearing.azimuth_rad, bearing.std_rad, direct)
         if self._grounding is not None:
-            signature = self._grounding.answer(signature, observe(bearing, approach)).evidence
+            signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         domain, kinds = self._recognised(frame)
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
@@ -493,8 +494,15 @@ def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
     return frozenset().union(*(SEEN_AS[name] for name in likely))
 
 
-def observe(bearing: Bearing | NotUsable, approach: Approach | NotUsable) -> GroundedObservation:
-    """Return what is measured beside the feature; spreads are those of the estimators' own bounds."""
+def observe(
+    frame: AcousticFrame, bearing: Bearing | NotUsable, approach: Approach | NotUsable
+) -> GroundedObservation:
+    """Return what a frame says beside its feature; spreads are those of the estimators' own bounds."""
+    # Where the front-end looks for an engine line (`FrontEndSettings.tone_band_hz`), it is the spacing of the
+    # harmonics: two firings a turn leave the first of them the strongest.
+    tone, lines = frame.tone, {}
+    if not isinstance(tone, NotUsable):
+        lines[LINE_SPACING] = Observable(tone.frequency_hz, tone.frequency_std_hz)
     return GroundedObservation(
         bearing_rad=bearing
         if isinstance(bearing, NotUsable)
@@ -502,4 +510,5 @@ def observe(bearing: Bearing | NotUsable, approach: Approach | NotUsable) -> Gro
         inverse_tta_hz=approach
         if isinstance(approach, NotUsable)
         else Observable(approach.inverse_tta_hz, approach.std_hz),
+        signature=lines,
     )

@@ -56,7 +56,7 @@ class ListenSettings:
     forgetting_s : float, optional
         Time constant of that, seconds; see `SiteEstimateSettings`.
     grounding : Grounding, optional
-        Weighs the model's scores with bearing and approach, eq. (5); off where not given.
+        Weighs the model's scores with bearing, approach and engine line, eq. (5); off where not given.
     ego_noise : bool or EgoNoiseSettings
         Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
         spatial spectrum, bearing and prominence. The signature hears what it was trained with: a model that

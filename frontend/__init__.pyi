@@ -1,3 +1,6 @@
+from .approach.doppler import RadialSpeed as RadialSpeed
+from .approach.doppler import radial_speed as radial_speed
+from .approach.engine_line import track_fundamental as track_fundamental
 from .approach.looming import Looming as Looming
 from .approach.looming import looming as looming
 from .approach.tone import Tone as Tone

@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 
 from worldstate.frontend.approach.looming import Looming
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.direction.bearing import Peak
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.ground import FloatArray, NotUsable
 
 _NOT_MONITORED = NotUsable("microphones were not monitored")
 CHARACTER_IS_OFF = NotUsable("the character is off: see FrontEndSettings.character")
+TONE_IS_OFF = NotUsable("the tone is off: see FrontEndSettings.tone_band_hz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +49,8 @@ class AcousticFrame:
         From the middle of the interval of the bearing to `stamp_ns`, seconds.
     health : ArrayHealth or NotUsable
         Faults of the microphones and which were left out.
+    tone : ToneReading or NotUsable
+        Engine line over the decision window; not usable when it is off or no tone exceeds the noise.
     character : ndarray, shape (49,), or NotUsable
         What the middle microphone heard in the last two seconds, whatever its level: modulation, what bands
         have in common, tones, harmonics, which a `DomainGuard` reads; and how the level is shared between
@@ -88,6 +92,7 @@ class AcousticFrame:
     least_prominence: float = 1.0
     bearing_age_s: float = 0.0
     health: ArrayHealth | NotUsable = _NOT_MONITORED
+    tone: ToneReading | NotUsable = TONE_IS_OFF
     character: FloatArray | NotUsable = CHARACTER_IS_OFF
     lost: float = 0.0
     heard: float = 1.0

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import (
     CLEANED_FEATURE_VERSION,
@@ -40,6 +41,8 @@ class FrontEndSettings:
         Frame length, samples, even; frames overlap by half.
     azimuth_span_deg : (float, float)
         First and last azimuth searched, a whole number of degrees apart, left positive.
+    tone_band_hz : (float, float), optional
+        Band in which an engine line is searched, Hz, for example (20, 400); None switches it off.
     srp_band_hz, level_band_hz : (float, float)
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
     ego_noise : EgoNoiseSettings, optional
@@ -64,6 +67,7 @@ class FrontEndSettings:
 
     nfft: int = FEATURE_NFFT
     azimuth_span_deg: tuple[float, float] = (-90.0, 90.0)
+    tone_band_hz: Band | None = None
     srp_band_hz: Band = BAND_HZ
     level_band_hz: Band = (50.0, 8000.0)
     ego_noise: EgoNoiseSettings | None = None
@@ -80,8 +84,8 @@ class FrontEndSettings:
         width = in_range("azimuth_span_deg: last", last, first + 2.0, 180.0) - first
         if abs(width - round(width)) > 1e-9:
             raise InvalidArgumentError(f"azimuth_span_deg: expected whole degrees, got {width}")
-        for name in ("srp_band_hz", "level_band_hz"):
-            low, high = getattr(self, name)
+        for name in ("srp_band_hz", "level_band_hz", "tone_band_hz"):
+            low, high = getattr(self, name) or ENGINE_BAND_HZ
             in_range(f"{name}: lower end", low, 0.0, np.inf)
             in_range(f"{name}: upper end", high, low, np.inf, open_low=True, open_high=True)
 

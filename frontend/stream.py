@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
+from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of, find_peaks
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
@@ -22,7 +23,7 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
-from .frame import CHARACTER_IS_OFF, AcousticFrame
+from .frame import CHARACTER_IS_OFF, TONE_IS_OFF, AcousticFrame
 from .hop_spectra import HopSpectra, HopSums
 from .levels import BANDS, LevelMeter, NoiseMeter
 from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
@@ -119,6 +120,7 @@ class FrontEnd:
         self._noise = NoiseMeter() if settings.watch_channels else None
         self._levels: FloatArray = np.full(BANDS, np.log(SILENCE))
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
+        self._tone = self._tone_stage()
         self._energy_floor = EnergyFloor()
         self._character = SoundCharacter(self.sample_rate_hz) if settings.character else None
         self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
@@ -214,6 +216,8 @@ class FrontEnd:
             self._hops.append(self._spectra.push(hop.samples))
             levels = self._unmasked(self._meter.push(hop.samples, self._keep, self._hops[-1].heard))
             self._energy_floor.push(float(self._hops[-1].energies[self._used].mean()))
+            if self._tone is not None:
+                self._tone.push(hop.samples, self._hops[-1].health.mask)
             if self._character is not None and not self._hops[-1].lost and self._hops[-1].n_frames:
                 self._character.push(hop.samples[:, self._middle])
             return self._frame(hop, levels) if hop.index >= WINDOW_HOPS else None
@@ -253,6 +257,7 @@ class FrontEnd:
             feature=self._feature(),
             bearing_age_s=self._age_s(heard, hop.end),
             health=self._hops[-1].health,
+            tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
             lost=sum(hop.lost for hop in self._hops) / WINDOW_HOPS,
             heard=0.0 if window < _LEAST_OF_WINDOW else min(window, self._hops[-1].share),
@@ -294,6 +299,10 @@ class FrontEnd:
         n_frames = max(sum(hop.n_frames for hop in hops), 1)
         power = normalised(total, n_frames, len(self._spectra.srp_bins), self.array.n_microphones)
         return np.asarray(power.reshape(-1, len(self._azimuths)).max(axis=0))
+
+    def _tone_stage(self) -> ToneStage | None:
+        band_hz = self.settings.tone_band_hz
+        return None if band_hz is None else ToneStage(self.array, self.sample_rate_hz, band_hz)
 
     def _age_s(self, hops: list[HopSums], end: int) -> float:
         weights = [max(hop.n_frames, 1) for hop in hops]

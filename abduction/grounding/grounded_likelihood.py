@@ -1,22 +1,84 @@
 r"""Grounded signature likelihoods, eq. (5), and their integral over class and state.
 
 .. math::
-    \ell_h(y) = \frac{P(h \mid s)}{\pi_h} \sum_c P(c) \int p(\hat v \mid v_r)\, dP(v_r \mid c, h)
-                \int p(\hat\theta \mid \theta)\, dP(\theta \mid h)
+    \ell_h(y) = \frac{P(h \mid s)}{\pi_h} \sum_c P(c) \int p(o \mid c, v_r)\, p(\hat v \mid v_r)\,
+                dP(v_r \mid c, h) \int p(\hat\theta \mid \theta)\, dP(\theta \mid h)
 
-The first factor is the calibrated score of any classifier. All densities are relative to those of a spurious
-signature, whose own factors are one: where nothing beside the feature was measured, the classifier's evidence
-is handed on unchanged.
+The first factor is the calibrated score of any classifier; o are the observables that physics couples to the
+radial speed. All densities are relative to those of a spurious signature, whose own factors are one: where
+nothing beside the feature was measured, the classifier's evidence is handed on unchanged.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from math import pi
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import MOST_NATS, SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
+
+SPEED_OF_SOUND_M_S = 343.0
+# Total ratio of gearbox and final drive, first to fifth gear: ordinary numbers of a passenger car (3.6, 2.05,
+# 1.4, 1.05 and 0.85 times 3.9), no measured ones.
+GEAR_RATIOS = (14.0, 8.0, 5.4, 4.1, 3.3)
+WHEEL_RADIUS_M = 0.3
+FIRINGS_PER_TURN = 2.0
+IDLE_HZ = 25.0
+REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 / 3.6, 20.0 / 3.6
+
+
+@dataclass(frozen=True, slots=True)
+class Coupling:
+    r"""An observable that depends on the radial speed.
+
+    A coupling says what an observable of the signature is worth at a given radial speed, as curves over
+    speed. It can be tested by itself and switched off.
+
+    References
+    ----------
+    Light vehicles, rolling and propulsion noise in octave bands over speed: European Commission, Directive
+    2015/996 (CNOSSOS-EU), annex, tables of category 1.
+    """
+
+    observable: str  # Its name, unit included
+    speed_m_s: tuple[float, ...]  # Knots, rising; speed towards the listener is positive
+    # Values at the knots, linear between and constant beyond; several where one of them holds but not known
+    # which, such as the gear, all equally likely.
+    curves: tuple[tuple[float, ...], ...]
+    std: float  # How far a source of this class scatters about its curve, in the observable's unit, > 0
+
+    def __post_init__(self) -> None:
+        knots = finite_array("speed_m_s", self.speed_m_s, (None,))
+        if not knots.size or (np.diff(knots) <= 0).any() or not self.curves:
+            raise InvalidArgumentError("coupling: expected rising speeds and at least one curve")
+        for curve in self.curves:
+            finite_array("curves", curve, (knots.size,))
+        in_range("std", self.std, 0.0, np.inf, open_low=True, open_high=True)
+
+    def expected(self, radial_speed_m_s: ArrayLike) -> FloatArray:
+        r"""Return the value on every curve, shape (curves, n).
+
+        .. math:: f_g(v) = f_{g,i} + (f_{g,i+1} - f_{g,i})\, \frac{v - v_i}{v_{i+1} - v_i}, \qquad
+                  v_i \le v \le v_{i+1}
+
+        Shapes: radial_speed_m_s (n,).
+        """
+        speed = np.asarray(radial_speed_m_s, dtype=np.float64)
+        return np.stack([np.interp(speed, self.speed_m_s, curve) for curve in self.curves])
+
+    def log_likelihood(self, value: float, value_std: float, radial_speed_m_s: ArrayLike) -> FloatArray:
+        r"""Return log p(value | c, v_r) at each speed, shape (n,), nats.
+
+        .. math:: p = \frac{1}{G} \sum_g N\big(value;\ f_g(v_r),\ \sigma_c^2 + \sigma_{value}^2\big)
+
+        Shapes: radial_speed_m_s (n,).
+        """
+        expected = self.expected(radial_speed_m_s)
+        variance = self.std**2 + value_std**2
+        log_density = -0.5 * ((value - expected) ** 2 / variance + np.log(2 * pi * variance))
+        return np.asarray(np.logaddexp.reduce(log_density, axis=0) - np.log(len(expected)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +95,13 @@ class Descriptor:
         Prior share among all classes, > 0; shares are normalised by the model.
     speed_mean_m_s, speed_std_m_s : float
         Of the radial speed of one that approaches, a normal law cut off at the model's speeds.
+    couplings : tuple of Coupling
+        At most one for each observable.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range.
+        If a number is out of range or an observable is coupled twice.
 
     Examples
     --------
@@ -50,11 +114,15 @@ class Descriptor:
     weight: float
     speed_mean_m_s: float
     speed_std_m_s: float
+    couplings: tuple[Coupling, ...] = ()
 
     def __post_init__(self) -> None:
         in_range("weight", self.weight, 0.0, np.inf, open_low=True, open_high=True)
         finite_array("speed_mean_m_s", self.speed_mean_m_s, ())
         in_range("speed_std_m_s", self.speed_std_m_s, 0.0, np.inf, open_low=True, open_high=True)
+        names = [coupling.observable for coupling in self.couplings]
+        if len(set(names)) != len(names):
+            raise InvalidArgumentError(f"couplings: expected each observable once, got {names}")
 
     def log_speed_prior(self, radial_speed_m_s: FloatArray) -> FloatArray:
         r"""Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats.
@@ -70,31 +138,93 @@ class Descriptor:
         return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
 
 
+def engine_line(std_hz: float = 4.0) -> Coupling:
+    r"""Spacing of the engine's harmonics over speed, one curve a gear.
+
+    .. math:: f = \max\Big( f_{idle},\ \frac{n_f\, G\, |v|}{2 \pi R} \Big)
+
+    with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
+    """
+    speed = np.linspace(-40.0, 40.0, 161)
+    per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
+    curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(speed)) for ratio in GEAR_RATIOS]
+    return Coupling("line_spacing_hz", _tuple(speed), tuple(map(_tuple, curves)), std_hz)
+
+
+def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
+    r"""Level of the 1 kHz octave above that of 125 Hz: rolling noise takes over from the engine with speed.
+
+    .. math:: \Delta L = L_{1000} - L_{125}, \qquad
+              L = 10 \log_{10} \big(10^{L_R / 10} + 10^{L_P / 10}\big)
+
+    Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
+    with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
+    """
+    speed = np.linspace(-40.0, 40.0, 161)
+    at = np.maximum(np.abs(speed), LOWEST_SPEED_M_S)
+    low = _octave_db(at, rolling=(85.7, 41.5), propulsion=(89.2, 7.2))
+    high = _octave_db(at, rolling=(97.3, 32.5), propulsion=(84.2, 8.0))
+    return Coupling("tyre_shape_db", _tuple(speed), (_tuple(high - low),), std_db)
+
+
+def doppler_trajectory(std: float = 0.01) -> Coupling:
+    """Ratio of the frequencies heard before and after a pass-by.
+
+    .. math:: f_{before} / f_{after} = (c + v) / (c - v)
+
+    References
+    ----------
+    P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section 11.2 (the shift of a moving source).
+
+    Examples
+    --------
+    >>> doppler_trajectory().expected([10.0]).round(3)
+    array([[1.06]])
+    """
+    speed = np.linspace(-40.0, 40.0, 161)
+    ratio = (SPEED_OF_SOUND_M_S + speed) / (SPEED_OF_SOUND_M_S - speed)
+    return Coupling("doppler_ratio", _tuple(speed), (_tuple(ratio),), std)
+
+
 def car() -> Descriptor:
-    """Return a motor vehicle that approaches at town speed.
+    """Return a motor vehicle that approaches at town speed, all three couplings in place.
 
     Returns
     -------
     Descriptor
-        Nine of ten road users.
+        With three couplings.
 
     Examples
     --------
     >>> car().name
     'motor_vehicle'
     """
-    return Descriptor("motor_vehicle", ("car", "truck", "bus"), 0.9, 8.0, 4.0)
+    couplings = (engine_line(), tyre_noise_shape(), doppler_trajectory())
+    return Descriptor("motor_vehicle", ("car", "truck", "bus"), 0.9, 8.0, 4.0, couplings)
 
 
 def motorcycle() -> Descriptor:
-    """Return a motorcycle, which is faster.
+    """Return a motorcycle: faster, with an engine line of its own gearing left open.
 
     Returns
     -------
     Descriptor
-        One of ten road users.
+        With the Doppler coupling only.
     """
-    return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0)
+    return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0, (doppler_trajectory(),))
+
+
+def _octave_db(
+    speed_m_s: FloatArray, rolling: tuple[float, float], propulsion: tuple[float, float]
+) -> FloatArray:
+    ratio = speed_m_s / REFERENCE_SPEED_M_S
+    rolling_db = rolling[0] + rolling[1] * np.log10(ratio)
+    propulsion_db = propulsion[0] + propulsion[1] * (ratio - 1.0)
+    return np.asarray(10.0 * np.log10(10.0 ** (rolling_db / 10.0) + 10.0 ** (propulsion_db / 10.0)))
+
+
+def _tuple(values: FloatArray) -> tuple[float, ...]:
+    return tuple(values.tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +254,9 @@ class GroundedObservation:
         From Doppler, positive while closing.
     inverse_tta_hz : Observable or NotUsable
         From looming, 1/s.
+    signature : mapping of str to Observable
+        Observables that descriptors couple to speed, such as ``line_spacing_hz``; those that are missing are
+        marginalised.
 
     Examples
     --------
@@ -134,6 +267,7 @@ class GroundedObservation:
     bearing_rad: Observable | NotUsable = NOT_MEASURED
     radial_speed_m_s: Observable | NotUsable = NOT_MEASURED
     inverse_tta_hz: Observable | NotUsable = NOT_MEASURED
+    signature: Mapping[str, Observable] = field(default_factory=dict)
 
 
 _SPEEDS_M_S = np.linspace(-5.0, 30.0, 141)
@@ -143,8 +277,28 @@ _AZIMUTH_CELL_RAD = float(np.radians(1.0))
 _RANGES_M = np.geomspace(5.0, 60.0, 24)
 
 
-# Of the broad normal laws about zero of what belongs to no source; all other densities are relative to these.
-BACKGROUND_STD = {"radial_speed_m_s": 10.0, "inverse_tta_hz": 1.0}
+@dataclass(frozen=True, slots=True)
+class Background:
+    """Density of an observable that belongs to no source; all other densities are relative to it."""
+
+    mean: float  # Of a broad normal law, in the observable's unit
+    std: float
+
+    def log_density(self, value: float) -> float:
+        r"""Return the log density at a value, nats.
+
+        .. math:: \log p = -\tfrac12 (x - \mu)^2 / \sigma^2 - \log(\sigma \sqrt{2 \pi})
+        """
+        return float(-0.5 * ((value - self.mean) / self.std) ** 2 - np.log(self.std * np.sqrt(2 * pi)))
+
+
+BACKGROUNDS = {
+    "line_spacing_hz": Background(70.0, 40.0),
+    "tyre_shape_db": Background(0.0, 10.0),
+    "doppler_ratio": Background(1.0, 0.05),
+    "radial_speed_m_s": Background(0.0, 10.0),
+    "inverse_tta_hz": Background(0.0, 1.0),
+}
 
 
 # Deviation of the azimuth of a source in plain view, and of the strongest direction of a hidden one: it is a
@@ -159,11 +313,12 @@ class GroundedSettings:
     Parameters
     ----------
     without : frozenset of str
-        Observables that are left out, for ablations: `radial_speed_m_s` and `inverse_tta_hz`.
+        Observables that are left out, for ablations: of a coupling, or of the approach rate,
+        `radial_speed_m_s` and `inverse_tta_hz`.
 
     Examples
     --------
-    >>> len(GroundedSettings(without=frozenset({"inverse_tta_hz"})).without)
+    >>> len(GroundedSettings(without=frozenset({"line_spacing_hz"})).without)
     1
     """
 
@@ -223,7 +378,7 @@ def ground(
     r"""Combine the classifier's evidence with the physical likelihoods of the other measurements.
 
     .. math:: \log \ell'_h = \log \ell_h + \log \sum_{c, v} P(c)\, P(v \mid c)\,
-              \frac{p(\hat v \mid v)}{p_0}
+              \frac{p(o \mid c, v)\, p(\hat v \mid v)}{p_0}
               + \log \sum_\theta P(\theta \mid h)\, \frac{p(\hat\theta \mid \theta)}{p_0}
 
     for h hidden or visible, with p_0 the density without a source; that of none is left as it is.
@@ -233,11 +388,11 @@ def ground(
     evidence : SignatureEvidence
         The classifier's, from calibrated scores.
     observation : GroundedObservation
-        Bearing and approach with their spreads; what is not usable is marginalised.
+        Bearing, approach and observables with their spreads; what is not usable is marginalised.
     descriptors : sequence of Descriptor
         Classes of road users, at least one, names all different.
     settings : GroundedSettings, optional
-        What is left out.
+        Switched-off couplings.
 
     Returns
     -------
@@ -284,32 +439,44 @@ def ground(
 def _over_speed(
     observation: GroundedObservation, descriptors: Sequence[Descriptor], settings: GroundedSettings
 ) -> FloatArray:
-    """Log of P(c) P(v_r | c) p(v | v_r) over the background, shape (classes, speeds)."""
+    """Log of P(c) P(v_r | c) p(o | c, v_r) p(v | v_r) over the background, shape (classes, speeds)."""
     weights = np.log([descriptor.weight for descriptor in descriptors])
     weights -= np.logaddexp.reduce(weights)
     approach = _log_approach(observation, settings)
     rows = [
-        weight + d.log_speed_prior(_SPEEDS_M_S) + approach
+        weight + d.log_speed_prior(_SPEEDS_M_S) + _log_couplings(observation, d, settings) + approach
         for weight, d in zip(weights, descriptors, strict=True)
     ]
     return np.stack(rows)
+
+
+def _log_couplings(
+    observation: GroundedObservation, descriptor: Descriptor, settings: GroundedSettings
+) -> FloatArray:
+    """Log of p(o | c, v_r) over the background; an observable that a class leaves open adds nothing."""
+    total = np.zeros(_SPEEDS_M_S.size)
+    for coupling in descriptor.couplings:
+        seen = observation.signature.get(coupling.observable)
+        if seen is None or coupling.observable in settings.without:
+            continue
+        background = BACKGROUNDS[coupling.observable].log_density(seen.value)
+        total += coupling.log_likelihood(seen.value, seen.std, _SPEEDS_M_S) - background
+    return total
 
 
 def _log_approach(observation: GroundedObservation, settings: GroundedSettings) -> FloatArray:
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
     if isinstance(speed, Observable) and "radial_speed_m_s" not in settings.without:
-        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - _log_background("radial_speed_m_s", speed)
+        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - BACKGROUNDS["radial_speed_m_s"].log_density(
+            speed.value
+        )
     if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in settings.without:
-        background = _log_background("inverse_tta_hz", inverse_tta)
+        background = BACKGROUNDS["inverse_tta_hz"].log_density(inverse_tta.value)
         ranges = _SPEED_CELL_M_S / _RANGES_M
         over_range = _log_normal(inverse_tta, _SPEEDS_M_S[:, None] / _RANGES_M, ranges)
         return np.asarray(np.logaddexp.reduce(over_range, axis=1) - np.log(_RANGES_M.size) - background)
     return np.zeros(_SPEEDS_M_S.size)
-
-
-def _log_background(name: str, seen: Observable) -> FloatArray:
-    return _log_normal(Observable(seen.value, BACKGROUND_STD[name]), np.zeros(()), 0.0)
 
 
 def _over_azimuth(bearing: Observable | NotUsable, std_rad: float) -> FloatArray:

@@ -1,1 +1,1 @@
-"""Approach: looming, and the frequency of a tone."""
+"""Approach: looming, engine line, Doppler shift."""

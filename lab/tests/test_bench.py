@@ -12,6 +12,7 @@ from worldstate import WorldFilter
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
 from worldstate.frontend.approach.looming import Looming
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.values import NotUsable
@@ -68,6 +69,8 @@ def test_everything_that_is_timed_is_there():
     sound += np.random.default_rng(1).standard_normal(sound.shape, dtype=np.float32)
     frame = FrontEnd(roof_array_56(), RATE_HZ, EVERYTHING).process(sound)[-1]
     assert np.degrees(frame.bearing_rad).round() == 25.0
+    assert isinstance(frame.tone, ToneReading)
+    assert abs(frame.tone.frequency_hz - 61.0) < 4.0 * frame.tone.frequency_std_hz
     assert isinstance(frame.looming, Looming)
     assert not isinstance(frame.character, NotUsable)
 

@@ -79,7 +79,7 @@ def approach(number: int, rng: np.random.Generator, *, lead_s: float) -> Trial:
     time_s = base.hops.time_s
     late, seen = time_s >= T0_S - lead_s - 1e-6, time_s > T0_S + 1e-6
     left_s = PASS_S - time_s
-    about = {**base.hops.about, "pass_s": PASS_S}
+    about = {**base.hops.about, "pass_s": PASS_S, "doppler": "" if number == 0 else "no stable line"}
     hops = base.hops.replace(
         name=f"left{number:02d}",
         label="left",
@@ -324,6 +324,7 @@ def test_front_end_figures_of_streets_with_a_known_answer(streets):
     assert found["prominence_in_silence"] == pytest.approx(1.0)
     assert found["looming_correlation"] == pytest.approx(1.0)
     assert found["looming_auroc"] > 0.95
+    assert found["doppler_usable"] == 1.0
     assert study.frames == 10 * int((streets[0].hops.time_s > T0_S + 1e-6).sum())
     low, high = study.intervals["looming_auroc"]
     assert low <= found["looming_auroc"] <= high

@@ -144,7 +144,7 @@ def heard(name, site, label, seed):
         "seen": np.isfinite(seen), "there": np.isfinite(seen), "features": np.zeros((60, 60)),
     }  # fmt: skip
     about = {
-        "site": site, "moving": False, "fingerprint": name, "pass_s": 6.0,
+        "site": site, "moving": False, "fingerprint": name, "doppler": "no tone", "pass_s": 6.0,
         "prior": {"shipped": [0.25] * 4, "published": [0.25] * 4},
     }  # fmt: skip
     return Trial(HopTable(columns, name, label, math.nan if label == "none" else 5.0, about))

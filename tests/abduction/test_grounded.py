@@ -1,4 +1,4 @@
-"""Eq. (5): its integral against adaptive quadrature, and a user's own classifier."""
+"""Eq. (5): its integral against adaptive quadrature, its couplings, and a user's own classifier."""
 
 import math
 
@@ -11,17 +11,26 @@ from scipy.stats import norm
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import (
-    BACKGROUND_STD,
+    BACKGROUNDS,
+    Coupling,
     Descriptor,
     GroundedObservation,
+    GroundedSettings,
     Observable,
     car,
+    engine_line,
     ground,
     motorcycle,
+    tyre_noise_shape,
 )
 from worldstate.ground.errors import InvalidArgumentError
 
 SCORES = SignatureEvidence(("left", "right"), (0.7, -0.4), 0.1, -0.2)
+NAMES = ("line_spacing_hz", "tyre_shape_db", "doppler_ratio")
+
+
+def seen(**signature):
+    return GroundedObservation(signature={name: Observable(*value) for name, value in signature.items()})
 
 
 def test_without_measurements_the_classifier_s_evidence_passes_unchanged():
@@ -31,17 +40,20 @@ def test_without_measurements_the_classifier_s_evidence_passes_unchanged():
     assert answer.best.direction == "left"
 
 
-@pytest.mark.parametrize("speed_m_s", [2.0, 7.0, 14.0])
-def test_the_integral_over_speed_is_that_of_adaptive_quadrature(speed_m_s):
-    vehicle = Descriptor("car", ("car",), 1.0, 8.0, 3.0)
+@pytest.mark.parametrize("spacing_hz", [40.0, 70.0, 120.0])
+def test_the_integral_over_speed_is_that_of_adaptive_quadrature(spacing_hz):
+    coupling = engine_line()
+    vehicle = Descriptor("car", ("car",), 1.0, 8.0, 3.0, (coupling,))
 
     def integrand(v):
-        return norm.pdf(speed_m_s, v, 2.0) * norm.pdf(v, 8.0, 3.0)
+        density = norm.pdf(spacing_hz, coupling.expected([v])[:, 0], math.hypot(coupling.std, 2.0)).mean()
+        return density * norm.pdf(v, 8.0, 3.0)
 
     mass = norm.cdf(30.0, 8.0, 3.0) - norm.cdf(-5.0, 8.0, 3.0)
     oracle = quad(integrand, -5.0, 30.0, limit=400, points=[0.0, 2.0, 5.0, 10.0])[0] / mass
-    relative = math.log(oracle) - norm.logpdf(speed_m_s, 0.0, BACKGROUND_STD["radial_speed_m_s"])
-    answer = ground(SCORES, GroundedObservation(radial_speed_m_s=Observable(speed_m_s, 2.0)), [vehicle])
+    background = BACKGROUNDS["line_spacing_hz"]
+    relative = math.log(oracle) - norm.logpdf(spacing_hz, background.mean, background.std)
+    answer = ground(SCORES, seen(line_spacing_hz=(spacing_hz, 2.0)), [vehicle])
     assert answer.evidence.hidden[0] - SCORES.hidden[0] == pytest.approx(relative, abs=0.01)
     assert answer.evidence.visible - SCORES.visible == pytest.approx(relative, abs=0.01)
     assert answer.evidence.none == SCORES.none
@@ -56,6 +68,42 @@ def test_looming_marginalises_the_range_and_doppler_comes_first():
     both = GroundedObservation(radial_speed_m_s=doppler, inverse_tta_hz=Observable(-0.4, 0.1))
     alone = GroundedObservation(radial_speed_m_s=doppler)
     assert ground(SCORES, both, [car()]) == ground(SCORES, alone, [car()])
+
+
+@given(st.floats(1.0, 20.0))
+def test_the_couplings_find_the_speed_that_made_them(speed):
+    vehicle = car()
+    signature = {
+        coupling.observable: Observable(float(coupling.expected([speed])[0, 0]), 0.05 * coupling.std)
+        for coupling in vehicle.couplings
+    }
+    flat = Descriptor("car", ("car",), 1.0, 10.0, 30.0, vehicle.couplings)
+    best = ground(SCORES, GroundedObservation(signature=signature), [flat]).best
+    assert best.radial_speed_m_s == pytest.approx(speed, abs=2.5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_coupling_can_be_switched_off_and_matters_when_on(name):
+    observation = seen(line_spacing_hz=(150.0, 1.0), tyre_shape_db=(12.0, 1.0), doppler_ratio=(1.12, 0.002))
+    off = ground(SCORES, observation, [car()], GroundedSettings(without=frozenset({name})))
+    rest = {key: value for key, value in observation.signature.items() if key != name}
+    unmeasured = ground(SCORES, GroundedObservation(signature=rest), [car()])
+    on = ground(SCORES, observation, [car()])
+    assert off == unmeasured
+    assert abs(on.evidence.hidden[0] - off.evidence.hidden[0]) > 0.1
+    none = ground(SCORES, observation, [car()], GroundedSettings(without=frozenset(NAMES)))
+    np.testing.assert_allclose(none.evidence.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
+
+
+def test_observables_that_contradict_each_other_are_less_likely_than_those_that_agree():
+    speed = 10.0
+    spacing, shape = (float(c.expected([speed])[0, 0]) for c in (engine_line(), tyre_noise_shape()))
+    agreeing = seen(line_spacing_hz=(spacing, 1.0), tyre_shape_db=(shape, 1.0), doppler_ratio=(1.060, 0.002))
+    contradicting = seen(
+        line_spacing_hz=(spacing, 1.0), tyre_shape_db=(shape, 1.0), doppler_ratio=(1.001, 0.002)
+    )
+    first, second = (ground(SCORES, one, [car()]).evidence.hidden[0] for one in (agreeing, contradicting))
+    assert first > second + 3.0
 
 
 @given(st.floats(-1.4, 1.4), st.floats(0.02, 0.5))
@@ -102,3 +150,18 @@ def test_numbers_that_are_none_are_refused():
         ground(SCORES, GroundedObservation(), [car(), car()])
     with pytest.raises(InvalidArgumentError, match="std"):
         Observable(1.0, -1.0)
+    with pytest.raises(InvalidArgumentError, match="rising"):
+        Coupling("x", (1.0, 1.0), ((0.0, 1.0),), 1.0)
+    with pytest.raises(InvalidArgumentError, match="each observable once"):
+        Descriptor("car", (), 1.0, 8.0, 1.0, (engine_line(), engine_line()))
+
+
+def test_tyre_noise_at_the_reference_speed_is_the_directive_s():
+    """Category 1 of Directive 2015/996 at 70 km/h, 125 Hz and 1 kHz: A_R and A_P, power-summed."""
+    low, high = (10.0 * math.log10(10.0**a + 10.0**b) for a, b in ((8.57, 8.92), (9.73, 8.42)))
+    assert tyre_noise_shape().expected([70.0 / 3.6])[0, 0] == pytest.approx(high - low, abs=0.02)
+
+
+def test_tyre_noise_is_held_where_the_directive_ends():
+    slow, slower = tyre_noise_shape().expected([20.0 / 3.6 - 0.5, 1.0])[0]
+    assert slow == pytest.approx(slower, abs=0.1)

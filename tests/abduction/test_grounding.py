@@ -8,13 +8,19 @@ import numpy as np
 import pytest
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings, car
-from worldstate.adapters.acoustic import AcousticAdapter, Grounding, observe
+from worldstate.abduction.grounding.grounded_likelihood import (
+    GroundedObservation,
+    GroundedSettings,
+    Observable,
+    car,
+)
+from worldstate.adapters.acoustic import LINE_SPACING, AcousticAdapter, Grounding, observe
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings
 from worldstate.adapters.source_files import open_source
 from worldstate.cli.main import main
 from worldstate.frontend.approach.looming import Looming
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.values import NotUsable
 
@@ -29,10 +35,11 @@ class Flat:
 
 @pytest.fixture(scope="module")
 def frame(approach):
-    """One frame with a bearing and a looming rate, whatever the recording has there."""
+    """One frame with a bearing, a looming rate and an engine line, whatever the recording has there."""
     frame, _ = next(iter(measure_steps(open_source(approach.folder))))
     looming = Looming(inverse_tta_hz=0.4, std_hz=0.05, log_slope_hz=0.8, log_slope_std_hz=0.1)
-    return replace(frame, bearing_rad=0.2, bearing_std_rad=0.05, prominence=2.0, looming=looming)
+    tone = ToneReading(57.0, 0.3, 0.5)
+    return replace(frame, bearing_rad=0.2, bearing_std_rad=0.05, prominence=2.0, looming=looming, tone=tone)
 
 
 def interpreted(frame, grounding=None):
@@ -45,23 +52,25 @@ def test_off_by_default(frame, approach):
 
 
 def test_nothing_measured_leaves_the_scores(frame):
-    blank = replace(frame, bearing_rad=math.nan, looming=SILENT)
+    blank = replace(frame, bearing_rad=math.nan, looming=SILENT, tone=SILENT)
     heard = interpreted(blank, Grounding()).signature
     np.testing.assert_allclose(heard.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
 
 
 def test_each_measurement_carries_its_own_spread(frame):
     measurement = interpreted(frame)
-    seen = observe(measurement.bearing, measurement.approach)
+    seen = observe(frame, measurement.bearing, measurement.approach)
     assert (seen.bearing_rad.value, seen.bearing_rad.std) == pytest.approx((0.2, 0.05))
     assert (seen.inverse_tta_hz.value, seen.inverse_tta_hz.std) == (0.4, 0.05)
-    none = observe(SILENT, SILENT)
+    assert (seen.signature[LINE_SPACING].value, seen.signature[LINE_SPACING].std) == (57.0, 0.3)
+    none = observe(replace(frame, tone=SILENT), SILENT, SILENT)
+    assert not none.signature
     assert none.bearing_rad is SILENT
     assert none.inverse_tta_hz is SILENT
 
 
 def test_a_source_that_recedes_is_less_of_a_vehicle_coming(frame):
-    quiet = replace(frame, bearing_rad=math.nan)
+    quiet = replace(frame, tone=SILENT, bearing_rad=math.nan)
     closing, receding = (
         interpreted(
             replace(quiet, looming=replace(quiet.looming, inverse_tta_hz=rate)), Grounding()
@@ -72,19 +81,27 @@ def test_a_source_that_recedes_is_less_of_a_vehicle_coming(frame):
 
 
 def test_a_bearing_far_to_the_side_speaks_against_plain_view(frame):
-    lone = replace(frame, looming=SILENT)
+    lone = replace(frame, tone=SILENT, looming=SILENT)
     ahead, aside = (
         interpreted(replace(lone, bearing_rad=azimuth), Grounding()).signature for azimuth in (0.0, 1.2)
     )
     assert ahead.visible - ahead.hidden[0] > aside.visible - aside.hidden[0]
 
 
-def test_the_approach_rate_is_left_out_by_its_name(frame):
-    lone = replace(frame, bearing_rad=math.nan)
-    without = Grounding((car(),), GroundedSettings(without=frozenset({"inverse_tta_hz"})))
+def test_a_coupling_is_switched_off_by_its_name(frame):
+    lone = replace(frame, bearing_rad=math.nan, looming=SILENT)
+    without = Grounding((car(),), GroundedSettings(without=frozenset({LINE_SPACING})))
     heard, deaf = (interpreted(lone, grounding).signature for grounding in (Grounding((car(),)), without))
     assert heard.hidden[0] != SCORES.hidden[0]
     np.testing.assert_allclose(deaf.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
+
+
+def test_the_engine_line_tells_the_speed():
+    slow, fast = (
+        Grounding((car(),)).answer(SCORES, GroundedObservation(signature={LINE_SPACING: Observable(hz, 0.5)}))
+        for hz in (28.0, 110.0)
+    )
+    assert slow.best.radial_speed_m_s < fast.best.radial_speed_m_s
 
 
 def test_the_whole_chain_runs_grounded(approach):

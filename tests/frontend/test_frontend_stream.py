@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.frontend.approach.looming import Looming
+from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.phat import srp_phat
@@ -26,7 +27,7 @@ from worldstate.ground.values import NotUsable
 
 SQUARE = MicrophoneArray([[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]])
 RATE = 16_000
-EVERYTHING = FrontEndSettings(character=True)
+EVERYTHING = FrontEndSettings(tone_band_hz=(20.0, 400.0))
 
 
 def noise_from(
@@ -49,6 +50,7 @@ def assert_same(ours: list[AcousticFrame], theirs: list[AcousticFrame], rtol: fl
         if isinstance(a.looming, Looming) and isinstance(b.looming, Looming):
             assert a.looming.inverse_tta_hz == pytest.approx(b.looming.inverse_tta_hz, rel=rtol, abs=1e-7)
             assert a.looming.std_hz == pytest.approx(b.looming.std_hz, rel=rtol)
+        assert a.tone == b.tone  # bit for bit: hops are cut before anything is computed
 
 
 @settings(deadline=None, max_examples=15)
@@ -60,6 +62,7 @@ def test_block_size_does_not_matter(cuts: list[int], rate: float) -> None:
     pieces = FrontEnd(SQUARE, rate, EVERYTHING)
     blocks = np.split(sound, sorted(min(c, len(sound)) for c in cuts))
     assert_same([frame for block in blocks for frame in pieces.process(block)], whole)
+    assert isinstance(whole[-1].tone, ToneReading)
 
 
 def test_sample_by_sample_is_the_same_too() -> None:

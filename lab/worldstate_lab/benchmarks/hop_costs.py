@@ -27,6 +27,7 @@ from worldstate.adapters import acoustic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.model_file import read_model
 from worldstate.frontend import hop_spectra, stream
+from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
@@ -48,6 +49,7 @@ FRONT_END: Stages = {
     "peaks": ((stream, "find_peaks"),),
     "bands": ((LevelMeter, "push"),),
     "looming": ((FrontEnd, "_looming"),),
+    "tone": ((ToneStage, "push"), (ToneStage, "read")),
     "channel_watching": ((ChannelMonitor, "push"),),
 }
 EVIDENCE: Stages = {

@@ -29,10 +29,10 @@ class SiteError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrontEndStudy:
-    """Bearings against the camera, prominence and looming, with intervals over recordings."""
+    """Bearings against the camera, prominence, looming and tonal Doppler, with intervals over recordings."""
 
     # `bearing_srp_deg`, `bearing_music_deg`, `bearing_gated_deg`, `prominence_in_view`,
-    # `prominence_in_silence`, `looming_auroc`, `looming_correlation`.
+    # `prominence_in_silence`, `looming_auroc`, `looming_correlation`, `doppler_usable` (count).
     figures: Mapping[str, float]
     intervals: Mapping[str, Interval]
     by_site: Mapping[str, SiteError]
@@ -75,6 +75,7 @@ def _figures(trials: Sequence[Trial], rows: IndexArray) -> dict[str, float]:
         "bearing_gated_deg": gated_median_deg(joined(checked)) if checked else np.nan,
         "prominence_in_view": _median(seen),
         "prominence_in_silence": _median(_pooled(calm, lambda hops: hops.prominence)),
+        "doppler_usable": float(sum(hops.about["doppler"] == "" for hops in approaches)),
         **_looming(approaches, calm),
     }
 

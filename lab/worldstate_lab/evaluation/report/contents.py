@@ -109,15 +109,15 @@ def front_end_section(measured: MeasuredValues) -> Section:
 
 
 def approach_rate_section(measured: MeasuredValues) -> Section:
-    """Return looming."""
+    """Return looming and tonal Doppler."""
     table = _group_table(
         "approach_rate",
         "Approach rate in the wild",
         measured,
         "approach rate",
         "Looming AUROC: energy slope of the last 3 s before the pass against hazard-free sound. "
-        "Correlation: time to arrival read from the slope, with the true time until the pass. Of tonal "
-        "Doppler the paper's figures alone stand here: lab/NOTES.md.",
+        "Correlation: time to arrival read from the slope, with the true time until the pass. Doppler: "
+        "approaches with a usable tone.",
     )
     return Section("Approach rate", (), (table,))
 

@@ -25,6 +25,7 @@ _FRONT_END, _LOOMING = ("front-end", "bearing in view"), ("approach rate", "loom
 # Places of the front-end study's figures in the paper's list.
 _STUDIED = {
     "bearing_srp_deg": (*_FRONT_END, "bearing_deg"),
+    "doppler_usable": ("approach rate", "Doppler", "doppler_usable"),
     **{name: (*_LOOMING, name) for name in ("looming_auroc", "looming_correlation")},
     **{name: (*_FRONT_END, name) for name in ("bearing_music_deg", "bearing_gated_deg")},
     **{name: (*_FRONT_END, name) for name in ("prominence_in_view", "prominence_in_silence")},
@@ -183,6 +184,7 @@ def _front_end_values(study: FrontEndStudy) -> Iterator[tuple[Place, Value]]:
     yield (*_FRONT_END, "frames"), Value(study.frames, digits=0)
     yield (*_FRONT_END, "recordings"), Value(study.approaches, digits=0)
     yield (*_FRONT_END, "gated_coverage"), Value(PUBLISHED_COVERAGE)
+    yield ("approach rate", "Doppler", "pass_bys"), Value(study.approaches, digits=0)
 
 
 def _derived_values(values: Mapping[Place, Value], found: Evaluation) -> Iterator[tuple[Place, Value]]:

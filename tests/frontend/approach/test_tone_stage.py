@@ -1,0 +1,204 @@
+"""The engine line of a stream: what decimation keeps, the fit against its bound, when it says nothing."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.frontend.approach.tone import ToneReading, ToneStage
+from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray, roof_array_56
+from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.decimator import Decimator
+from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
+
+SLOW = 6_000
+RATE = 47_998
+PAIR = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
+BOTH = ChannelMask.all_of(2)
+SETTINGS = FrontEndSettings(tone_band_hz=(20.0, 400.0))
+
+
+def line(frequency_hz: float, seconds: float, rate: float, phase: float = 0.3) -> np.ndarray:
+    return np.cos(2 * np.pi * frequency_hz / rate * np.arange(round(seconds * rate)) + phase)
+
+
+def each_hop(sound: np.ndarray) -> list[ToneReading | NotUsable]:
+    """Readings of both microphones hearing the same, one a tenth of a second."""
+    stage, found = ToneStage(PAIR, SLOW), []
+    for hop in on_both(sound).reshape(-1, SLOW // 10, 2):
+        stage.push(hop, BOTH)
+        found.append(stage.read())
+    return found
+
+
+def on_both(sound: np.ndarray) -> np.ndarray:
+    return np.stack([sound, sound], axis=1).astype(np.float32)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    cuts=st.lists(st.integers(0, 6000), max_size=8),
+    rate=st.sampled_from([1_000, 2_500.0, 8_000, 47_998]),
+    share=st.floats(0.0, 1.0),
+)
+def test_decimation_keeps_the_band_where_it_was(cuts: list[int], rate: float, share: float) -> None:
+    """A tone in the band comes out as itself, sampled at the promised instants, whatever the blocks."""
+    decimator, frequency = Decimator(rate, 300.0), 300.0 * share
+    sound = line(frequency, 6000 / rate, rate)
+    heard = np.concatenate([decimator.push(block) for block in np.split(sound, sorted(cuts))])
+    assert len(heard) == (6000 - decimator.n_taps) // decimator.factor + 1
+    instants = (np.arange(len(heard)) * decimator.factor + 0.5 * (decimator.n_taps - 1)) / rate
+    np.testing.assert_allclose(heard, np.cos(2 * np.pi * frequency * instants + 0.3), atol=3e-4)
+
+
+@pytest.mark.parametrize("frequency_hz", [835.0, 1230.0, 1500.0, 5000.0, 23_000.0])
+def test_what_would_fold_into_the_band_is_gone(frequency_hz: float) -> None:
+    decimator = Decimator(RATE, 400.0)
+    assert decimator.rate_hz - 400.0 < 835.0
+    assert np.abs(decimator.push(line(frequency_hz, 0.5, RATE))).max() < 2e-4
+
+
+@pytest.mark.parametrize(("low_hz", "high_hz"), [(20.5, 24.0), (25.0, 390.0), (390.0, 399.0)])
+@pytest.mark.parametrize("snr_db", [-6.0, 10.0, 35.0])
+def test_variance_meets_the_decimated_bound(snr_db: float, low_hz: float, high_hz: float) -> None:
+    """Within 1.5 dB of the bound, never below it beyond sampling error; the claimed variance is right."""
+    rng, trials, eta = np.random.default_rng(int(snr_db) + int(low_hz)), 150, 10 ** (snr_db / 10)
+    stage = ToneStage(PAIR, RATE)
+    rate = Decimator(RATE, 400.0).rate_hz
+    # White noise whose density makes this eta of the samples that are left: 1 / 2 eta of each.
+    noise = np.sqrt(0.5 / eta * RATE / rate)
+    errors, claimed = [], []
+    for _ in range(trials):
+        frequency = rng.uniform(low_hz, high_hz)
+        sound = line(frequency, 1.0, RATE, rng.uniform(-3.1, 3.1)) + noise * rng.standard_normal(RATE)
+        stage.push(on_both(sound), BOTH)
+        reading = stage.read()
+        assert isinstance(reading, ToneReading)
+        errors.append(reading.frequency_hz - frequency)
+        claimed.append(reading.frequency_std_hz**2)
+    bound = tone_crb_hz2(eta, len(stage._band_samples), rate)
+    spread = 3 * np.sqrt(2 / trials)
+    assert 10 * np.log10(1 - spread) < 10 * np.log10(np.mean(np.square(errors)) / bound) < 1.5
+    assert abs(10 * np.log10(np.mean(claimed) / bound)) < 1.0
+
+
+def test_noise_alone_is_no_tone() -> None:
+    rng, stage, found = np.random.default_rng(3), ToneStage(PAIR, 4_000), 0
+    for _ in range(600):
+        stage.push(rng.standard_normal((4_000, 2), dtype=np.float32), BOTH)
+        found += isinstance(stage.read(), ToneReading)
+    assert found <= 4
+
+
+@pytest.mark.parametrize("slope", [1.0, 1.5])
+def test_steep_or_gusty_noise_is_no_tone(slope: float) -> None:
+    """Without a look beside the line a quarter of the seconds of f^-3 had one."""
+    rng, n = np.random.default_rng(7), 40 * SLOW
+    white = np.fft.rfft(rng.standard_normal(n))
+    steep = np.fft.irfft(white / np.maximum(np.fft.rfftfreq(n, 1 / SLOW), 5.0) ** slope, n)
+    gusts = np.exp(np.interp(np.arange(n), np.arange(0, n, SLOW // 2), rng.standard_normal(80)))
+    for sound in (steep / steep.std(), gusts * rng.standard_normal(n)):
+        found = [isinstance(one, ToneReading) for one in each_hop(sound)]
+        assert np.mean(found) <= 0.1
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.002, 0.01])
+def test_what_is_stated_of_a_wandering_line_is_its_error(wander: float) -> None:
+    """The bound of a steady line stated a hundredth of the error of one that wanders by 1 %."""
+    rng, n = np.random.default_rng(8), 40 * SLOW
+    knots = rng.standard_normal(n // (SLOW // 10) + 1)
+    frequency = 83.37 * (1.0 + wander * np.interp(np.arange(n), SLOW // 10 * np.arange(len(knots)), knots))
+    phase = 2 * np.pi * np.cumsum(frequency) / SLOW
+    z = []
+    for hop, one in enumerate(each_hop(10.0 * np.sin(phase) + rng.standard_normal(n))):
+        if isinstance(one, ToneReading):
+            middle = (hop + 1) * SLOW // 10 - SLOW // 2
+            truth = frequency[max(middle - 47 * SLOW // 100, 0) : middle + 47 * SLOW // 100].mean()
+            z.append((one.frequency_hz - truth) / one.frequency_std_hz)
+    assert len(z) > 300
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
+
+
+def test_coloured_noise_and_rumble_hide_no_line() -> None:
+    """A line far weaker than the rumble below it and than an offset is found where it stands."""
+    rng = np.random.default_rng(4)
+    n = 2 * RATE
+    f = np.fft.rfftfreq(n, 1 / RATE)
+    rumble = np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) / np.maximum(f, 2.0) ** 1.5, n)
+    rumble /= rumble.std()
+    stage = ToneStage(PAIR, RATE)
+    stage.push(on_both(rumble + 2.0 + 0.03 * line(151.7, 2.0, RATE)), BOTH)
+    reading = stage.read()
+    assert isinstance(reading, ToneReading)
+    assert abs(reading.frequency_hz - 151.7) < 4 * reading.frequency_std_hz < 0.2
+
+
+def test_the_stream_says_it_every_hop() -> None:
+    """A gliding line: the frequency is that of the middle of the window, half a second before the stamp."""
+    rate, n = 16_000, 32_000
+    t = np.arange(n) / rate
+    glide = np.cos(2 * np.pi * (100.0 * t + 0.5 * 0.4 * t**2))
+    noise = 0.05 * np.random.default_rng(0).standard_normal(n)
+    frames = FrontEnd(PAIR, rate, SETTINGS).process(on_both(glide + noise))
+    assert len(frames) == 11
+    for frame in frames:
+        assert isinstance(frame.tone, ToneReading)
+        middle_s = frame.sample_index / rate - 0.5
+        assert frame.tone.frequency_hz == pytest.approx(100.0 + 0.4 * middle_s, abs=0.01)
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 60.0, 90.0])
+def test_a_line_adds_up_from_wherever_it_comes(azimuth_deg: float) -> None:
+    array, f = roof_array_56(), 380.0
+    delays = array.delays_s(np.radians(azimuth_deg)).ravel()
+    t = np.arange(8_000)[:, None] / 8_000
+    stage = ToneStage(array, 8_000)
+    stage.push(np.cos(2 * np.pi * f * (t - delays)).astype(np.float32), ChannelMask.all_of(56))
+    reading = stage.read()
+    assert isinstance(reading, ToneReading)
+    assert reading.frequency_hz == pytest.approx(f, abs=1e-4)
+
+
+def test_microphones_left_out_are_not_heard() -> None:
+    sound = on_both(line(90.0, 1.0, 8_000))
+    sound[:, 1] = 1e3 * line(210.0, 1.0, 8_000)
+    stage = ToneStage(PAIR, 8_000)
+    stage.push(sound, ChannelMask(np.array([True, False])))
+    reading = stage.read()
+    assert isinstance(reading, ToneReading)
+    assert reading.frequency_hz == pytest.approx(90.0, abs=1e-3)
+
+
+def test_not_usable_says_why() -> None:
+    stage = ToneStage(PAIR, 8_000)
+    stage.push(on_both(line(90.0, 0.5, 8_000)), BOTH)
+    assert stage.read() == NotUsable("needs 0.99 s of sound")
+    silent = FrontEnd(PAIR, 8_000, SETTINGS).process(np.zeros((8_000, 2)))[0]
+    assert silent.tone == NotUsable("silence")
+    assert isinstance(FrontEnd(PAIR, 8_000).process(np.zeros((8_000, 2)))[0].tone, NotUsable)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e14])
+def test_level_does_not_matter(scale: float) -> None:
+    stage = ToneStage(PAIR, 8_000)
+    stage.push(on_both(scale * line(90.0, 1.0, 8_000)), BOTH)
+    reading = stage.read()
+    assert isinstance(reading, ToneReading)
+    assert reading.frequency_hz == pytest.approx(90.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("rate", "chosen", "message"),
+    [
+        (8_000, {"tone_band_hz": (1.0, 400.0)}, "tone_band_hz"),
+        (8_000, {"tone_band_hz": (20.0, 4_000.0)}, "tone_band_hz"),
+        (8_000, {"tone_band_hz": (10.0, 20.0)}, "tone_band_hz: expected a filter"),
+        (8_000, {"tone_band_hz": (400.0, 20.0)}, "tone_band_hz"),
+    ],
+)
+def test_bad_settings_are_refused(rate: float, chosen: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=message):
+        FrontEnd(PAIR, rate, FrontEndSettings(**chosen))  # type: ignore[arg-type]
