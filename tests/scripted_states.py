@@ -16,7 +16,7 @@ SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
 def scripted_states(hops: int = 5) -> list[WorldState]:
-    """Return one snapshot a hop with somebody heard on the left, and two of it in view."""
+    """Return one snapshot a hop with a vehicle heard on the left, and two of it in view."""
     world, states = WorldFilter(), []
     for hop in range(1, hops + 1):
         sides = np.stack([_heard(0.9), _heard(0.01)])
@@ -33,7 +33,7 @@ def _in_view(last: WorldState) -> list[WorldState]:
     """Return what follows when it has come into view: by azimuth alone, then with a position."""
     seen = replace(
         last.entities[0], status="visible", hidden_probability=0.0, existence_probability=0.98,
-        azimuth_rad=0.5, azimuth_std_rad=0.03, sector_rad=None,
+        azimuth_rad=0.5, azimuth_std_rad=0.03, sector_rad=None, sides=(),
         classification=(Classification("car", 0.7), Classification("unknown", 0.3)),
         forecast={"1": (0.2, 0.05), "2": (-0.2, 0.1)},
     )  # fmt: skip
@@ -43,6 +43,7 @@ def _in_view(last: WorldState) -> list[WorldState]:
 
 
 def _heard(coming: float) -> np.ndarray:
-    groups = np.full(len(GROUPS), 0.4 * (1.0 - coming) / (len(GROUPS) - 2))
+    # Nothing of the rest comes: what does on both sides is one vehicle of unknown side.
+    groups = np.where([one.startswith("coming") for one in GROUPS], 0.0, 0.08 * (1.0 - coming))
     groups[GROUPS.index("coming_2s")], groups[GROUPS.index("seen")] = coming, 0.6 * (1.0 - coming)
     return groups
