@@ -19,9 +19,9 @@ from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground.typing import FloatArray
 
 from .ratio_recursion import balanced
+from .sequence_inputs import HOP_S
 from .sequence_model import COMING_S, GROUPS
 
-HOP_S = 0.1
 _LEAK = 0.004  # Of the hops: what the sequence of groups does not foresee
 # A wrong prior on both sides slides the alarm: by +2 nats from 15 to 58 onsets an hour, by -1 to a detection
 # of .73 in place of .94.

@@ -220,22 +220,28 @@ def held(over: BoolArray, hops: int = HELD_HOPS) -> BoolArray:
 class SequenceModel:
     """Trees over the groups, the shares that they were trained at, and how far times may be off."""
 
-    LAYOUT: ClassVar = Layout(constants={"groups": list(GROUPS), "inputs": list(INPUTS)})
+    LAYOUT: ClassVar = Layout(constants={"groups": list(GROUPS)})
 
     trees: BoostedTrees
     share: FloatArray  # shape (groups,): Of hops and sides of the streams that it was trained on
     margin_s: float = 0.0  # Beyond the trees' own interval, so that it holds nine of ten
     alarm: SequenceAlarm | None = None  # Before one is set
+    inputs: tuple[str, ...] = INPUTS  # The first of them; a model learned before others were added has fewer
 
     def __post_init__(self) -> None:
         freeze_arrays(self, share=(len(GROUPS),))
         # A posterior is moved to another prior by dividing by it.
         if (self.share <= 0.0).any():
             raise InvalidArgumentError(f"share: expected positive numbers, got {self.share.min()}")
-        got = int(self.trees.split.max()) + 1, len(self.trees.baseline)
-        if got[0] > len(INPUTS) or got[1] != len(GROUPS):
+        if self.inputs != INPUTS[: len(self.inputs)]:
+            raise InvalidArgumentError(f"inputs: expected the first of {list(INPUTS)}, got {self.inputs}")
+        got, sizes = (
+            (int(self.trees.split.max()) + 1, len(self.trees.baseline)),
+            (len(self.inputs), len(GROUPS)),
+        )
+        if got[0] > sizes[0] or got[1] != sizes[1]:
             raise InvalidArgumentError(
-                f"trees: expected {len(INPUTS)} inputs and {len(GROUPS)} groups, got {got[0]} and {got[1]}"
+                f"trees: expected {sizes[0]} inputs and {sizes[1]} groups, got {got[0]} and {got[1]}"
             )
 
     def posterior(self, evidence: HopEvidence) -> SequencePosterior:

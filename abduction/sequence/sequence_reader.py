@@ -13,6 +13,7 @@ from .sequence_inputs import (
     COLUMNS,
     MEMORY_HOPS,
     QUIET_HOPS,
+    RECENT_HOPS,
     SIDES,
     USUAL,
     HopEvidence,
@@ -38,7 +39,7 @@ class SequenceHistory:
     0
     """
 
-    # shapes (up to 31, 13), as `columns_of`, and (up to 600, 9), as `streets_own`; the last hop last
+    # shapes (up to 81, 13), as `columns_of`, and (up to 600, 9), as `streets_own`; the last hop last
     recent: FloatArray = field(default_factory=partial(np.zeros, (0, len(COLUMNS))))
     minute: FloatArray = field(default_factory=partial(np.zeros, (0, len(USUAL))))
     missed: Count = field(default=0, metadata=ADDED)  # Hops since the last one that was heard
@@ -55,7 +56,7 @@ class SequenceHistory:
 
     @property
     def hops(self) -> int:
-        """Number of hops that are kept, up to three seconds of them."""
+        """Number of hops that are kept, up to eight seconds of them."""
         return len(self.recent)
 
     def missed_hop(self) -> "SequenceHistory":
@@ -64,7 +65,7 @@ class SequenceHistory:
         Those before are forgotten after three seconds without sound.
         """
         missed = self.missed + 1
-        recent = self.recent if missed < MEMORY_HOPS else self.recent[:0]
+        recent = self.recent if missed < RECENT_HOPS else self.recent[:0]
         return SequenceHistory(recent, self.minute, missed)
 
     def heard(self, evidence: HopEvidence) -> "SequenceHistory":

@@ -11,10 +11,17 @@ from made_up_sequence import evidence_of
 from worldstate.abduction.sequence.sequence_inputs import (
     INPUTS,
     MEMORY_HOPS,
+    RECENT_HOPS,
     HopEvidence,
     sequence_inputs,
 )
-from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S, BoostedTrees, SequencePosterior
+from worldstate.abduction.sequence.sequence_model import (
+    GROUPS,
+    HORIZONS_S,
+    BoostedTrees,
+    SequenceModel,
+    SequencePosterior,
+)
 from worldstate.ground.errors import InvalidArgumentError
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -39,13 +46,36 @@ def test_the_mirrored_street_exchanges_the_sides(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_three_seconds_are_all_that_is_kept_but_for_the_streets_own_level(seed: int) -> None:
-    whole = evidence_of(np.random.default_rng(seed), 70)
+def test_eight_seconds_are_all_that_is_kept_but_for_the_streets_own_level(seed: int) -> None:
+    whole = evidence_of(np.random.default_rng(seed), 120)
     own = {"level", "loudness", "band_1", "band_2", "band_3", "band_4"}
-    levels = np.array([name in own or name.endswith("_above") for name in INPUTS])
-    kept = HopEvidence(*(getattr(whole, one.name)[-MEMORY_HOPS:] for one in fields(whole)))
-    last, short = sequence_inputs(whole)[-1], sequence_inputs(kept)[-1]
-    np.testing.assert_allclose(last[:, ~levels], short[:, ~levels], atol=1e-9)
+    kept = np.array([name not in own and not name.endswith("_above") for name in INPUTS])
+    # What vehicles in view have left comes last, and nothing before it reads more than three seconds.
+    recent = kept & (np.arange(len(INPUTS)) < INPUTS.index("since_loudest"))
+    last = sequence_inputs(whole)[-1]
+    for hops, same in ((MEMORY_HOPS, kept), (RECENT_HOPS, recent)):
+        cut = HopEvidence(*(getattr(whole, one.name)[-hops:] for one in fields(whole)))
+        np.testing.assert_allclose(last[:, same], sequence_inputs(cut)[-1][:, same], atol=1e-9)
+
+
+def test_a_second_vehicle_is_a_rise_after_the_loudest_hop_and_its_dip() -> None:
+    level = np.concatenate([np.linspace(0.0, 5.0, 20), np.linspace(4.9, 2.0, 30), np.linspace(2.1, 3.5, 10)])
+    heard = replace(evidence_of(np.random.default_rng(1), len(level)), loudness=level)
+    last = dict(zip(INPUTS, sequence_inputs(heard)[-1, 0], strict=True))
+    found = [last[name] for name in ("since_loudest", "below_loudest", "above_dip")]
+    assert found == [pytest.approx(4.0), pytest.approx(-1.5), pytest.approx(1.5)]
+
+
+def test_a_model_reads_the_first_inputs_and_no_others() -> None:
+    stump = {"split": [[0, 0, 0]], "threshold": [[0.5, 0.0, 0.0]], "yes": [[1, 1, 2]], "no": [[2, 1, 2]]}
+    trees = BoostedTrees(**stump, value=[[0.0, -1.0, 1.0]], tree_class=[0], baseline=[0.0] * len(GROUPS))  # type: ignore[arg-type]
+    heard, share = evidence_of(np.random.default_rng(1), 20), np.full(len(GROUPS), 1.0 / len(GROUPS))
+    before = SequenceModel(trees, share, inputs=INPUTS[:46])
+    np.testing.assert_array_equal(
+        before.posterior(heard).groups, SequenceModel(trees, share).posterior(heard).groups
+    )
+    with pytest.raises(InvalidArgumentError, match="inputs: expected the first"):
+        SequenceModel(trees, share, inputs=INPUTS[1:])
 
 
 @given(SEEDS, st.integers(1, 900))

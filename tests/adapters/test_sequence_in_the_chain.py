@@ -13,6 +13,7 @@ from made_up_sequence import sequence_model
 
 from worldstate import Context, MicrophoneArray
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
+from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
 from worldstate.abduction.sequence.sequence_model import SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import neutral
@@ -198,7 +199,7 @@ def test_lost_sound_is_no_evidence_and_leaves_nothing_behind(folder: Path, tmp_p
     assert ends[0].history is not None and ends[1].history is not None
     assert len(ends[0].history.minute) == len(ends[1].history.minute) - 13
     # Level, loudness and prominence of the last hops are as if nothing had been lost.
-    recent = [end.history.recent[1:, 3:6] for end in ends if end.history is not None]
+    recent = [end.history.recent[1 - RECENT_HOPS :, 3:6] for end in ends if end.history is not None]
     np.testing.assert_allclose(recent[0], recent[1], atol=1e-9)
 
 
