@@ -20,7 +20,7 @@ def main(out: Path, size: str = "full") -> None:
     """Learn from minutes of sound: every step is there, and the model is unfit for use."""
     array, settings = MicrophoneArray(CORNERS), quick_settings(BUDGET)
     if size == "small":
-        settings = replace(settings, approach_minutes=0.8, exam_minutes=1.6)
+        settings = replace(settings, approach_minutes=0.9, exam_minutes=1.6)
     streams = out / ("streams_small" if size == "small" else "streams")  # what was heard once is kept here
     model = commission(array, settings, streams)
     save_model(out / "my_model.json", model)

@@ -16,7 +16,7 @@ SAYS = {
     "02_own_array": r"line of 8 across: cannot tell cone",
     "03_own_detector": r"30 degrees: misses 0\.[1-9]",
     "04_commission": r"fit for use: False.*onsets_per_hour=20\.0",
-    "05_several_road_users": r"handed_over[\s\S]*at most 2 hidden at once",
+    "05_several_road_users": r"handed_over[\s\S]*2 identities",
     "06_moving_ego": r"chances over time: {'0.5': 0\.",
     "07_another_modality": r"light: .* 0 with a time\nradio: (\d+) states, \1 with a time",
     "08_embed": r"as if in order: True; snapshots read back: True\n.*repeated=[1-9].*too_late=0",

@@ -95,7 +95,7 @@ class CommissionSettings:
     def __post_init__(self) -> None:
         in_range("junctions", self.junctions, 2, 200)
         # Of less there are streams without vehicles, and nothing is learned.
-        in_range("approach_minutes", self.approach_minutes, 0.8, 120.0)
+        in_range("approach_minutes", self.approach_minutes, 0.9, 120.0)
         in_range("hazard_free_minutes", self.hazard_free_minutes, 0.5, 120.0)
         in_range("exam_minutes", self.exam_minutes, 0.5, 160.0)
         in_range("onsets_per_hour", self.onsets_per_hour, 0.1, 3600.0)
