@@ -409,7 +409,7 @@ def heard_of(frame: AcousticFrame) -> Heard:
         dead = 1.0 - health.mask.n_kept / len(health.mask.keep)
         left += [(falling(dead, _DEAD), "dead channels"), (falling(health.clipped, _CLIPPED), "clipped")]
     share, reason = min(left, key=itemgetter(0))
-    return Heard(share, reason if share < _SAID else None)
+    return Heard(share, reason if share < _SAID else None, frame.excess_db)
 
 
 def asked_again(

@@ -15,6 +15,7 @@ from worldstate.abduction.cueing.risk_map import PlattMap
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.ground import LEAST_HEARD
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Heard, Look, Position, PositionScan
 
@@ -316,6 +317,45 @@ def test_absence_counts_as_far_as_a_vehicle_would_have_been_heard(seed: int, sha
                 odds = then / (1.0 - then)
                 assert now / (1.0 - now) >= (1.0 - share) * odds - 1e-6
         assert sum(after.hypotheses) == pytest.approx(1.0)
+
+
+def passing(excess_db: float) -> list[WorldState]:
+    """Return the states while a vehicle is in view for two seconds, and for four after it has left."""
+    groups = np.full((2, len(GROUPS)), 0.01)
+    groups[:, GROUPS.index("none")] = 1.0
+    empty = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1)
+    quiet, world, found = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0), WorldFilter(), []
+    for number in range(1, 60):
+        there = number <= 20
+        answer = Present(0.04, 0.01) if there else Absent(0.04, 0.01)
+        boxes = (Sighting(0.04 * (10 - number), 0.02, "car", 0.9),) if there else ()
+        world = world.update(
+            Measurement(
+                number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=Look("camera", number * 10**8, answer),
+                sequence=empty, heard=Heard(excess_db=excess_db),
+            )
+        )  # fmt: skip
+        found.append(world.state)
+    return found
+
+
+def test_beside_a_vehicle_in_view_heard_says_that_it_masks() -> None:
+    shares = []
+    for excess_db in (6.0, 30.0):
+        states = passing(excess_db)
+        (beside,), (later,) = states[15].heard or (), states[-1].heard or ()
+        assert beside.reason == "masked by a vehicle in view" and beside.since_ns < 10**9
+        # The ear itself works: the belief follows it, and a budget is stated.
+        assert LEAST_HEARD <= beside.share < 0.75 and states[15].calibrated == states[-1].calibrated
+        assert (later.share, later.reason) == (1.0, None)
+        shares.append(beside.share)
+    assert shares[1] < shares[0]
+
+
+def test_what_masks_says_how_well_could_be_heard_and_moves_no_belief() -> None:
+    for faint, loud in zip(passing(0.0), passing(30.0), strict=True):
+        assert [cue.risk for cue in faint.cues] == [cue.risk for cue in loud.cues]
+        assert faint.entities == loud.entities
 
 
 def test_a_source_that_falls_silent_gives_no_news() -> None:

@@ -18,6 +18,7 @@ from worldstate.measurement import Measurement
 
 from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceRule
 from .sequence_memory import LEAST_RISK
+from .side_update import heard_beside
 from .site_model import FilterModel, published_belief
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
@@ -48,12 +49,13 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     domain = measurement.domain
     fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
     last = memory.rule_of(measurement.source, measurement.stamp_ns)
-    same = last.heard.reason == measurement.heard.reason
+    heard = heard_beside(memory, measurement)
+    same = last.heard.reason == heard.reason
     rule = SourceRule(
         measurement.source,
         measurement.stamp_ns,
         fault=fault,
-        heard=measurement.heard,
+        heard=heard,
         heard_ns=last.heard_ns if same else measurement.stamp_ns,
     )
     if not measurement.heard.usable and memory.instant is not None:

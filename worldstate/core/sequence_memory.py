@@ -14,6 +14,7 @@ from worldstate.abduction.sequence.sequence_chain import (
     BEHIND,
     COMES,
     FOLLOWS,
+    IN_VIEW,
     SEEN,
     STATES,
     context_prior,
@@ -157,6 +158,12 @@ class SequenceMemory:
         told = sum(self._told.values(), np.zeros(len(STATES)))
         weighed = self.states.belief * np.exp(told - told.max())
         return np.asarray(weighed / weighed.sum(axis=1, keepdims=True))
+
+    @property
+    def in_view(self) -> float:
+        """P(a vehicle is in view, or has left it into a side), by what is heard."""
+        there = self.weighed[:, IN_VIEW].sum(axis=1) + self.posterior.groups[0, :, _PAST]
+        return min(float(there.max()), 1.0)
 
     @cached_property
     def posterior(self) -> SequencePosterior:

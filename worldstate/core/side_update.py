@@ -8,9 +8,9 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground import FloatArray
+from worldstate.ground import LEAST_HEARD, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement import CameraLook, Measurement
+from worldstate.measurement import CameraLook, Heard, Measurement
 
 from .memory import Memory
 from .sequence_memory import informed
@@ -30,6 +30,31 @@ def update_windows(memory: Memory, measurement: Measurement, model: FilterModel)
         windows, prior = windows.update(source, stamp_ns, signature, looked, rates_hz, window_ns)
         memory = replace(memory, windows=windows, predicted=prior.sides.hypotheses)
     return memory
+
+
+# P(a vehicle that comes into view within three seconds adds a decibel or more to 300 Hz to 2 kHz), by how far
+# the sound lies above the place's usual, dB, while another is in view or has left it within two seconds: 6,066
+# hops of 28 learned junctions. With none in view it is .8 from 3 dB on.
+_EXCESS_DB, _NOTICED = (4.5, 7.5, 10.5, 13.5, 17.5, 22.0), (0.5, 0.36, 0.33, 0.25, 0.15, 0.06)
+_JUST_LEFT_NS = 2_000_000_000  # What has left the view is as loud as it was for so long
+_SAID = 0.75  # Above, a vehicle in view is not likely enough to be a reason
+
+
+def heard_beside(memory: Memory, measurement: Measurement) -> Heard:
+    r"""Return how well could be heard beside a vehicle in view, or one that has just left it.
+
+    .. math:: s = 1 - P(\text{in view})\, \big(1 - P(\text{noticed} \mid \text{level})\big)
+
+    The belief moves by the sequence's own reading, which was learned where vehicles mask one another.
+    """
+    heard, since_ns = measurement.heard, measurement.stamp_ns - _JUST_LEFT_NS
+    near = [one.existence for one in memory.tracks if one.moving and (one.last_seen_ns or 0) >= since_ns]
+    in_view = max([*near, 0.0 if memory.sequence is None else memory.sequence.in_view], default=0.0)
+    share = 1.0 - in_view * (1.0 - float(np.interp(heard.excess_db, _EXCESS_DB, _NOTICED)))
+    if share >= min(heard.share, _SAID):
+        return heard
+    # What masks is heard itself: the ear is not deaf.
+    return replace(heard, share=max(share, LEAST_HEARD), reason="masked by a vehicle in view")
 
 
 def masked_by(signature: SignatureEvidence, share: float) -> SignatureEvidence:

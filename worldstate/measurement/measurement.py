@@ -102,6 +102,8 @@ class Heard:
     reason : str or None
         Why it would not: "lost samples", "clipped", "noise far above this place's usual", "wind", "dead
         channels" or "loud source in view"; None where nothing is against it.
+    excess_db : float
+        How far the sound lies above what is usual at this place, dB.
 
     Raises
     ------
@@ -116,6 +118,7 @@ class Heard:
 
     share: Probability = 1.0
     reason: str | None = None
+    excess_db: float = field(default=0.0, metadata=ADDED)
 
     @property
     def usable(self) -> bool:
@@ -123,7 +126,7 @@ class Heard:
         return self.share >= LEAST_HEARD
 
     def __post_init__(self) -> None:
-        check_fields(self, share=(0.0, 1.0), reason=str | None)
+        check_fields(self, share=(0.0, 1.0), reason=str | None, excess_db=(-1e3, 1e3))
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,7 @@ def measurements(
             bearing=_bearing(heard, i),
             approach=_approach(heard, i),
             sequence=reading if i + 1 >= LEAST_HOPS else TOO_FEW,
-            heard=Heard(float(hops.heard[i]), str(hops.unheard[i]) or None),
+            heard=Heard(float(hops.heard[i]), str(hops.unheard[i]) or None, float(hops.excess_db[i])),
         )
         yield asked_again(measurement, vision)
 
