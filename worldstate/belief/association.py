@@ -31,8 +31,9 @@ _MOST_NATS = 25.0  # Sums that leave one term out keep their digits
 # Deviations and radians of a sighting of an entity in view. The second bounds the first: four deviations of
 # an entity unseen for a second are most of the view.
 _GATE_SIGMA, _GATE_RAD = 4.0, 0.35
-# Of first sightings about the edge that they come past: corners of real junctions stand within 6 degrees of
-# the default; missed once or twice, a vehicle moves on by 3 to 6 degrees an image.
+# Of the leading ends of first sightings about the edge that they come past: corners of real junctions stand
+# within 6 degrees of the default; missed once or twice, a vehicle moves on by 3 to 6 degrees an image. By its
+# middle, what turns in ahead or pulls out from the kerb, wholly in view at once, would seem to come past it.
 EDGE_STD_RAD = 0.15
 # P(the signature names the wrong side): rarely on junctions that its model was trained on, often on others.
 _SIDE_CONFUSION = 0.2
@@ -211,7 +212,6 @@ def _log_ratios(
 ) -> FloatArray:
     """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
     motion, in_sight = MotionBelief.stacked([one.motion for one in tracks]), detections[0].found is not None
-    azimuth_rad = np.array([[one.azimuth_rad] for one in detections])
     found = np.array([[one.found or 0.0] for one in detections])
     existence = np.array([one.existence for one in tracks]).clip(LEAST_EXISTENCE, MOST_EXISTENCE)
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
@@ -220,7 +220,7 @@ def _log_ratios(
     if len(heard):
         # What was only heard is found where it comes into view.
         hidden = [tracks[i] for i in heard]
-        density[:, heard] = np.log(np.maximum(emergence_density(hidden, azimuth_rad, site), _LEAST))
+        density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), _LEAST))
         reached = np.array([reached_edge(one, site) for one in hidden])
         likely[:, heard] = np.log(existence[heard] * reached)
     if detections[0].position is None:
@@ -320,14 +320,19 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
     return min(max(by_time / near(side.azimuth_rad, side.std_rad), _UNFORESEEN), 1.0)
 
 
-def emergence_density(tracks: Sequence[Track], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
+def emergence_density(
+    tracks: Sequence[Track], detections: Sequence[Detection], site: SiteGeometry
+) -> FloatArray:
     """Return the density of first sightings of hidden entities, 1/rad, shape (sightings, tracks)."""
-    edges_rad = np.array([side.edge_azimuth_rad for side in site.sides])
-    deviations = wrap_angle(azimuth_rad - edges_rad) / EDGE_STD_RAD
+    from_edge_rad = [
+        [side.distance_rad(one.azimuth_rad, one.width_rad or 0.0) for side in site.sides]
+        for one in detections
+    ]
+    deviations = np.array(from_edge_rad) / EDGE_STD_RAD
     # Of first sightings about the edge that they come past, 1/rad.
     near = np.exp(-0.5 * deviations**2) / (EDGE_STD_RAD * math.sqrt(2.0 * math.pi))
     heard = np.empty_like(near)
-    for side in range(len(edges_rad)):
-        others = np.delete(near, side, axis=1).max(axis=1) if len(edges_rad) > 1 else near[:, side]
+    for side in range(len(site.sides)):
+        others = np.delete(near, side, axis=1).max(axis=1) if len(site.sides) > 1 else near[:, side]
         heard[:, side] = (1.0 - _SIDE_CONFUSION) * near[:, side] + _SIDE_CONFUSION * others
-    return np.asarray(heard @ np.array([side_weights(track, len(edges_rad)) for track in tracks]).T)
+    return np.asarray(heard @ np.array([side_weights(track, len(site.sides)) for track in tracks]).T)

@@ -256,7 +256,8 @@ def after_look(
         track.side
         for track in tracks[len(before) :]
         if track.seen and track.moving
-        if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * EDGE_STD_RAD
+        if site.sides[track.side].distance_rad(track.motion.azimuth_rad, track.width_rad)
+        <= 2.0 * EDGE_STD_RAD
     }
     memory = replace(memory, tracks=surviving(tracks, site.settings))
     return past_edges(memory, handed_over, unheard, stamp_ns)
