@@ -217,6 +217,13 @@ def test_two_are_two_when_both_are_likely_and_one_again_by_the_joint() -> None:
     assert merged.into == one[0].id
 
 
+def test_one_that_changes_sides_as_it_becomes_two_leaves_the_other_side_to_the_other() -> None:
+    """Likelier left so far, it is the one on the right: on the left another one is born, and no third."""
+    (one,), two = (heard_as(ONE, TWO)[hop].entities for hop in (5, 6))
+    assert {entity.direction: entity.id == one.id for entity in two} == {"left": False, "right": True}
+    assert len(two) == 2
+
+
 def test_a_share_that_fades_merges_nothing() -> None:
     """Where next to nothing is left on one side, the vehicle there is gone, and not part of the other."""
     states = heard_as(TWO, both_sides((0.9, 0.02), (0.02, 0.9), "coming_2s"))
