@@ -258,6 +258,25 @@ def test_a_second_vehicle_believed_apart_stays_when_the_first_is_seen() -> None:
     assert cue_of(after, "right").risk > 0.95 * cue_of(before, "right").risk
 
 
+def test_a_second_vehicle_believed_apart_is_not_unheard_because_the_first_masks_it() -> None:
+    """Law 11: for as long as the window holds the first's entry, neither its sound nor looks at it count."""
+    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    masked = np.full((2, len(GROUPS)), 1e-3)
+    masked[:, GROUPS.index("seen")] = 1.0
+    alone, before = replace(TWO, groups=masked / masked.sum(axis=1, keepdims=True)), world.state
+    for number in range(1, 20):
+        answer = Absent(0.04, 0.01) if number < 10 else Present(0.04, 0.01)
+        boxes = (Sighting(0.53 - 0.04 * (number - 10), 0.02, "car", 0.9),) if number >= 10 else ()
+        said, look = TWO if number < 10 else alone, Look("camera", number * 10**8, answer)
+        before = world.state if number == 10 else before
+        world = world.update(
+            Measurement(number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=look, sequence=said)
+        )
+    right = {one.direction: one for one in before.entities}["right"]
+    assert right.id in {one.id for one in world.state.entities if one.status == "hidden"}
+    assert cue_of(world.state, "right").risk > 0.85 * cue_of(before, "right").risk
+
+
 def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_that_follow() -> None:
     before, after = seen_from_left(both_sides((0.97, 0.01), (0.01, 0.97), "coming_0.5s"))
     assert [event.kind for event in after.events] == ["handed_over"]
