@@ -30,7 +30,7 @@ _SETTLED = 1e-9  # Existence is stated in nine digits
 _MOST_NATS = 25.0  # Sums that leave one term out keep their digits
 # Deviations and radians of a sighting of an entity in view. The second bounds the first: four deviations of
 # an entity unseen for a second are most of the view.
-_GATE_SIGMA, _GATE_RAD = 4.0, 0.35
+_GATE_SIGMA, GATE_RAD = 4.0, 0.35
 # Of the leading ends of first sightings about the edge that they come past: corners of real junctions stand
 # within 6 degrees of the default; missed once or twice, a vehicle moves on by 3 to 6 degrees an image. By its
 # middle, what turns in ahead or pulls out from the kerb, wholly in view at once, would seem to come past it.
@@ -244,7 +244,7 @@ def _azimuth_density(
     density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
     if detections[0].position is not None:
         return np.where(squares > _GATE, FORBIDDEN, density)
-    outside = (np.abs(residual) > _GATE_RAD) | (squares > _GATE_SIGMA**2)
+    outside = (np.abs(residual) > GATE_RAD) | (squares > _GATE_SIGMA**2)
     return np.where(outside, FORBIDDEN, density)
 
 

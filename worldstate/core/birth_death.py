@@ -6,7 +6,7 @@ from functools import partial
 from operator import attrgetter, itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.association import EDGE_STD_RAD, HANDOVER_RESIDUAL, Association
+from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL, Association
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
@@ -189,11 +189,14 @@ def _are_halves(hidden: list[Track], sides: SideBelief, site: SiteGeometry) -> b
 
 
 def _at_one_place(one: Track, other: Track) -> bool:
-    """Tell whether two tracks of one class stand within each other's deviations of azimuth and range."""
+    """Tell whether two tracks of one class stand within each other's deviations of azimuth and range.
+
+    One that has left the view is soon anywhere in it: beyond the gate no sighting would have been its own.
+    """
     gap = one.motion.mean - other.motion.mean
     gap[AZIMUTH] = wrap_angle(gap[AZIMUTH])
     variance = (one.motion.covariance + other.motion.covariance).diagonal()
-    near = all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
+    near = abs(gap[AZIMUTH]) <= GATE_RAD and all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
     alike = _likeliest(one) == _likeliest(other)
     return near and alike and one.moving == other.moving
 
