@@ -9,7 +9,7 @@ import numpy as np
 
 from worldstate.abduction.road_users import SEEN_AS
 from worldstate.belief.kinematics.cartesian import CartesianBelief, full_measurement
-from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, MotionBelief
+from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, MotionBelief
 from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
 
 from .detection import Detection
@@ -214,6 +214,10 @@ def _log_ratios(
     motion, in_sight = MotionBelief.stacked([one.motion for one in tracks]), detections[0].found is not None
     found = np.array([[one.found or 0.0] for one in detections])
     existence = np.array([one.existence for one in tracks]).clip(LEAST_EXISTENCE, MOST_EXISTENCE)
+    boxes = detections[0].position is None
+    past = np.array([leaving(one, site) if boxes else 0.0 for one in tracks])
+    # What may have left the view is found as far as it may not, wherever the edge truly is.
+    found = found * np.maximum(1.0 - past, _UNFORESEEN)
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
     density = _azimuth_density(motion, detections, detected)
     heard = np.flatnonzero(~detected) if in_sight else np.array([], int)
@@ -302,6 +306,15 @@ def _shared_class(track: Track, label: str) -> float:
         return _MISREAD if label in _ON_FOOT else 1.0
     kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in track.labels)
     return max(sum(share for matches, share in kinds if matches), _MISREAD)
+
+
+def leaving(track: Track, site: SiteGeometry) -> float:
+    """Return P(the leading end of an entity in view has passed the edge ahead of it)."""
+    if not (track.seen and track.moving):
+        return 0.0
+    way = float(np.sign(track.motion.mean[AZIMUTH_RATE]))  # Of a first sighting none
+    end_rad = track.motion.azimuth_rad + 0.5 * way * track.width_rad
+    return site.past_edge(end_rad, track.motion.azimuth_std_rad, way)
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:
