@@ -28,6 +28,7 @@ from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
+from worldstate.state import SideShare
 
 Vehicle = tuple[str, str, float]  # flow, arm, T0; "from_ahead" comes along the ego's own street
 CORNER_RAD, STREET_M, PACE_MPS = math.radians(32.0), 9.0, 4.5
@@ -166,6 +167,14 @@ def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
     group = "other, 1.5 to 4 s"
     assert (told[f"{group}: stated apart"], told[f"{group}: merged"]) == (1, 0.0)
     assert told[f"{group}: identity kept"] == 1.0
+    # One whose side is not known is the first's, and apart only as far as it is likelier the second's.
+    shares = SideShare("left", 0.8, 0.8, 0.1), SideShare("right", 0.2, -0.8, 0.1)
+    single = tuple(
+        tuple(replace(one, sides=shares) for one in hop if one.status == "hidden" and one.direction == "left")
+        for hop in follow.entities
+    )
+    unknown = PassedStream(made_up, passed.truth, replace(follow, entities=single))
+    assert second_figures([unknown])[f"{group}: stated apart"] == 0
     # What ends in another one was merged, whatever is seen later.
     ids = frozenset(one.id for hop in follow.entities for one in hop)
     merged = PassedStream(made_up, passed.truth, replace(follow, merged=ids))

@@ -155,6 +155,38 @@ def test_whoever_comes_into_view_has_to_be_what_was_heard(label, same):
     assert {one.status: one.id == heard.id for one in seen}["visible"] == same
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("azimuth_rad", "width_rad", "same"), [(0.44, 0.08, True), (0.25, 0.27, False)])
+def test_a_vehicle_that_comes_past_an_edge_shows_its_front_first(sign, azimuth_rad, width_rad, same):
+    """One that pulls out from the kerb or turns in ahead shows all of itself: another one is still heard."""
+    world = WorldFilter()
+    for hop in range(1, 30):
+        world = world.update(looked(hop / 10, (3.0, 0.0) if sign > 0.0 else (0.0, 3.0)))
+    (heard,) = world.state.entities
+    car = Sighting(sign * azimuth_rad, 0.02, "car", 0.9, width_rad)
+    after = world.update(looked(3.0, (0.0, 0.0), car)).state.entities
+    assert {one.status: one.id == heard.id for one in after}["visible"] == same
+    assert heard.id in {one.id for one in after}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("azimuth_rad", "width_rad", "leaves"), [(0.34, 0.4, True), (0.53, 0.05, False)])
+def test_one_that_leaves_where_another_comes_does_not_take_it_over(sign, azimuth_rad, width_rad, leaves):
+    """Its leading end has passed the edge: a box there is of the one heard behind it, one before its own."""
+    world, nats = WorldFilter(), (3.0, 0.0) if sign > 0.0 else (0.0, 3.0)
+    for hop in range(1, 30):
+        world = world.update(looked(hop / 10, nats))
+    (heard,) = world.state.entities
+    for hop in range(30, 37):
+        car = Sighting(sign * (0.045 * (hop - 30) - 0.02), 0.02, "car", 0.9, 0.5)
+        world = world.update(looked(hop / 10, nats, car))
+    for hop in range(37, 40):
+        world = world.update(looked(hop / 10, nats))
+    car = Sighting(sign * azimuth_rad, 0.02, "car", 0.9, width_rad)
+    (seen,) = (one for one in world.update(looked(4.0, nats, car)).state.entities if one.last_seen_ns == 4e9)
+    assert (seen.id != heard.id) == leaves
+
+
 def test_of_two_who_may_have_been_found_the_other_one_keeps_his_existence():
     """Two cars a degree apart and one box between them: an empty look would take both down by .04."""
     world = WorldFilter()

@@ -288,6 +288,18 @@ def test_two_that_have_become_one_go_on_as_the_first() -> None:
     assert "died" not in {one.kind for one in told}
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_one_that_has_left_the_view_does_not_become_the_next_one_far_from_it(way: float) -> None:
+    """Unseen for seconds it may be anywhere, so that any box lies within its deviations."""
+    world, kinds = WorldFilter(), set[str]()
+    for hop in range(1, 11):
+        world = world.update(box(hop, way * 0.66))
+    for hop in range(11, 80):
+        world = world.update(box(hop) if hop < 70 else box(hop, way * (0.2 - 0.01 * (hop - 70))))
+        kinds |= {one.kind for one in world.state.events}
+    assert "born" in kinds and "merged" not in kinds
+
+
 def test_two_of_which_each_is_found_stay_two() -> None:
     world = WorldFilter()
     for hop in range(1, 40):

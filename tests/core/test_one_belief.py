@@ -218,6 +218,13 @@ def test_two_are_two_when_both_are_likely_and_one_again_by_the_joint() -> None:
     assert merged.into == one[0].id
 
 
+def test_one_that_changes_sides_as_it_becomes_two_leaves_the_other_side_to_the_other() -> None:
+    """Likelier left so far, it is the one on the right: on the left another one is born, and no third."""
+    (one,), two = (heard_as(ONE, TWO)[hop].entities for hop in (5, 6))
+    assert {entity.direction: entity.id == one.id for entity in two} == {"left": False, "right": True}
+    assert len(two) == 2
+
+
 def test_a_share_that_fades_merges_nothing() -> None:
     """Where next to nothing is left on one side, the vehicle there is gone, and not part of the other."""
     states = heard_as(TWO, both_sides((0.9, 0.02), (0.02, 0.9), "coming_2s"))
@@ -250,6 +257,25 @@ def test_one_of_unknown_side_is_handed_over_where_it_is_seen(edge_rad: float) ->
 def test_a_second_vehicle_believed_apart_stays_when_the_first_is_seen() -> None:
     before, after = seen_from_left(both_sides((0.9, 0.85), (0.04, 0.08), "coming_1s"))
     assert cue_of(after, "right").risk > 0.95 * cue_of(before, "right").risk
+
+
+def test_a_second_vehicle_believed_apart_is_not_unheard_because_the_first_masks_it() -> None:
+    """Law 11: for as long as the window holds the first's entry, neither its sound nor looks at it count."""
+    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    masked = np.full((2, len(GROUPS)), 1e-3)
+    masked[:, GROUPS.index("seen")] = 1.0
+    alone, before = replace(TWO, groups=masked / masked.sum(axis=1, keepdims=True)), world.state
+    for number in range(1, 20):
+        answer = Absent(0.04, 0.01) if number < 10 else Present(0.04, 0.01)
+        boxes = (Sighting(0.53 - 0.04 * (number - 10), 0.02, "car", 0.9),) if number >= 10 else ()
+        said, look = TWO if number < 10 else alone, Look("camera", number * 10**8, answer)
+        before = world.state if number == 10 else before
+        world = world.update(
+            Measurement(number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=look, sequence=said)
+        )
+    right = {one.direction: one for one in before.entities}["right"]
+    assert right.id in {one.id for one in world.state.entities if one.status == "hidden"}
+    assert cue_of(world.state, "right").risk > 0.85 * cue_of(before, "right").risk
 
 
 def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_that_follow() -> None:

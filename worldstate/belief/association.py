@@ -9,7 +9,7 @@ import numpy as np
 
 from worldstate.abduction.road_users import SEEN_AS
 from worldstate.belief.kinematics.cartesian import CartesianBelief, full_measurement
-from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, MotionBelief
+from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, MotionBelief
 from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
 
 from .detection import Detection
@@ -30,9 +30,10 @@ _SETTLED = 1e-9  # Existence is stated in nine digits
 _MOST_NATS = 25.0  # Sums that leave one term out keep their digits
 # Deviations and radians of a sighting of an entity in view. The second bounds the first: four deviations of
 # an entity unseen for a second are most of the view.
-_GATE_SIGMA, _GATE_RAD = 4.0, 0.35
-# Of first sightings about the edge that they come past: corners of real junctions stand within 6 degrees of
-# the default; missed once or twice, a vehicle moves on by 3 to 6 degrees an image.
+_GATE_SIGMA, GATE_RAD = 4.0, 0.35
+# Of the leading ends of first sightings about the edge that they come past: corners of real junctions stand
+# within 6 degrees of the default; missed once or twice, a vehicle moves on by 3 to 6 degrees an image. By its
+# middle, what turns in ahead or pulls out from the kerb, wholly in view at once, would seem to come past it.
 EDGE_STD_RAD = 0.15
 # P(the signature names the wrong side): rarely on junctions that its model was trained on, often on others.
 _SIDE_CONFUSION = 0.2
@@ -211,16 +212,19 @@ def _log_ratios(
 ) -> FloatArray:
     """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
     motion, in_sight = MotionBelief.stacked([one.motion for one in tracks]), detections[0].found is not None
-    azimuth_rad = np.array([[one.azimuth_rad] for one in detections])
     found = np.array([[one.found or 0.0] for one in detections])
     existence = np.array([one.existence for one in tracks]).clip(LEAST_EXISTENCE, MOST_EXISTENCE)
+    boxes = detections[0].position is None
+    past = np.array([leaving(one, site) if boxes else 0.0 for one in tracks])
+    # What may have left the view is found as far as it may not, wherever the edge truly is.
+    found = found * np.maximum(1.0 - past, _UNFORESEEN)
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
     density = _azimuth_density(motion, detections, detected)
     heard = np.flatnonzero(~detected) if in_sight else np.array([], int)
     if len(heard):
         # What was only heard is found where it comes into view.
         hidden = [tracks[i] for i in heard]
-        density[:, heard] = np.log(np.maximum(emergence_density(hidden, azimuth_rad, site), _LEAST))
+        density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), _LEAST))
         reached = np.array([reached_edge(one, site) for one in hidden])
         likely[:, heard] = np.log(existence[heard] * reached)
     if detections[0].position is None:
@@ -244,7 +248,7 @@ def _azimuth_density(
     density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
     if detections[0].position is not None:
         return np.where(squares > _GATE, FORBIDDEN, density)
-    outside = (np.abs(residual) > _GATE_RAD) | (squares > _GATE_SIGMA**2)
+    outside = (np.abs(residual) > GATE_RAD) | (squares > _GATE_SIGMA**2)
     return np.where(outside, FORBIDDEN, density)
 
 
@@ -304,6 +308,15 @@ def _shared_class(track: Track, label: str) -> float:
     return max(sum(share for matches, share in kinds if matches), _MISREAD)
 
 
+def leaving(track: Track, site: SiteGeometry) -> float:
+    """Return P(the leading end of an entity in view has passed the edge ahead of it)."""
+    if not (track.seen and track.moving):
+        return 0.0
+    way = float(np.sign(track.motion.mean[AZIMUTH_RATE]))  # Of a first sighting none
+    end_rad = track.motion.azimuth_rad + 0.5 * way * track.width_rad
+    return site.past_edge(end_rad, track.motion.azimuth_std_rad, way)
+
+
 def reached_edge(track: Track, site: SiteGeometry) -> float:
     """Return how likely a hidden entity is near enough to its edge, against one of unknown time.
 
@@ -320,14 +333,19 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
     return min(max(by_time / near(side.azimuth_rad, side.std_rad), _UNFORESEEN), 1.0)
 
 
-def emergence_density(tracks: Sequence[Track], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
+def emergence_density(
+    tracks: Sequence[Track], detections: Sequence[Detection], site: SiteGeometry
+) -> FloatArray:
     """Return the density of first sightings of hidden entities, 1/rad, shape (sightings, tracks)."""
-    edges_rad = np.array([side.edge_azimuth_rad for side in site.sides])
-    deviations = wrap_angle(azimuth_rad - edges_rad) / EDGE_STD_RAD
+    from_edge_rad = [
+        [side.distance_rad(one.azimuth_rad, one.width_rad or 0.0) for side in site.sides]
+        for one in detections
+    ]
+    deviations = np.array(from_edge_rad) / EDGE_STD_RAD
     # Of first sightings about the edge that they come past, 1/rad.
     near = np.exp(-0.5 * deviations**2) / (EDGE_STD_RAD * math.sqrt(2.0 * math.pi))
     heard = np.empty_like(near)
-    for side in range(len(edges_rad)):
-        others = np.delete(near, side, axis=1).max(axis=1) if len(edges_rad) > 1 else near[:, side]
+    for side in range(len(site.sides)):
+        others = np.delete(near, side, axis=1).max(axis=1) if len(site.sides) > 1 else near[:, side]
         heard[:, side] = (1.0 - _SIDE_CONFUSION) * near[:, side] + _SIDE_CONFUSION * others
-    return np.asarray(heard @ np.array([side_weights(track, len(edges_rad)) for track in tracks]).T)
+    return np.asarray(heard @ np.array([side_weights(track, len(site.sides)) for track in tracks]).T)

@@ -43,17 +43,21 @@ class SideGeometry:
     hides: bool = True
     yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
 
+    @property
+    def outwards(self) -> float:
+        """The way from the edge to what it hides: 1 to the left, -1 to the right."""
+        return math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
+
     def behind(self, azimuth_rad: float, std_rad: float) -> float:
         """Return the probability that what stands at an azimuth is behind this side's occluder."""
         if not self.hides:
             return 0.0
-        outwards = math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
-        past = outwards * wrap_angle(azimuth_rad - self.edge_azimuth_rad) / std_rad
+        past = self.outwards * wrap_angle(azimuth_rad - self.edge_azimuth_rad) / std_rad
         return normal_share(past) - normal_share(past - _WIDEST_RAD / std_rad)
 
-    def distance_rad(self, azimuth_rad: float) -> float:
-        """Return the angle between an azimuth and the occluder's edge, >= 0."""
-        return abs(wrap_angle(azimuth_rad - self.edge_azimuth_rad))
+    def distance_rad(self, azimuth_rad: float, width_rad: float = 0.0) -> float:
+        """Return the angle, >= 0, between the occluder's edge and the end of a box that leads past it."""
+        return abs(wrap_angle(azimuth_rad - 0.5 * self.outwards * width_rad - self.edge_azimuth_rad))
 
     def prior(self) -> MotionBelief:
         """Return the prior motion of a vehicle hidden here."""

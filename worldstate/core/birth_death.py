@@ -6,7 +6,7 @@ from functools import partial
 from operator import attrgetter, itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.association import EDGE_STD_RAD, HANDOVER_RESIDUAL, Association
+from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL, Association
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
@@ -48,13 +48,14 @@ def birth_death(
         _heard_on(one, alarmed, measurement, memory.sides, site) if one.id in current else one
         for one in memory.tracks
     )
-    memory = replace(memory, tracks=tuple(one for one in updated if one is not None))
+    # Before births: another one is born on the side that it leaves.
+    tracks = (_on_its_side(one, memory.sides, site) for one in updated if one is not None)
+    memory = replace(memory, tracks=tuple(tracks))
     for k in _sides_of_births(memory, alarmed, site):
         memory = _with_birth(memory, k, measurement, site)
-    hidden = _hidden(memory.tracks)
-    alone = len(hidden) == 1 and memory.sides.hidden_share(None) >= HIDDEN
-    tracks = (_on_its_side(one, alone, memory.sides, site) for one in memory.tracks)
-    return replace(memory, tracks=tuple(tracks))
+    if len(_hidden(memory.tracks)) == 1 and memory.sides.hidden_share(None) >= HIDDEN:
+        return memory
+    return replace(memory, tracks=tuple(_of_known_side(one, memory.sides) for one in memory.tracks))
 
 
 def _heard_on(
@@ -109,19 +110,26 @@ def _with_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeom
         shares = ()
     stamp_ns, motion = measurement.stamp_ns, site.sides[k].prior()
     one = replace(one, side=k, seen=False, came_from=1.0, existence=min(sides.hidden[k], 1.0))
-    kept.append(replace(one, motion=motion, updated_ns=stamp_ns, place=None, behind=1.0, side_shares=shares))
+    one = replace(one, motion=motion, updated_ns=stamp_ns, place=None, behind=1.0, side_shares=shares)
+    kept.append(_on_its_side(one, sides, site))
     return replace(memory, tracks=tuple(kept), births=tuple(counts))
 
 
-def _on_its_side(track: Track, alone: bool, sides: SideBelief, site: SiteGeometry) -> Track:
-    """Return an entity of unknown side on its likelier one: the only one, where it is hidden alone."""
+def _on_its_side(track: Track, sides: SideBelief, site: SiteGeometry) -> Track:
+    """Return an entity of unknown side on its likelier one."""
     if track.of_side is not None:
-        return replace(track, side_shares=()) if track.side_shares else track
+        return _of_known_side(track, sides)
     shares = sides.side_shares(site.settings.death_probability)
     side = shares.index(max(shares))
     motion = track.motion if side == track.side else site.sides[side].prior()
-    track = replace(track, side=side, side_shares=shares if alone else (), motion=motion)
-    return replace(track, existence=sides.existence(track.of_side))
+    return replace(track, side=side, side_shares=shares, motion=motion, existence=sides.existence(None))
+
+
+def _of_known_side(track: Track, sides: SideBelief) -> Track:
+    if not track.side_shares:
+        return track
+    existence = track.existence if track.of_side is not None else sides.existence(track.side)
+    return replace(track, side_shares=(), existence=existence)
 
 
 def _rearmed(memory: Memory) -> list[bool]:
@@ -148,8 +156,7 @@ def merged_tracks(memory: Memory, site: SiteGeometry) -> tuple[tuple[Track, ...]
         first, second = sorted(_hidden(tracks), key=_AGE)
         shares = memory.sides.side_shares(site.settings.death_probability)
         left.remove(second)
-        halves = replace(first, side_shares=shares)
-        left[left.index(first)] = _on_its_side(halves, True, memory.sides, site)
+        left[left.index(first)] = _on_its_side(replace(first, side_shares=shares), memory.sides, site)
         into[second.id] = first.id
     found = [one for one in tracks if one.seen and one.last_seen_ns == stamp_ns]
     lost = [one for one in tracks if one.seen and stamp_ns - (one.last_seen_ns or 0) >= _ALONE_NS]
@@ -182,11 +189,14 @@ def _are_halves(hidden: list[Track], sides: SideBelief, site: SiteGeometry) -> b
 
 
 def _at_one_place(one: Track, other: Track) -> bool:
-    """Tell whether two tracks of one class stand within each other's deviations of azimuth and range."""
+    """Tell whether two tracks of one class stand within each other's deviations of azimuth and range.
+
+    One that has left the view is soon anywhere in it: beyond the gate no sighting would have been its own.
+    """
     gap = one.motion.mean - other.motion.mean
     gap[AZIMUTH] = wrap_angle(gap[AZIMUTH])
     variance = (one.motion.covariance + other.motion.covariance).diagonal()
-    near = all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
+    near = abs(gap[AZIMUTH]) <= GATE_RAD and all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
     alike = _likeliest(one) == _likeliest(other)
     return near and alike and one.moving == other.moving
 
@@ -256,7 +266,8 @@ def after_look(
         track.side
         for track in tracks[len(before) :]
         if track.seen and track.moving
-        if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * EDGE_STD_RAD
+        if site.sides[track.side].distance_rad(track.motion.azimuth_rad, track.width_rad)
+        <= 2.0 * EDGE_STD_RAD
     }
     memory = replace(memory, tracks=surviving(tracks, site.settings))
     return past_edges(memory, handed_over, unheard, stamp_ns)

@@ -9,7 +9,13 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, Association, associated
+from worldstate.belief.association import (
+    LEAST_EXISTENCE,
+    MOST_EXISTENCE,
+    Association,
+    associated,
+    leaving,
+)
 from worldstate.belief.detection import Detection, Scan, camera_scan, fused, position_scan
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import (
@@ -20,7 +26,6 @@ from worldstate.belief.kinematics.cartesian import (
 )
 from worldstate.belief.kinematics.motion import (
     AZIMUTH,
-    AZIMUTH_RATE,
     LOG_RANGE,
     RADIAL_RATE,
     MotionBelief,
@@ -375,11 +380,7 @@ def _has_left(track: Track, miss_rate: float, stamp_ns: int, site: SiteGeometry)
     with the chance p of that, the time t since its last box and the interval T of looks. Boxes end as soon as
     a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
     """
-    if not (track.seen and track.moving):
-        return False
-    way = math.copysign(1.0, track.motion.mean[AZIMUTH_RATE])
-    end_rad = track.motion.azimuth_rad + 0.5 * way * track.width_rad
-    past = site.past_edge(end_rad, track.motion.azimuth_std_rad, way)
+    past = leaving(track, site)
     unseen_s = seconds(stamp_ns - (track.last_seen_ns or 0))
     missed = math.pow(miss_rate, min(unseen_s / site.settings.look_interval_s, 1.0))
-    return past >= (1.0 - past) * missed
+    return 0.0 < past >= (1.0 - past) * missed

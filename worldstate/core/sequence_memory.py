@@ -97,8 +97,8 @@ _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 300_000_000, 1_000_000_000, 5_000_000
 # A look says what is in view then, not what will be: multiplied into the belief hop by hop, looks at one
 # vehicle outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
 _LOOK_NS = 500_000_000
-# A window and the smoothing of the alarm: so long the sound of a side is that of the vehicle that has just
-# come into view, and says nothing of the next one.
+# A window and the smoothing of the alarm: so long the sound of either side is that of the vehicle that has
+# just come into view, and says nothing of the next one.
 _MASKED_NS = 1_300_000_000
 _IN_VIEW_S = 6.0  # Two passages: before, it is the sound that tells whether it is still there
 _OTHERS = 0.1  # Vehicles in view from no side that is listened to
@@ -108,6 +108,10 @@ _FAR = [_PAST, GROUPS.index("rising"), GROUPS.index("falling")]
 _SEEN_GROUP = GROUPS.index("seen")
 # States of vehicles that come into view within three seconds.
 _SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range(len(STATES))])
+# What every state becomes when a vehicle comes into view, shape (states, states).
+_ONE_IN_VIEW = np.eye(len(STATES))[
+    [len(COMING_S) + i % len(COMING_S) if comes else STATES.index("seen") for i, comes in enumerate(COMES)]
+]
 LEAST_RISK = 0.1  # An advisory does not stand beside a risk that denies it
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
 
@@ -129,7 +133,7 @@ class SequenceMemory:
     looks: tuple[Look, ...] = ()  # The last one of each sensor, for as long as it holds
     # When a vehicle last came into view from a side.
     emerged_ns: tuple[int | None, ...] = (None,) * len(SIDES)
-    # When what was heard on a side was last that of a vehicle that then came into view, there or elsewhere.
+    # When what was heard on a side was last masked by a vehicle that came into view, there or elsewhere.
     masked_ns: tuple[int | None, ...] = (None,) * len(SIDES)
     # P(a vehicle has come into view from a side and no look has told), where no camera looks or none sees.
     unseen: tuple[Probability, ...] = (0.0,) * len(SIDES)
@@ -245,14 +249,14 @@ class SequenceMemory:
 
         with the chance r, in `kept`, that it was another vehicle than the one believed there, the share f of
         vehicles that another one follows, and the gaps g of these. One vehicle of unknown side was believed
-        on both sides; vehicles of sides that are `apart`, or that were likelier two than one, stay.
+        on both sides; vehicles of sides that are `apart`, or that were likelier two than one, stay. From now
+        on one is in view of either side, which looks would else count against the second, and masks it.
         """
-        belief, alone, masked = self.states.belief.copy(), self.states.alone.copy(), set(kept)
+        belief, alone = self.states.belief @ _ONE_IN_VIEW, self.states.alone @ _ONE_IN_VIEW
         unseen, comes, both = np.array(self.unseen), self.comes, self.both_come
         for k, residual in kept.items():
             j = 1 - k
             if j not in kept and j not in apart and both <= _TWO:
-                masked.add(j)
                 given = both / max(comes[k], _LEAST_WEIGHT)
                 less = residual + (1.0 - residual) * min(given / max(comes[j], _LEAST_WEIGHT), 1.0)
                 moved = belief[j, COMES].sum() * (1.0 - less)
@@ -270,7 +274,7 @@ class SequenceMemory:
             self,
             states=SequenceBelief(belief, alone),
             emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
-            masked_ns=tuple(stamp_ns if k in masked else ns for k, ns in enumerate(self.masked_ns)),
+            masked_ns=(stamp_ns,) * len(SIDES),
             over_ns=tuple(None if k in kept else ns for k, ns in enumerate(self.over_ns)),
             unseen=tuple(unseen.tolist()),
             arrivals=tuple(

@@ -120,9 +120,10 @@ def _kept(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool, bool]
             continue
         behind = one.sides[0] == one.sides[1]
         before = int(np.searchsorted(followed.time_s, one.entries_s[0] - SLACK_S)) - 1
-        # Behind another one the likeliest entity is that one's.
-        hidden = sorted(followed.hidden(before, one.sides[1]), key=lambda e: -e.existence_probability)
-        stated = {e.id for e in hidden[behind:] if e.existence_probability >= STATED}
+        # By its share of that side: one of unknown side is the first's, too. Behind another one the
+        # likeliest entity is that one's.
+        hidden = sorted(followed.hidden(before, one.sides[1], STATED), key=lambda e: -e.existence_probability)
+        stated = {e.id for e in hidden[behind:]}
         first, second = (_seen_after(stream, entry_s) for entry_s in one.entries_s)
         merged = first in stated or bool(stated & followed.merged)
         yield behind, one.entries_s[1] - one.entries_s[0], bool(stated), second in stated, merged
