@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.datasets.traffic_clips import TrafficClip, idmt_traffic, melaudis
 from worldstate.adapters.files.atomic import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
@@ -39,6 +38,7 @@ from worldstate_lab.signatures.signature_study import (
     SignatureStudy,
     signature_study,
 )
+from worldstate_lab.signatures.traffic_clips import TrafficClip, idmt_traffic, melaudis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
