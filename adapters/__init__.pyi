@@ -40,4 +40,4 @@ from .listener import listen_steps as listen_steps
 from .listener import measure_steps as measure_steps
 from .source import ListenSettings as ListenSettings
 from .source import Source as Source
-from .source_files import open_source as open_source
+from .source import open_source as open_source

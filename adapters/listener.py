@@ -24,8 +24,7 @@ from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
 from .own_parts import OtherModality
-from .source import Source
-from .source_files import SourceParts, open_source
+from .source import Source, SourceParts, open_source
 
 # Half a hop.
 PARTS_PER_SECOND = 20

@@ -62,7 +62,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
 from worldstate.adapters.listener import listen_steps, measure_steps
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError

@@ -19,8 +19,7 @@ from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, o
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.adapters.listener import listen, measure_steps
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
 from worldstate.ground.errors import InputFileError, OutOfDomainError

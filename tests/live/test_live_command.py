@@ -25,8 +25,7 @@ from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound
 from worldstate.adapters.live.microphones import Playback
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.common.live_view import view_of
 from worldstate.cli.main import main
 from worldstate.state import WorldState

@@ -13,8 +13,7 @@ from worldstate.adapters.live.bounded_channel import BoundedChannel
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound, SoundBlock
 from worldstate.adapters.live.microphones import Playback
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 

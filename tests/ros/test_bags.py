@@ -290,8 +290,7 @@ def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
 
 def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
     from worldstate.adapters.listener import listen_steps
-    from worldstate.adapters.source import ListenSettings
-    from worldstate.adapters.source_files import open_source
+    from worldstate.adapters.source import ListenSettings, open_source
     from worldstate.frontend import MicrophoneArray
 
     path = write_blocks(tmp_path / "bag", sound_of(2 * RATE_HZ))

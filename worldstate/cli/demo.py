@@ -60,7 +60,7 @@ def _delivery_van(rng: "np.random.Generator") -> "SimulationSettings":
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.source_files import open_source
+    from worldstate.adapters.source import open_source
     from worldstate.cli.common.listening import listen_with_progress
     from worldstate.operations.viewing.state_figure import drawn_run
 

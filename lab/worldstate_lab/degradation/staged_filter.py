@@ -22,8 +22,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import MAX_IMAGE_AGE_S, VisionQuery
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
-from worldstate.adapters.source import Source, unoccluded_sector
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import Source, open_source, unoccluded_sector
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray

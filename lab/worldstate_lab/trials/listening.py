@@ -19,8 +19,7 @@ from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.adapters.files.array_match import TRAIN
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import Step, listen_steps, measure_steps
-from worldstate.adapters.source import ListenSettings, Source
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.approach.doppler import radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray

@@ -15,8 +15,7 @@ from worldstate.adapters.files.acoustic_domain import check_tables
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import listen_steps, measure_steps
-from worldstate.adapters.source import ListenSettings, Source
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings

@@ -170,7 +170,7 @@ def recorded(arguments: argparse.Namespace, sound: "SoundInput", settings: "List
     """Return a recording of which sound, boxes and camera are used, and no model has to fit the array."""
     from dataclasses import replace
 
-    from worldstate.adapters.source_files import open_source
+    from worldstate.adapters.source import open_source
 
     given = given_sensors(arguments)
     return open_source(

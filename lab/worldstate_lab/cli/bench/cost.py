@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[imp
 
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.listener import Listener
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import open_source
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
