@@ -3,6 +3,7 @@
 A place is as measured, or in the crossing lane where only the azimuth is known.
 """
 
+import json
 import math
 import struct
 import uuid
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.atomic import atomic_path, line_writer
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
@@ -124,6 +125,13 @@ def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[
     sec, nanosec = divmod(state.stamp_ns, 1_000_000_000)
     header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": state.frame_id}
     return {"header": header, "objects": [_object(one) for one in lane_objects(state, crossing_m)]}
+
+
+@contextmanager
+def autoware_lines(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
+    """Lend a function that writes the messages of states, one a line."""
+    with line_writer(path) as write:
+        yield lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
 
 
 def likeliest_label(one: LaneObject) -> int:

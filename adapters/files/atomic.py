@@ -7,7 +7,7 @@ points to is replaced, and the link stays. Devices, pipes and folders are never 
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -59,6 +59,13 @@ def write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8 with plain newlines, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+@contextmanager
+def line_writer(path: str | Path) -> Iterator[Callable[[str], None]]:
+    """Lend a function that writes lines of UTF-8 to a file, which takes its name at the end."""
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        yield lambda line: print(line, file=file)
 
 
 def _remove(path: Path) -> None:
