@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 
-from worldstate.adapters.export.log_sinks import read_snapshot_lines
+from worldstate.adapters.export.log_messages import read_snapshot_lines
 from worldstate.adapters.files.atomic import line_writer
 from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.adapters.ros.bag_reader import is_bag

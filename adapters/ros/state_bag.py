@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from worldstate.adapters.export.lane_objects import CROSSING_M, autoware_objects
-from worldstate.adapters.export.scene import scene_update
-from worldstate.adapters.export.scene_messages import SceneItem
+from worldstate.adapters.export.scene import SceneItem, scene_update
 from worldstate.ground.serialisation import encode
 from worldstate.state import RiskCue, WorldState
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from worldstate.adapters.export.log_message import LogMessage, LogSink
+    from worldstate.adapters.export.log_messages import LogMessage, LogSink
     from worldstate.adapters.listener import Step
     from worldstate.adapters.source import Source
     from worldstate.state import WorldState
@@ -84,7 +84,7 @@ class Exports:
 
     def state(self, state: "WorldState") -> None:
         """Pass a state on."""
-        from worldstate.adapters.export.log_message import state_messages
+        from worldstate.adapters.export.log_messages import state_messages
 
         for message in state_messages(state) if self.viewers else ():
             self.message(message)
@@ -108,16 +108,16 @@ def open_exports(
 
 
 def _viewer(name: str, target: str, paced: bool) -> "AbstractContextManager[LogSink]":
-    from worldstate.adapters.export import log_sinks
+    from worldstate.adapters.export.log_messages import mcap_file, rerun_file
 
     if name == "foxglove":
         return _websocket(target, paced)
-    return (log_sinks.mcap_file if name == "mcap" else log_sinks.rerun_file)(Path(target))
+    return mcap_file(Path(target)) if name == "mcap" else rerun_file(Path(target))
 
 
 @contextmanager
 def _websocket(port: str, paced: bool) -> "Iterator[LogSink]":
-    from worldstate.adapters.export.log_sinks import live_server
+    from worldstate.adapters.export.log_messages import live_server
 
     if not port.isdecimal():
         raise InvalidArgumentError(f"--export foxglove: expected a port, got {port}")
@@ -152,7 +152,7 @@ def exported_hops(
         if not exports.viewers:
             yield lambda step: exports.state(step.state)
             return
-        from worldstate.adapters.export.log_message import camera_images, srp_message
+        from worldstate.adapters.export.log_messages import camera_images, srp_message
 
         image_before = camera_images(source.audio_path.parent, source.start_ns)
 
