@@ -6,8 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.export.log_messages import read_snapshot_lines
-from worldstate.adapters.files.atomic import line_writer
-from worldstate.adapters.files.text_file import refused_as_file
+from worldstate.adapters.files.file_io import line_writer, refused_as_file
 from worldstate.adapters.ros.bag_reader import is_bag
 from worldstate.adapters.ros.state_bag import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds

@@ -9,7 +9,7 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
-from worldstate.adapters.files.text_file import read_json, read_text, refused_as_file
+from worldstate.adapters.files.file_io import read_json, read_text, refused_as_file
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
 from worldstate.ground.serialisation import Check, Count, Probability, decode
 from worldstate.ground.typing import FloatArray, ImageArray, IntArray

@@ -1,6 +1,5 @@
 """Measured miss and clutter rates of a camera's detector, with their counts, on disk."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass, field
 from functools import cached_property
@@ -11,8 +10,7 @@ import numpy as np
 from scipy.special import betaincinv
 
 from worldstate.abduction.absence import MissRateTable, isotonic_grid
-from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.text_file import read_record
+from worldstate.adapters.files.file_io import read_record, write_json
 from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.serialisation import ADDED, Layout, encode
 from worldstate.ground.typing import FloatArray
@@ -206,7 +204,7 @@ def save_miss_rates(path: str | Path, rates: MissRates) -> None:
     ...     load_miss_rates(Path(folder) / "beta.json").families["noise"].misses
     ((0.0, 1.0, 2.0, 5.0, 10.0),)
     """
-    write_text(path, json.dumps(rates.to_dict(), allow_nan=False, indent=1) + "\n")
+    write_json(path, rates.to_dict(), indent=1)
 
 
 def load_miss_rates(path: str | Path) -> MissRates:

@@ -12,7 +12,7 @@ from typing import Literal, final, get_args
 
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
-from worldstate.adapters.files.text_file import read_rows
+from worldstate.adapters.files.file_io import read_rows
 from worldstate.ground.errors import InputFileError
 
 LOG_NAME = "DataLog.csv"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.files.atomic import atomic_path, line_writer
+from worldstate.adapters.files.file_io import atomic_path, line_writer
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.file_io import atomic_path
 from worldstate.adapters.files.json_schema import json_schema
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.extras import check_extra, optional

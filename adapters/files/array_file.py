@@ -18,8 +18,7 @@ from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, Micropho
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
-from .atomic import write_text
-from .text_file import read_bytes
+from .file_io import read_bytes, write_text
 
 Axes = Literal["acoular", "base_link"]
 

@@ -11,7 +11,7 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.audio.sound_file import Audio
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.file_io import atomic_path
 from worldstate.ground import InputFileError, nanoseconds
 from worldstate.ground.typing import Float32Array
 

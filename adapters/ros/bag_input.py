@@ -17,8 +17,8 @@ from worldstate.adapters.camera.detections import (
     DetectionFrame,
     DetectionLog,
 )
+from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
-from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, InvalidArgumentError, seconds
 from worldstate.ground.typing import Float32Array

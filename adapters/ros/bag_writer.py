@@ -10,9 +10,8 @@ from worldstate.adapters.audio.open_sound import SoundInput, open_sound
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME, Recording
-from worldstate.adapters.files.atomic import atomic_path, check_target
+from worldstate.adapters.files.file_io import atomic_path, check_target, read_json
 from worldstate.adapters.files.odometry_file import OdometryLog
-from worldstate.adapters.files.text_file import read_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, nanoseconds
 from worldstate.measurement.odometry import Odometry

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.files.atomic import write_text
+from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range

@@ -24,7 +24,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from worldstate.adapters.files.text_file import number, read_rows
+from worldstate.adapters.files.file_io import number, read_rows
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.array.microphone_array import MicrophoneArray

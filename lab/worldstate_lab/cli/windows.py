@@ -44,7 +44,7 @@ from worldstate.abduction.cueing.calibration_error import (
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, read_ids
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.file_io import atomic_path
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.output import CommandResult, check_outputs

@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.atomic import write_text
+    from worldstate.adapters.files.file_io import write_text
     from worldstate.cli.common.progress import sound_bar
     from worldstate.operations.recordings.bearing_track import (
         bearings_csv,
