@@ -11,8 +11,7 @@ criterion: reflections count, so it is no number of vehicles.
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common import inputs
-from worldstate.cli.common.output import CommandResult, check_outputs
+from worldstate.cli.common import inputs, output, progress
 
 EXAMPLE = """\
 examples:
@@ -30,18 +29,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw azimuth over time")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.files.file_io import write_text
-    from worldstate.cli.common.progress import sound_bar
     from worldstate.operations.recordings.bearing_track import (
         bearings_csv,
         track_bearings,
         write_bearings_figure,
     )
 
-    check_outputs(arguments, "out", figures=("figure",))
-    with inputs.opened_front_end(arguments) as (audio, front_end), sound_bar(audio) as bar:
+    output.check_outputs(arguments, "out", figures=("figure",))
+    with inputs.opened_front_end(arguments) as (audio, front_end), progress.sound_bar(audio) as bar:
         track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
         silent = list(audio.silent_channels)
     write_text(arguments.out, bearings_csv(track))
@@ -54,4 +52,4 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "hops": len(track),
         "silent_channels": silent,
     }
-    return CommandResult(summary)
+    return output.CommandResult(summary)

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate import adapters
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_messages import LogMessage, LogSink
-    from worldstate.adapters.listener import Step
-    from worldstate.adapters.source import Source
     from worldstate.state import WorldState
 
     Stack = AbstractContextManager[Callable[[WorldState], object]]
@@ -145,8 +144,8 @@ def _stack(name: str, target: str, crossing_m: float) -> "Stack":
 
 @contextmanager
 def exported_hops(
-    arguments: argparse.Namespace, source: "Source", crossing_m: float, *, paced: bool = True
-) -> "Iterator[Callable[[Step], None]]":
+    arguments: argparse.Namespace, source: "adapters.Source", crossing_m: float, *, paced: bool = True
+) -> "Iterator[Callable[[adapters.Step], None]]":
     """Lend a function that exports a hop of a recording: state, power over azimuth, the camera's image."""
     with open_exports(arguments, crossing_m=crossing_m, paced=paced) as exports:
         if not exports.viewers:
@@ -156,7 +155,7 @@ def exported_hops(
 
         image_before = camera_images(source.audio_path.parent, source.start_ns)
 
-        def export_hop(step: "Step") -> None:
+        def export_hop(step: "adapters.Step") -> None:
             for message in image_before(step.state.stamp_ns):
                 exports.message(message)
             exports.state(step.state)

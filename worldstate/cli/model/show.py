@@ -7,7 +7,8 @@ thresholds, limits, licence.
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.output import CommandResult
+from worldstate import adapters
+from worldstate.cli.common import output
 
 EXAMPLE = """\
 examples:
@@ -21,13 +22,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("file", type=Path, nargs="?", metavar="FILE", help="model file (default: the one that ships)")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.model_file import read_model
     from worldstate.operations.training.model_card import model_card
 
-    card = model_card(read_model(arguments.file))
-    return CommandResult(card, table=_readable(card))
+    card = model_card(adapters.read_model(arguments.file))
+    return output.CommandResult(card, table=_readable(card))
 
 
 def _readable(card: dict[str, object]) -> dict[str, object]:
