@@ -1,8 +1,8 @@
 from .acoustic import AcousticAdapter as AcousticAdapter
 from .acoustic import AcousticSettings as AcousticSettings
 from .acoustic import Grounding as Grounding
-from .audio.open_sound import RawPcm as RawPcm
 from .audio.sound_file import AudioSource as AudioSource
+from .audio.sound_file import RawPcm as RawPcm
 from .audio.sound_file import open_audio as open_audio
 from .camera.detections import DetectionFilter as DetectionFilter
 from .camera.detections import DetectionFrame as DetectionFrame

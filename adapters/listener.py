@@ -11,7 +11,7 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.adapters.audio.open_sound import SoundInput, open_sound
+from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras
 from worldstate.adapters.files.checkpoint_file import Checkpoint

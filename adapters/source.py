@@ -15,7 +15,7 @@ from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
-from worldstate.adapters.audio.open_sound import SoundInput, SoundStream, as_sound, path_of
+from worldstate.adapters.audio.sound_file import SoundInput, SoundStream, as_sound, path_of
 from worldstate.adapters.camera.camera_channel import video_degradation, watched
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector, read_any_detections
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates

@@ -11,9 +11,8 @@ from scipy.special import betaincinv
 
 from worldstate.abduction.absence import MissRateTable, isotonic_grid
 from worldstate.adapters.files.file_io import read_record, write_json
-from worldstate.ground import InvalidArgumentError, finite_array
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.serialisation import ADDED, Layout, encode
-from worldstate.ground.typing import FloatArray
 
 from .camera_health import CameraHealth, Health
 from .degradation import LEVELS

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.files.file_io import atomic_path, line_writer
+from worldstate.ground import FloatArray, seconds
 from worldstate.ground.extras import check_extra, optional
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
 from worldstate.state import Entity, WorldState
 
 # Real vehicles of OVAD pass some 9 m ahead of the ego; another junction has another distance.

@@ -15,10 +15,9 @@ import numpy as np
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
 from worldstate.adapters.files.file_io import atomic_path
 from worldstate.adapters.files.json_schema import json_schema
-from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
+from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
-from worldstate.ground.typing import FloatArray
 from worldstate.state.world_state import WorldState, snapshot_schema
 
 from .scene import (

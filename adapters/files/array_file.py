@@ -15,8 +15,7 @@ from defusedxml.common import DefusedXmlException
 
 from worldstate.frontend.array.geometry import nearest_spacings_m
 from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, MicrophoneArray
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 
 from .file_io import read_bytes, write_text
 

@@ -6,8 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from worldstate.adapters.audio.open_sound import SoundInput, open_sound
-from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.audio.sound_file import SoundInput, open_audio, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME, Recording
 from worldstate.adapters.files.file_io import atomic_path, check_target, read_json

@@ -10,7 +10,7 @@ from worldstate.adapters.export.scene import SceneItem, scene_update
 from worldstate.ground.serialisation import encode
 from worldstate.state import RiskCue, WorldState
 
-from .bag_reader import open_bag
+from .bag_input import open_bag
 from .bag_writer import Storage, bag_writer
 from .message_types import ADVISORIES, MARKERS, OBJECTS, TEXT, header, time_of
 

@@ -15,9 +15,8 @@ from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
 from worldstate.adapters.files.array_file import checked_array, read_array
 from worldstate.adapters.files.file_io import check_keys, read_json, read_record, refused_as_file, write_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground import InputFileError, InvalidArgumentError, finite_array, in_range
+from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import ADDED, decode
-from worldstate.ground.typing import FloatArray
 
 # No vehicle carries a sensor farther from its origin; such a number was written in millimetres.
 MAX_OFFSET_M = 30.0

@@ -51,7 +51,7 @@ from worldstate_lab.trials.pass_cache import PassCache
 
 from worldstate.abduction.absence import default_miss_rates
 from worldstate.abduction.co_evidence import Absent
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.camera.camera_channel import watched
 from worldstate.adapters.camera.camera_health import learn_health
 from worldstate.adapters.camera.degradation import degrade

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from worldstate.adapters.live import microphones
-from worldstate.adapters.live.live_sound import LiveSound
-from worldstate.adapters.live.microphones import MissingPortAudioError, PortAudioInput, portaudio
+from worldstate.adapters.live.live_sound import LiveSound, MissingPortAudioError, PortAudioInput, portaudio
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError, MissingExtraError
 

@@ -15,7 +15,7 @@ import pytest
 import soundfile
 from scripted_states import scripted_states
 
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.export.lane_objects import autoware_objects
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.files.odometry_file import OdometryLog

@@ -134,7 +134,7 @@ def _source(
 
 
 def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "SoundFeed":
-    from worldstate.adapters.live.microphones import PortAudioInput
+    from worldstate.adapters.live.live_sound import PortAudioInput
 
     array = given.car.array
     if array is None:
@@ -147,8 +147,8 @@ def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> 
 
 
 def _played(arguments: argparse.Namespace, recorded: "adapters.Source") -> "SoundFeed":
-    from worldstate.adapters.audio.open_sound import open_sound
-    from worldstate.adapters.live.microphones import Playback
+    from worldstate.adapters.audio.sound_file import open_sound
+    from worldstate.adapters.live.live_sound import Playback
 
     audio = open_sound(recorded.sound, recorded.array.n_microphones, strict=False)
     return Playback(audio, arguments.speed, arguments.duration)

@@ -24,7 +24,7 @@ from worldstate.cli.common import exports, inputs, listening, output, sensors
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import SoundInput
+    from worldstate.adapters.audio.sound_file import SoundInput
     from worldstate.adapters.files.odometry_file import OdometryLog
 
     Seen = Path | adapters.DetectionLog | None

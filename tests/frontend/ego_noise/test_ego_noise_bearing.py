@@ -9,7 +9,7 @@ import scipy.signal
 import soundfile
 
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.adapters.files.acoustic_domain import check_tables
 from worldstate.adapters.files.array_file import write_array_xml

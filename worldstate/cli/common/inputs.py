@@ -10,8 +10,7 @@ from worldstate import adapters, frontend
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import Encoding, SoundInput
-    from worldstate.adapters.audio.sound_file import Audio
+    from worldstate.adapters.audio.sound_file import Audio, Encoding, SoundInput
     from worldstate.adapters.ros.bag_input import BagTopics
 
 SOUND_HELP = """\
@@ -75,7 +74,7 @@ def topics_of(arguments: argparse.Namespace) -> "BagTopics":
 
 def sound_of(arguments: argparse.Namespace) -> "SoundInput":
     """Return what INPUT names."""
-    from worldstate.adapters.audio.open_sound import as_sound
+    from worldstate.adapters.audio.sound_file import as_sound
     from worldstate.adapters.ros.bag_input import read_sound
 
     bag = bag_of(arguments)
@@ -99,7 +98,7 @@ def _raw_samples(name: str, *, alone: bool) -> "SoundInput":
 
 def bag_of(arguments: argparse.Namespace) -> Path | None:
     """Return the bag that INPUT names, None where it is none."""
-    from worldstate.adapters.ros.bag_reader import is_bag
+    from worldstate.adapters.ros.bag_input import is_bag
 
     alone = arguments.input[0] if len(arguments.input) == 1 else None
     return alone if alone is not None and is_bag(alone) else None
@@ -120,7 +119,7 @@ def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
 
 def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, frontend.MicrophoneArray]":
     """Return what INPUT and --array name, or the array that belongs to the sound."""
-    from worldstate.adapters.audio.open_sound import path_of
+    from worldstate.adapters.audio.sound_file import path_of
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.ros.bag_input import needed_array, read_sound
 
@@ -138,7 +137,7 @@ def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, fronte
 @contextmanager
 def opened_front_end(arguments: argparse.Namespace) -> "Iterator[tuple[Audio, frontend.FrontEnd]]":
     """Open what INPUT and --array name, and the front-end that hears it."""
-    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.adapters.audio.sound_file import open_sound
 
     sound, array = _sound_and_array(arguments)
     with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:

@@ -17,7 +17,7 @@ from .progress import progress_bar, track
 from .sensors import MOVING, GivenSensors, given_sensors
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import SoundInput
+    from worldstate.adapters.audio.sound_file import SoundInput
     from worldstate.adapters.files.odometry_file import OdometryLog
     from worldstate.adapters.live.live_sound import LiveSound
 
@@ -170,7 +170,7 @@ def listen_with_progress(
     on_hop: "Callable[[adapters.Step], None]" = lambda step: None,
 ) -> "operations.RecordingReport":
     """Listen to `source` to its end while a bar on standard error counts seconds of audio."""
-    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.adapters.audio.sound_file import open_sound
 
     hops = None
     if not isinstance(source.sound, adapters.RawPcm):

@@ -12,7 +12,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from .inputs import add_array_options, given_array
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import SoundInput
+    from worldstate.adapters.audio.sound_file import SoundInput
     from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 

@@ -84,7 +84,7 @@ def _windows(
 ) -> "list[tuple[object, ...]]":
     import numpy as np
 
-    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.operations.labelling.label_files import window_rows
 
     with open_sound(source.sound) as audio:

@@ -102,7 +102,7 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     """Return the passes of a recording."""
     from dataclasses import replace
 
-    from worldstate.adapters.audio.open_sound import as_sound, open_sound
+    from worldstate.adapters.audio.sound_file import as_sound, open_sound
     from worldstate.operations.labelling.street_passes import heard_street, watched_recording
 
     model = adapters.read_model(arguments.model)
