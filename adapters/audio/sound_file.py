@@ -1,5 +1,6 @@
 """Recordings, read in blocks and checked when they are opened: one file, a file a microphone, a pipe."""
 
+import io
 import os
 import struct
 from abc import ABC, abstractmethod
@@ -136,10 +137,7 @@ class AudioSource(Audio):
             raise InvalidArgumentError(f"frames: expected at least 1, got {frames}")
         self._seek(0)
         for start in range(0, self.frames, frames):
-            block = self._read(min(frames, self.frames - start))
-            if self._floating:
-                check_finite(self.path, block, start)
-            yield block
+            yield self._read(start, min(frames, self.frames - start))
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
@@ -148,10 +146,7 @@ class AudioSource(Audio):
     def span(self, start: int, frames: int) -> Float32Array:
         """Return so many samples from one on, shape (frames, M)."""
         self._seek(start)
-        block = self._read(frames)
-        if self._floating:
-            check_finite(self.path, block, start)
-        return block
+        return self._read(start, frames)
 
     def _seek(self, frame: int) -> None:
         if self._file.closed:
@@ -161,13 +156,15 @@ class AudioSource(Audio):
         except soundfile.SoundFileError as error:
             raise _cut_short(self.path, self.frames) from error
 
-    def _read(self, frames: int) -> Float32Array:
+    def _read(self, start: int, frames: int) -> Float32Array:
         try:
             block: Float32Array = self._file.read(frames, dtype="float32", always_2d=True)
         except soundfile.SoundFileError as error:
             raise _cut_short(self.path, self.frames) from error
         if len(block) < frames:
             raise _cut_short(self.path, self.frames)
+        if self._floating:
+            check_finite(self.path, block, start)
         return block
 
 
@@ -282,52 +279,39 @@ def data_size(path: Path) -> tuple[int, int] | None:
     with path.open("rb") as file:
         magic = file.read(16)
         if magic[:4] in (b"RIFF", b"RF64") and magic[8:12] == b"WAVE":
-            file.seek(12)
-            return _riff_data(file)
+            return _data_chunk(file, 12, struct.Struct("<4sI"), counted=0, padded=2)
         if magic == W64_RIFF:
-            file.seek(40)
-            return _w64_data(file)
+            return _data_chunk(file, 40, struct.Struct("<4s12xQ"), counted=24, padded=8)
     return None
 
 
-def _remaining(file: BinaryIO) -> int:
-    return os.fstat(file.fileno()).st_size - file.tell()
-
-
-def _riff_data(file: BinaryIO) -> tuple[int, int] | None:
+def _data_chunk(
+    file: BinaryIO, first: int, header: struct.Struct, counted: int, padded: int
+) -> tuple[int, int] | None:
+    """Find the samples among chunks, of whose header the size counts some bytes, padded to a multiple."""
     wide_size: int | None = None
+    file.seek(first)
     for _ in range(MAX_CHUNKS):
-        header = file.read(8)
-        if len(header) < 8:
+        if len(head := file.read(header.size)) < header.size:
             return None
-        name, size = struct.unpack("<4sI", header)
+        name, size = header.unpack(head)
+        size -= counted
+        there = os.fstat(file.fileno()).st_size - file.tell()
         if name == b"data":
             declared = wide_size if size == UNKNOWN_SIZE else size
-            return None if declared is None else (declared, _remaining(file))
+            return None if declared is None else (declared, there)
         if name == b"ds64":
             ds64 = file.read(16)
             wide_size = struct.unpack("<8xQ", ds64)[0] if len(ds64) == 16 else None
             file.seek(-len(ds64), os.SEEK_CUR)
-        file.seek(size + size % 2, os.SEEK_CUR)
-    return None
-
-
-def _w64_data(file: BinaryIO) -> tuple[int, int] | None:
-    for _ in range(MAX_CHUNKS):
-        header = file.read(24)
-        if len(header) < 24:
+        if not 0 <= size <= there:
             return None
-        name, size = struct.unpack("<4s12xQ", header)
-        if name == b"data":
-            return size - 24, _remaining(file)
-        if not 24 <= size <= _remaining(file) + 24:
-            return None
-        file.seek(size - 24 + -size % 8, os.SEEK_CUR)
+        file.seek(size + -size % padded, os.SEEK_CUR)
     return None
 
 
 Encoding = Literal["s16", "s24", "s32", "f32"]
-BYTES: dict[Encoding, int] = {"s16": 2, "s24": 3, "s32": 4, "f32": 4}
+SUBTYPES: dict[Encoding, str] = {"s16": "PCM_16", "s24": "PCM_24", "s32": "PCM_32", "f32": "FLOAT"}
 MAX_CHANNELS = 1024
 
 
@@ -389,8 +373,9 @@ class RawPcm(SoundStream):
     def __post_init__(self) -> None:
         in_range("sample_rate_hz", self.sample_rate_hz, 1, 10_000_000)
         in_range("channels", self.channels, 1, MAX_CHANNELS)
-        if self.encoding not in BYTES:
-            raise InvalidArgumentError(f"encoding: expected one of {', '.join(BYTES)}, got {self.encoding!r}")
+        if self.encoding not in SUBTYPES:
+            known = ", ".join(SUBTYPES)
+            raise InvalidArgumentError(f"encoding: expected one of {known}, got {self.encoding!r}")
 
     def open(self) -> "RawAudio":
         """Read its first second."""
@@ -399,21 +384,14 @@ class RawPcm(SoundStream):
     @property
     def frame_bytes(self) -> int:
         """Bytes of one sample of all channels."""
-        return BYTES[self.encoding] * self.channels
+        return int(self.encoding[1:]) // 8 * self.channels
 
     def to_samples(self, data: bytes) -> Float32Array:
         """Return samples of full scale 1, shape (n, channels)."""
-        if self.encoding == "f32":
-            flat = np.frombuffer(data, "<f4")
-        elif self.encoding == "s24":
-            # The three bytes become the upper ones of four.
-            wide = np.zeros((len(data) // 3, 4), np.uint8)
-            wide[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
-            flat = wide.view("<i4").ravel() * np.float32(2.0**-31)
-        else:
-            bits = 8 * BYTES[self.encoding]
-            flat = np.frombuffer(data, f"<i{bits // 8}") * np.float32(2.0 ** (1 - bits))
-        return flat.astype(np.float32, copy=False).reshape(-1, self.channels)
+        raw = {"format": "RAW", "subtype": SUBTYPES[self.encoding], "endian": "LITTLE"}
+        about = {"samplerate": self.sample_rate_hz, "channels": self.channels, "always_2d": True}
+        samples: Float32Array = soundfile.read(io.BytesIO(data), dtype="float32", **raw, **about)[0]
+        return samples
 
 
 # An open recording is one whose samples come from elsewhere, such as microphones that run.

@@ -1,6 +1,5 @@
 """The sensors of a vehicle in one file: its array, its cameras and what they reported, odometry, model."""
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -56,9 +55,11 @@ class Mounting:
     @property
     def rotation(self) -> FloatArray:
         """From the sensor's axes to those of `base_link`, shape (3, 3)."""
-        yaw, pitch, roll = (math.radians(one) for one in (self.yaw_deg, self.pitch_deg, self.roll_deg))
-        about_z, upwards, about_x = _turn(0, 1, yaw), _turn(0, 2, pitch), _turn(1, 2, roll)
-        return np.asarray(about_z @ upwards @ about_x)
+        # Imported where it is used: most commands read no car file.
+        from scipy.spatial.transform import Rotation
+
+        angles_deg = self.yaw_deg, -self.pitch_deg, self.roll_deg
+        return np.asarray(Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix())
 
     def applied(self, points_m: ArrayLike) -> FloatArray:
         """Return points of the sensor, shape (n, 3), in `base_link`."""
@@ -306,14 +307,6 @@ class _CarFile:
             measurements={name: folder / file for name, file in self.measurements.items()},
             crossing_m=in_range("car.crossing_m", self.crossing_m, 1.0, 100.0),
         )
-
-
-def _turn(first: int, second: int, angle_rad: float) -> FloatArray:
-    """Return the rotation of one axis towards another."""
-    turn, cosine, sine = np.eye(3), math.cos(angle_rad), math.sin(angle_rad)
-    turn[[first, second], [first, second]] = cosine
-    turn[first, second], turn[second, first] = -sine, sine
-    return turn
 
 
 def _beside(folder: Path, file: str | None) -> Path | None:
