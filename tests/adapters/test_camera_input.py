@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.camera.box_linking import count_boxes
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, count_boxes
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME

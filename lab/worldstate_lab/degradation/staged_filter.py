@@ -14,9 +14,14 @@ import numpy as np
 
 from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.adapters.acoustic import asked_again
-from worldstate.adapters.camera.box_linking import kept_and_parked, overlaps
+from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.camera_health import DegradationLog
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import (
+    DetectionFilter,
+    DetectionFrame,
+    DetectionLog,
+    kept_and_parked,
+)
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import MAX_IMAGE_AGE_S, VisionQuery

@@ -13,7 +13,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings
 from worldstate.adapters.acoustic import Grounding, observe
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
-from worldstate.adapters.camera.box_linking import kept_and_parked
+from worldstate.adapters.camera.detections import kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.adapters.files.array_match import TRAIN

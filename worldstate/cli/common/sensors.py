@@ -195,7 +195,7 @@ def camera_source(
 
 def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
     """Say how many boxes count and why the others do not; None without a camera."""
-    from worldstate.adapters.camera.box_linking import COUNTS_TOLD, count_boxes
+    from worldstate.adapters.camera.detections import COUNTS_TOLD, count_boxes
 
     if source.detections is None:
         return None
