@@ -22,8 +22,7 @@ from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
-from worldstate.adapters.datasets.array_choice import choose_array
-from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.datasets.ovad import Recording, choose_array
 from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, heard_with, states_budget
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint

@@ -8,7 +8,7 @@ from pathlib import Path
 from worldstate.adapters.export.log_messages import read_snapshot_lines
 from worldstate.adapters.files.file_io import line_writer, refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
-from worldstate.adapters.ros.state_bag import bag_snapshot_lines
+from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.serialisation import MOST_CHARACTERS, decode_json
 from worldstate.state import WorldState

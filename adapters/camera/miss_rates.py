@@ -14,8 +14,7 @@ from worldstate.adapters.files.file_io import read_record, write_json
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.serialisation import ADDED, Layout, encode
 
-from .camera_health import CameraHealth, Health
-from .degradation import LEVELS
+from .camera_health import LEVELS, CameraHealth, Health
 
 # Far more than there are kinds of degradation; a bound for files from elsewhere.
 MOST_FAMILIES = 100

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -14,7 +15,6 @@ import numpy as np
 
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
 from worldstate.adapters.files.file_io import atomic_path
-from worldstate.adapters.files.json_schema import json_schema
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
@@ -71,8 +71,10 @@ class LogMessage:
     @property
     def schema(self) -> bytes:
         """JSON Schema of the message."""
-        kind = type(self.value)
-        return json.dumps(snapshot_schema() if kind is WorldState else json_schema(kind)).encode()
+        if isinstance(self.value, WorldState):
+            return json.dumps(snapshot_schema()).encode()
+        shipped = files("worldstate") / "data" / f"{self.schema_name}.schema.json"
+        return json.dumps(json.loads(shipped.read_text("utf-8"))).encode()
 
 
 LogSink: TypeAlias = Callable[[LogMessage], None]

@@ -1,4 +1,8 @@
-"""Files: text, JSON of one dataclass and rows of CSV read within bounds; written whole or not at all."""
+"""Files: text, JSON of one dataclass and rows of CSV read within bounds; written whole or not at all.
+
+A reader never meets half a file, and a run that fails leaves nothing behind. A link is followed: what it
+points to is replaced, and the link stays. Devices, pipes and folders are never replaced.
+"""
 
 import csv
 import io

@@ -2,11 +2,12 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import soundfile
@@ -17,7 +18,87 @@ from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateEr
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array
 
-from .bounded_channel import BoundedChannel
+T = TypeVar("T")
+
+
+class BoundedChannel(Generic[T]):
+    """Queue of limited length between two threads.
+
+    A sensor cannot wait: when nobody takes what it gives, the oldest item makes room for the newest, because
+    the state is about now. Every item lost is counted.
+
+    Parameters
+    ----------
+    capacity : int
+        Largest number of items that wait, >= 1.
+
+    Attributes
+    ----------
+    dropped : int
+        Items that were lost because nobody took them in time.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the capacity is below one.
+
+    Examples
+    --------
+    >>> channel = BoundedChannel(2)
+    >>> for number in range(5):
+    ...     channel.put(number)
+    >>> channel.take_all(), channel.dropped
+    ([3, 4], 3)
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = int(in_range("capacity", capacity, 1, 1 << 20))
+        self._items: deque[T] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._error: BaseException | None = None
+        self.dropped = 0
+
+    def put(self, item: T) -> None:
+        """Hand an item over; never waits. After the end nothing is taken any more."""
+        with self._changed:
+            if self._closed:
+                return
+            if len(self._items) == self._capacity:
+                self._items.popleft()
+                self.dropped += 1
+            self._items.append(item)
+            self._changed.notify()
+
+    def take(self) -> T | None:
+        """Wait for the oldest item and return it; None once the channel is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._items or self._closed)
+            if self._items:
+                return self._items.popleft()
+            self._raise_failure()
+            return None
+
+    def take_all(self) -> list[T]:
+        """Return all that waits, the oldest first, without waiting."""
+        with self._changed:
+            taken = list(self._items)
+            self._items.clear()
+            if not taken:
+                self._raise_failure()
+            return taken
+
+    def close(self, error: BaseException | None = None) -> None:
+        """Say that nothing more comes; an error is raised at whoever takes, once nothing waits."""
+        with self._changed:
+            self._closed = True
+            self._error = self._error or error
+            self._changed.notify_all()
+
+    def _raise_failure(self) -> None:
+        if self._error is not None:
+            raise self._error
+
 
 # Blocks a second that a source gives. The state of a hop that ends within one waits for its end: at most
 # 25 ms, and not at all where hops are whole blocks, as at 48 kHz.

@@ -53,8 +53,7 @@ from worldstate.abduction.absence import default_miss_rates
 from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.camera.camera_channel import watched
-from worldstate.adapters.camera.camera_health import learn_health
-from worldstate.adapters.camera.degradation import degrade
+from worldstate.adapters.camera.camera_health import degrade, learn_health
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.adapters.camera.motion_detector import MotionDetector

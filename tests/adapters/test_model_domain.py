@@ -13,8 +13,8 @@ from worldstate_lab.cli.main import main as study
 
 from conftest import Approach
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
+from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model

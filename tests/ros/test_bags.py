@@ -16,13 +16,12 @@ import soundfile
 from scripted_states import scripted_states
 
 from worldstate.adapters.audio.sound_file import open_sound
-from worldstate.adapters.export.lane_objects import autoware_objects
+from worldstate.adapters.export.other_stacks import autoware_objects
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.ros.bag_input import BagTopics, read_bag
-from worldstate.adapters.ros.bag_writer import bag_writer
+from worldstate.adapters.ros.bag_writer import bag_writer, state_bag
 from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
-from worldstate.adapters.ros.state_bag import state_bag
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
 from worldstate.measurement.odometry import Odometry

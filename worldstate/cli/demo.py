@@ -2,6 +2,8 @@
 
 Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
 before any camera can see it. Leaves timeline.png, states.jsonl and summary.json in the output folder.
+
+example: worldstate demo --out out/demo --seed 7
 """
 
 import argparse
@@ -18,8 +20,6 @@ if TYPE_CHECKING:
 
 # Louder than a car, so that the first recording that a newcomer sees is not a marginal one.
 VAN_OVER_CAR_DB = 6.0
-
-EXAMPLE = "example: worldstate demo --out out/demo --seed 7"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

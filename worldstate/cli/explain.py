@@ -6,6 +6,12 @@ the alarm goes by, then and when the advisory began; the entity; the sensors; wh
 
 Without --time all advisories are listed and the first one is explained, or the highest risk where there is
 none.
+
+Examples
+--------
+  worldstate explain states.jsonl
+  worldstate explain states.jsonl --time 5.2
+  worldstate explain out/demo/states.jsonl --time 5.2 --side left --json
 """
 
 import argparse
@@ -20,12 +26,6 @@ from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.state import WorldState
-
-EXAMPLE = """\
-examples:
-  worldstate explain states.jsonl
-  worldstate explain states.jsonl --time 5.2
-  worldstate explain out/demo/states.jsonl --time 5.2 --side left --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -19,6 +19,14 @@ the model of a moving ego is taken where --model names none.
 
 --save-state keeps belief and site at the end, --resume goes on from them: from the time at which they end, or
 by --start from a later one.
+
+Examples
+--------
+  worldstate live --array mics.csv --device 2 --model mine.json --out states.jsonl
+  worldstate live --array mics.csv --model mine.json --camera-device 0 --camera camera.json
+  worldstate live --array mics.csv --model mine.json --detections 127.0.0.1:9100
+  worldstate live --play ovad_dataset/SA1/left/1_00_0002
+  worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4
 """
 
 import argparse
@@ -43,13 +51,6 @@ if TYPE_CHECKING:
     HandIn = Callable[[Listener], None]
     Losses = Callable[[], dict[str, object]]
 
-EXAMPLE = """\
-examples:
-  worldstate live --array mics.csv --device 2 --model mine.json --out states.jsonl
-  worldstate live --array mics.csv --model mine.json --camera-device 0 --camera camera.json
-  worldstate live --array mics.csv --model mine.json --detections 127.0.0.1:9100
-  worldstate live --play ovad_dataset/SA1/left/1_00_0002
-  worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4"""
 
 # Lost sound is said at most so often.
 SAID_EVERY_NS = 1_000_000_000

@@ -13,6 +13,16 @@ that of detections with stamps, too).
 the corner that hides the arm (x ahead, y left of the ego) and the lane behind it, metres, or "open": true of
 an arm that hides nothing; optional "speed_mps" and "corner_std_m" of an arm, "rates", "priors",
 "ego_speed_mps", "site", "view_half_angle_deg". With --odometry corners move as the ego does.
+
+Examples
+--------
+  worldstate run some.wav --array mics.csv --detections d.json --camera camera.json --out states.jsonl
+  worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png
+  worldstate run ovad_dataset/SB1/left/2_00_0005 --context elm_street.json
+  worldstate run second.wav --resume state.json --start 60 --save-state state2.json
+  worldstate run drive.wav --car car.json --ego-noise
+  worldstate run ovad_dataset/SA1/left/1_00_0002 --export mcap=out.mcap
+  worldstate run street_bag --export rosbag=states_bag
 """
 
 import argparse
@@ -29,15 +39,6 @@ if TYPE_CHECKING:
 
     Seen = Path | adapters.DetectionLog | None
 
-EXAMPLE = """\
-examples:
-  worldstate run some.wav --array mics.csv --detections d.json --camera camera.json --out states.jsonl
-  worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png
-  worldstate run ovad_dataset/SB1/left/2_00_0005 --context elm_street.json
-  worldstate run second.wav --resume state.json --start 60 --save-state state2.json
-  worldstate run drive.wav --car car.json --ego-noise
-  worldstate run ovad_dataset/SA1/left/1_00_0002 --export mcap=out.mcap
-  worldstate run street_bag --export rosbag=states_bag"""
 # What a first user needs.
 FIRST_OPTIONS = (
     *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--detections", "--camera"),

@@ -1,4 +1,4 @@
-"""Entry point of `worldstate-lab`: one module per study, each with `EXAMPLE`, `add_options` and `run`."""
+"""Entry point of `worldstate-lab`: one module per study, as those of `worldstate`."""
 
 import argparse
 import json

@@ -25,6 +25,11 @@ same for every method.
 
 With --model a finished model is evaluated instead; it is refused where it was trained on these recordings.
 Keys that end in _absent are of eq. (6) with the visible explanation removed.
+
+Examples
+--------
+  worldstate-lab windows features.csv --group static --protocol lojo --json
+  worldstate-lab windows features.csv --model model.json --only testset.csv
 """
 
 import argparse
@@ -314,11 +319,6 @@ def draw_figures(
 Report = dict[str, Any]
 # What fits a line of the table; the JSON object has the gains of all figures.
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
-
-EXAMPLE = """\
-examples:
-  worldstate-lab windows features.csv --group static --protocol lojo --json
-  worldstate-lab windows features.csv --model model.json --only testset.csv"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

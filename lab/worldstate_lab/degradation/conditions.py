@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from worldstate.adapters.audio.sound_file import Audio, RawPcm, open_sound
-from worldstate.adapters.camera.degradation import (
+from worldstate.adapters.camera.camera_health import (
     LEVELS,
     QUANTILES,
     Family,

@@ -7,6 +7,11 @@ apart.
 Each interval is a bootstrap over the vehicles, and does not hold what all vehicles share: where a vehicle is
 heard, taken as a third of its length behind the front (a tenth more or less is 0.1 s of offset), and 10 m for
 the way of the sound (3 ms a metre).
+
+Examples
+--------
+  worldstate array align drives/* --car car.json --camera front --out aligned.json
+  worldstate array align ovad_dataset --json
 """
 
 import argparse
@@ -14,11 +19,6 @@ from pathlib import Path
 
 from worldstate.cli.common import inputs, output, progress, sensors
 from worldstate.ground.errors import InvalidArgumentError
-
-EXAMPLE = """\
-examples:
-  worldstate array align drives/* --car car.json --camera front --out aligned.json
-  worldstate array align ovad_dataset --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

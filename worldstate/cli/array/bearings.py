@@ -6,17 +6,17 @@ Write the bearing of the loudest source every tenth of a second, for any array, 
 positive), std_deg (standard deviation as the front-end states it) and prominence (peak over median of the
 spatial spectrum; 1 in silence). --sources adds the number of plane waves in each second by an information
 criterion: reflections count, so it is no number of vehicles.
+
+Examples
+--------
+  worldstate array bearings some.wav --array mics.csv --out bearings.csv --figure bearings.png
+  worldstate array bearings mic1.wav mic2.wav --array pair.json --azimuth-span 360 --out bearings.csv
 """
 
 import argparse
 from pathlib import Path
 
 from worldstate.cli.common import inputs, output, progress
-
-EXAMPLE = """\
-examples:
-  worldstate array bearings some.wav --array mics.csv --out bearings.csv --figure bearings.png
-  worldstate array bearings mic1.wav mic2.wav --array pair.json --azimuth-span 360 --out bearings.csv"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

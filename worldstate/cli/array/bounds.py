@@ -3,6 +3,11 @@
 Print the second moment S_xx, aperture and alias frequency of an array, and the Cramer-Rao bound of a bearing
 at several azimuths: the standard deviation that no unbiased estimator can beat. The SNR is per microphone and
 snapshot, N snapshots independent.
+
+Examples
+--------
+  worldstate array bounds
+  worldstate array bounds --array mics.xml --frequency 800 --snr-db 0 10 20
 """
 
 import argparse
@@ -13,11 +18,6 @@ from worldstate.cli.common import inputs, output
 AZIMUTHS_DEG = (0.0, 20.0, 40.0, 60.0, 80.0)
 # From below the threshold SNR, where estimators fail, to well above it.
 SNR_DB = (-15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
-
-EXAMPLE = """\
-examples:
-  worldstate array bounds
-  worldstate array bounds --array mics.xml --frequency 800 --snr-db 0 10 20"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

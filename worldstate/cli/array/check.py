@@ -7,6 +7,11 @@ samples, the sample rate. Channels are counted from 1.
 Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
 and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
 ten for small ones; levels and gusts take six seconds, drifts twenty.
+
+Examples
+--------
+  worldstate array check some.wav --array mics.xml
+  worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json
 """
 
 import argparse
@@ -19,11 +24,6 @@ from worldstate.cli.common import inputs, output, progress
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
     from worldstate.operations.recordings.channel_report import RecordingHealth
-
-EXAMPLE = """\
-examples:
-  worldstate array check some.wav --array mics.xml
-  worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

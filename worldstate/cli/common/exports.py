@@ -126,14 +126,14 @@ def _websocket(port: str, paced: bool) -> "Iterator[LogSink]":
 
 
 def _stack(name: str, target: str, crossing_m: float) -> "Stack":
-    from worldstate.adapters.export import lane_objects, odas
+    from worldstate.adapters.export import other_stacks
     from worldstate.adapters.own_parts import ExporterPart, load_part
-    from worldstate.adapters.ros.state_bag import state_bag
+    from worldstate.adapters.ros.bag_writer import state_bag
 
     own: dict[str, ExporterPart] = {
-        "osi": lambda path: lane_objects.osi_trace(Path(path), crossing_m),
-        "autoware": lambda path: lane_objects.autoware_lines(Path(path), crossing_m),
-        "odas": odas.odas_socket,
+        "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m),
+        "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m),
+        "odas": other_stacks.odas_socket,
         "rosbag": lambda path: state_bag(Path(path), crossing_m),
         "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),
     }

@@ -120,7 +120,7 @@ def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
 def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, frontend.MicrophoneArray]":
     """Return what INPUT and --array name, or the array that belongs to the sound."""
     from worldstate.adapters.audio.sound_file import path_of
-    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.datasets.ovad import choose_array
     from worldstate.adapters.ros.bag_input import needed_array, read_sound
 
     bag = bag_of(arguments)

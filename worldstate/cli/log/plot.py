@@ -3,6 +3,13 @@
 Draw what the filter believed: over time (--out), from above at one time (--birds-eye with --time), and from
 above as an animation (--animate). With --recording the power of its sound lies below the azimuths, so that
 belief and sound are seen together.
+
+Examples
+--------
+  worldstate log plot states.jsonl --out states.png
+  worldstate log plot out.mcap --out states.png --recording some.wav --array mics.csv
+  worldstate log plot states.jsonl --birds-eye above.png --time 5.2
+  worldstate log plot states.jsonl --animate above.gif
 """
 
 import argparse
@@ -15,13 +22,6 @@ from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.operations.viewing.state_figure import SoundPower
-
-EXAMPLE = """\
-examples:
-  worldstate log plot states.jsonl --out states.png
-  worldstate log plot out.mcap --out states.png --recording some.wav --array mics.csv
-  worldstate log plot states.jsonl --birds-eye above.png --time 5.2
-  worldstate log plot states.jsonl --animate above.gif"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

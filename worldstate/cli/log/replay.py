@@ -2,6 +2,14 @@
 
 Read the snapshots of an MCAP file, of a bag of ROS 2 or of JSON lines, and write or serve them anew. --out of
 an MCAP file or a bag that `worldstate run` wrote holds the same bytes as the --out of that run.
+
+Examples
+--------
+  worldstate log replay out.mcap --out states.jsonl
+  worldstate log replay states.jsonl --export mcap=out.mcap
+  worldstate log replay states.jsonl --export foxglove
+  worldstate log replay states.jsonl --export osi=out.osi --export autoware=objects.jsonl
+  worldstate log replay states.jsonl --export odas=127.0.0.1:9000
 """
 
 import argparse
@@ -9,14 +17,6 @@ from pathlib import Path
 
 from worldstate import ground
 from worldstate.cli.common import exports, output, progress
-
-EXAMPLE = """\
-examples:
-  worldstate log replay out.mcap --out states.jsonl
-  worldstate log replay states.jsonl --export mcap=out.mcap
-  worldstate log replay states.jsonl --export foxglove
-  worldstate log replay states.jsonl --export osi=out.osi --export autoware=objects.jsonl
-  worldstate log replay states.jsonl --export odas=127.0.0.1:9000"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

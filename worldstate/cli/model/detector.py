@@ -1,4 +1,4 @@
-"""`worldstate model detector`: the miss rate of a camera's detector on staged-degraded frames.
+r"""`worldstate model detector`: the miss rate of a camera's detector on staged-degraded frames.
 
 Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
 blur, darkness, sensor noise and the three together are staged on clean video, four levels each, and a
@@ -10,6 +10,12 @@ YOLO text. Without any, what the detector itself reports on clean frames is the 
 on those is zero by definition.
 
 The file also holds the scale by which d is read from this camera's own images.
+
+Examples
+--------
+  worldstate model detector sim --detector motion --out beta.json --figure beta.png
+  worldstate model detector street.mp4 --reference boxes.json --detector m.onnx \
+      --labels person bicycle car --out beta.json
 """
 
 import argparse
@@ -21,12 +27,6 @@ from worldstate.cli.common import output, progress, sensors
 
 if TYPE_CHECKING:
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, MakeDetector
-
-EXAMPLE = """\
-examples:
-  worldstate model detector sim --detector motion --out beta.json --figure beta.png
-  worldstate model detector street.mp4 --reference boxes.json --detector m.onnx \\
-      --labels person bicycle car --out beta.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,12 @@ looked for.
 
 Without --labels, DATASET is in the OVAD layout and DataLog.csv says what is in it: windows of left, right and
 none end at T0, 0.5 s later where the ego moves, front windows 1.5 s after that.
+
+Examples
+--------
+  worldstate sim make --out sim --static 40 && worldstate model features sim --out features.csv
+  worldstate model features recordings --labels labels.csv --array mics.xml --out features.csv
+  worldstate model fit features.csv --out model.json
 """
 
 import argparse
@@ -21,12 +27,6 @@ from worldstate.ground.errors import InputFileError
 
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_extraction import LabelledWindow
-
-EXAMPLE = """\
-examples:
-  worldstate sim make --out sim --static 40 && worldstate model features sim --out features.csv
-  worldstate model features recordings --labels labels.csv --array mics.xml --out features.csv
-  worldstate model fit features.csv --out model.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -43,8 +43,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.feature_extraction import feature_table
+    from worldstate.adapters.datasets.ovad import choose_array
     from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, FEATURE_VERSION
 
     output.check_outputs(arguments, "out")

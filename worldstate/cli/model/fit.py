@@ -8,6 +8,11 @@ released one, counts as OVAD's unless --array and --sample-rate say otherwise.
 The classifier is a mirror-symmetric ensemble on windows compared with their site, for unseen junctions, its
 thresholds half-way between recordings left out and junctions left out. With --simulated it learns simulated
 windows too, with --streams the classes both and direct as well: for a standing ego.
+
+Examples
+--------
+  worldstate model fit features.csv --group static --exclude testset.csv --out model.json
+  worldstate model fit features.csv --labels recordings/labels.csv --out model.json
 """
 
 import argparse
@@ -20,10 +25,6 @@ from worldstate.cli.common import command, output, progress
 if TYPE_CHECKING:
     from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 
-EXAMPLE = """\
-examples:
-  worldstate model fit features.csv --group static --exclude testset.csv --out model.json
-  worldstate model fit features.csv --labels recordings/labels.csv --out model.json"""
 
 NEEDS = ("sklearn",)
 

@@ -6,6 +6,14 @@ detected, lead, alarms an hour, both sides, times to visible. Usable before any 
 
 Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes on
 there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
+
+Examples
+--------
+  worldstate model make --array mics.csv --out my_model.json --streams streams --jobs 2
+  worldstate model make --array mics.csv --out my_model.json --streams streams --quiet night.wav
+  worldstate model make --array mics.csv --out my_model.json --streams streams --mounting-errors
+  worldstate model make --array mics.csv --out moving.json --streams streams --ego moving --jobs 2
+  worldstate model make --array mics.csv --out try.json --quick
 """
 
 import argparse
@@ -21,13 +29,6 @@ if TYPE_CHECKING:
 
 # Alarms an hour by what the ego does: its own noise leaves less to be heard of others.
 ONSETS = {"standing": 30.0, "moving": 60.0}
-EXAMPLE = """\
-examples:
-  worldstate model make --array mics.csv --out my_model.json --streams streams --jobs 2
-  worldstate model make --array mics.csv --out my_model.json --streams streams --quiet night.wav
-  worldstate model make --array mics.csv --out my_model.json --streams streams --mounting-errors
-  worldstate model make --array mics.csv --out moving.json --streams streams --ego moving --jobs 2
-  worldstate model make --array mics.csv --out try.json --quick"""
 
 NEEDS = ("sklearn",)
 

@@ -2,6 +2,11 @@
 
 Say what a model was made of and made for: data, recordings, array, sample rates, band, feature, ego's motion,
 thresholds, limits, licence.
+
+Examples
+--------
+  worldstate model
+  worldstate model my_model.json --json
 """
 
 import argparse
@@ -9,11 +14,6 @@ from pathlib import Path
 
 from worldstate import adapters
 from worldstate.cli.common import output
-
-EXAMPLE = """\
-examples:
-  worldstate model
-  worldstate model my_model.json --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

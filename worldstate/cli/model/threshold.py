@@ -7,6 +7,11 @@ that --save-streams wrote with the same signature. Recordings labelled none and 
 hazard-free. Approaches with a T0, where there are some, give the risk map (Platt for few, isotonic for many);
 without them the model's own is kept. A budget that the hours do not suffice for is warned about, with the
 hours that it would take.
+
+Examples
+--------
+  worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
+  worldstate model threshold my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json
 """
 
 import argparse
@@ -15,11 +20,6 @@ from pathlib import Path
 
 from worldstate import adapters, operations
 from worldstate.cli.common import command, inputs, listening, output
-
-EXAMPLE = """\
-examples:
-  worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
-  worldstate model threshold my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json"""
 
 NEEDS = ("sklearn",)
 

@@ -25,6 +25,13 @@ sound, array.xml, camera results, truth.json, events.json (an entry a vehicle), 
 and tenth of a second: position, speed, in view, time to visible, loudness at the array) and stream.png.
 --traffic no-hazard is busy, but nothing comes out of a hidden arm: whatever warns there is wrong.
 --sounds come twelve times an hour each; a tenth of the vehicles has each signal of them.
+
+Examples
+--------
+  worldstate sim make --out sim --static 4 --seed 1
+  worldstate sim make --out sim --dynamic 10 --kind electric --jobs 2
+  worldstate sim make --out hours --minutes 60 --site SA1 --traffic busy --bandwidth 2000 --jobs 2
+  worldstate run sim/SA1/left/1_00_0000
 """
 
 import argparse
@@ -42,13 +49,6 @@ JUNCTION = "junction"  # the scene where none is named
 FIGURE_NAME = "stream.png"
 PER_HOUR = 12.0  # of every kind of --sounds in a stream that is no vehicle's
 SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds
-
-EXAMPLE = """\
-examples:
-  worldstate sim make --out sim --static 4 --seed 1
-  worldstate sim make --out sim --dynamic 10 --kind electric --jobs 2
-  worldstate sim make --out hours --minutes 60 --site SA1 --traffic busy --bandwidth 2000 --jobs 2
-  worldstate run sim/SA1/left/1_00_0000"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

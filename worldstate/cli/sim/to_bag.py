@@ -2,6 +2,11 @@
 
 Write sound, array, detections and the speed of the ego, where it is known, as messages. It shows what a bag
 has to look like for `worldstate run BAG`, and which topics; the definitions are in the documentation.
+
+Examples
+--------
+  worldstate sim to-bag ovad_dataset/SA1/left/1_00_0002 street_bag
+  worldstate sim to-bag out/demo/recording/SB1/right/3_02_0000 street_bag --ros-storage sqlite3
 """
 
 import argparse
@@ -9,11 +14,6 @@ from pathlib import Path
 
 from worldstate import adapters, ground
 from worldstate.cli.common import command, inputs, output, progress
-
-EXAMPLE = """\
-examples:
-  worldstate sim to-bag ovad_dataset/SA1/left/1_00_0002 street_bag
-  worldstate sim to-bag out/demo/recording/SB1/right/3_02_0000 street_bag --ros-storage sqlite3"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it wrote."""
-    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.datasets.ovad import choose_array
     from worldstate.adapters.ros.bag_writer import check_bag_target, odometry_of, write_bag
 
     check_bag_target(arguments.out)

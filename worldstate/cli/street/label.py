@@ -7,6 +7,12 @@ standard deviation. For a standing ego.
 --out is JSON in the layout of ASAM OpenLABEL. --windows is a list of labelled seconds, which
 `model features --labels` and `model fit --labels` read: recordings of one's own become training data without
 marking by hand. It lies in the recording's folder or above it.
+
+Examples
+--------
+  worldstate street label street.wav --detections boxes.json --camera camera.json --out labels.json
+  worldstate street label ovad_dataset/SA1/left/1_00_0002 --out labels.json --windows ovad_dataset/labels.csv
+  worldstate model fit features.csv --labels ovad_dataset/labels.csv --out model.json
 """
 
 import argparse
@@ -21,12 +27,6 @@ if TYPE_CHECKING:
 
     from worldstate.operations.labelling.box_tracks import BoxTrack
     from worldstate.operations.labelling.pass_labels import PassLabel
-
-EXAMPLE = """\
-examples:
-  worldstate street label street.wav --detections boxes.json --camera camera.json --out labels.json
-  worldstate street label ovad_dataset/SA1/left/1_00_0002 --out labels.json --windows ovad_dataset/labels.csv
-  worldstate model fit features.csv --labels ovad_dataset/labels.csv --out model.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,13 @@ street that was learned before. `worldstate run --street` takes what --out write
 
 An edge that vehicles no longer come out of is learned anew after two or three of them; what was learned
 long ago is forgotten slowly.
+
+Examples
+--------
+  worldstate street learn monday.wav --array mics.csv --detections boxes.json --out street.json
+  worldstate street learn ovad_dataset/SB1/left/* --out street.json --figure street.png
+  worldstate street learn tuesday.wav --detections boxes.json --known street.json --days 1 --out street.json
+  worldstate run ovad_dataset/SB1/left/2_00_0005 --street street.json
 """
 
 import argparse
@@ -24,12 +31,6 @@ if TYPE_CHECKING:
     from worldstate.operations.labelling.street_passes import WatchedRecording
     from worldstate.smoothing.learned_street import LearnedArm, LearnedStreet
 
-EXAMPLE = """\
-examples:
-  worldstate street learn monday.wav --array mics.csv --detections boxes.json --out street.json
-  worldstate street learn ovad_dataset/SB1/left/* --out street.json --figure street.png
-  worldstate street learn tuesday.wav --detections boxes.json --known street.json --days 1 --out street.json
-  worldstate run ovad_dataset/SB1/left/2_00_0005 --street street.json"""
 # Drawn beside what all passes tell.
 STAGES = (1, 3, 10)
 

@@ -7,8 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.camera.box_linking import overlaps
-from worldstate.adapters.camera.camera_health import CameraHealth, learn_health
-from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, Family, degrade
+from worldstate.adapters.camera.camera_health import (
+    FAMILIES,
+    LEVELS,
+    CameraHealth,
+    Family,
+    degrade,
+    learn_health,
+)
 from worldstate.adapters.camera.detections import (
     DetectionFilter,
     DetectionFrame,
