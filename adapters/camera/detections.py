@@ -295,13 +295,9 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionL
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
         raise InputFileError(name, problem)
-    frames: list[DetectionFrame] = []
-    stamps: list[int | None] = []
     with refused_as_file(name):
-        for number, row in enumerate(rows):
-            read = decode(_OvadFrame, row, f"frame {number}")
-            frames.append(read.frame())
-            stamps.append(read.stamp_ns)
+        read = [decode(_OvadFrame, row, f"frame {number}") for number, row in enumerate(rows)]
+        frames, stamps = [one.frame() for one in read], [one.stamp_ns for one in read]
         if all(stamp is None for stamp in stamps):
             return DetectionLog.at_rate(frames, frame_rate_hz, source=str(name))
         if None in stamps:

@@ -134,9 +134,8 @@ class MissRates:
     @cached_property
     def table(self) -> MissRateTable:
         """Largest beta over the families at every d: absence is then never overrated."""
-        return self._table(
-            np.max([counts.miss_rates(self.repeats) for counts in self.families.values()], axis=0)
-        )
+        rates = [counts.miss_rates(self.repeats) for counts in self.families.values()]
+        return self._table(np.max(rates, axis=0))
 
     def level(self, health: Health) -> float:
         """Return the d at which `table` has, at boresight, the miss rate of the worst family.
@@ -162,9 +161,8 @@ class MissRates:
 
     def clutter_rate(self, degradation: float) -> float:
         """Return P(false detection in a query sector) at d, the largest over the families."""
-        return max(
-            float(np.interp(degradation, LEVELS, counts.clutter_rates)) for counts in self.families.values()
-        )
+        families = self.families.values()
+        return max(float(np.interp(degradation, LEVELS, one.clutter_rates)) for one in families)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values with the schema's name and version."""

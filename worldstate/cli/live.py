@@ -30,6 +30,7 @@ Examples
 """
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
@@ -240,6 +241,7 @@ def _listen(
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice = _loss_notices()
     start_s, last = ground.seconds(source.start_ns), None
+    longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
         states_writer(arguments.out) as write,
         exports.exported_hops(arguments, source, given.car.crossing_m, paced=False) as export,
@@ -254,10 +256,7 @@ def _listen(
             show(live)
             notice(live)
             last = live.step
-            if (
-                arguments.duration is not None
-                and ground.seconds(last.state.stamp_ns) - start_s >= arguments.duration
-            ):
+            if ground.seconds(last.state.stamp_ns) - start_s >= longest_s:
                 break
     if arguments.save_state is not None and last is not None:
         adapters.save_checkpoint(arguments.save_state, last.checkpoint)

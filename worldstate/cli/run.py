@@ -70,11 +70,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     output.check_outputs(arguments, "out", "save_state", figures=("figure",))
     given = listening.checked_sensors(arguments, arguments.input if inputs.bag_of(arguments) is None else [])
-    return _heard(arguments, given)
-
-
-def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> output.CommandResult:
-    """Listen to the recording; return what was found."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
     from worldstate.operations.viewing.state_figure import drawn_run
 

@@ -53,6 +53,8 @@ SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    from worldstate.simulation.stream.settings import TRAFFICS
+
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="D", help="folder of the data set")
     add("--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)")
@@ -70,12 +72,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--bandwidth", type=float, metavar="HZ", help=told)
     add("--video", action="store_true", help="render the camera's video, too")
     add("--video-width", type=int, default=1936, metavar="PX", help="of its images (default: 1936)")
-    _add_stream_options(parser)
-
-
-def _add_stream_options(parser: argparse.ArgumentParser) -> None:
-    from worldstate.simulation.stream.settings import TRAFFICS
-
     add = parser.add_argument_group("a continuous stream").add_argument
     add("--minutes", type=float, metavar="M", help="its length")
     # Any word is taken: the library refuses a moving ego with its reason.
@@ -143,7 +139,9 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
     from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
-    band = arguments.bandwidth
+    rate_hz, band = SAMPLE_RATE_HZ, arguments.bandwidth
+    if band is not None:
+        rate_hz = rate_for(ground.in_range("--bandwidth", band, *BANDWIDTHS_HZ))
     return StreamSettings(
         site=simulation.site(arguments.site),
         minutes=arguments.minutes,
@@ -154,27 +152,21 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
             signals=dict.fromkeys((kind for kind in arguments.sounds if kind in SIGNALS), SIGNAL_SHARE),
         ),
         preset=simulation.preset(arguments.preset),
-        sample_rate_hz=SAMPLE_RATE_HZ
-        if band is None
-        else rate_for(ground.in_range("--bandwidth", band, *BANDWIDTHS_HZ)),
+        sample_rate_hz=rate_hz,
     )
 
 
 def _settings(arguments: argparse.Namespace) -> "simulation.DatasetSettings":
 
     static = arguments.static
+    same = "seed", "scene", "kind", "video", "preset", "sounds"
     return simulation.DatasetSettings(
         n_static=(0 if arguments.dynamic else 4) if static is None else static,
         n_dynamic=arguments.dynamic,
-        seed=arguments.seed,
-        scene=arguments.scene,
-        kind=arguments.kind,
         duration_s=arguments.duration,
-        video=arguments.video,
         video_width_px=arguments.video_width,
-        preset=arguments.preset,
-        sounds=arguments.sounds,
         bandwidth_hz=arguments.bandwidth,
+        **{name: getattr(arguments, name) for name in same},
     )
 
 
