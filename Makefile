@@ -46,9 +46,9 @@ lint: $(VENV)/.test
 	MYPYPATH=lab $(BIN)/mypy -p worldstate_lab
 	$(BIN)/lint-imports
 
-# After a change of the snapshot's types.
+# After a change of the types of snapshots or scenes.
 schema: $(VENV)/.core
-	$(BIN)/python -c 'import json; from worldstate.adapters.files.json_schema import json_schema as s; from worldstate.state import WorldState; print(json.dumps(s(WorldState), indent=1))' > worldstate/data/snapshot.schema.json
+	$(BIN)/python docs/_ext/json_schema.py
 
 # Warnings are errors, and a page that would load something from the network is one too.
 $(VENV)/.docs: $(VENV)/bin/python pyproject.toml

@@ -1,8 +1,8 @@
 from .acoustic import AcousticAdapter as AcousticAdapter
 from .acoustic import AcousticSettings as AcousticSettings
 from .acoustic import Grounding as Grounding
-from .audio.open_sound import RawPcm as RawPcm
 from .audio.sound_file import AudioSource as AudioSource
+from .audio.sound_file import RawPcm as RawPcm
 from .audio.sound_file import open_audio as open_audio
 from .camera.detections import DetectionFilter as DetectionFilter
 from .camera.detections import DetectionFrame as DetectionFrame
@@ -40,4 +40,4 @@ from .listener import listen_steps as listen_steps
 from .listener import measure_steps as measure_steps
 from .source import ListenSettings as ListenSettings
 from .source import Source as Source
-from .source_files import open_source as open_source
+from .source import open_source as open_source

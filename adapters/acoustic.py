@@ -503,12 +503,8 @@ def observe(
     tone, lines = frame.tone, {}
     if not isinstance(tone, NotUsable):
         lines[LINE_SPACING] = Observable(tone.frequency_hz, tone.frequency_std_hz)
-    return GroundedObservation(
-        bearing_rad=bearing
-        if isinstance(bearing, NotUsable)
-        else Observable(bearing.azimuth_rad, bearing.std_rad),
-        inverse_tta_hz=approach
-        if isinstance(approach, NotUsable)
-        else Observable(approach.inverse_tta_hz, approach.std_hz),
-        signature=lines,
+    heard = bearing if isinstance(bearing, NotUsable) else Observable(bearing.azimuth_rad, bearing.std_rad)
+    near = (
+        approach if isinstance(approach, NotUsable) else Observable(approach.inverse_tta_hz, approach.std_hz)
     )
+    return GroundedObservation(bearing_rad=heard, inverse_tta_hz=near, signature=lines)

@@ -11,7 +11,7 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.adapters.audio.open_sound import SoundInput, open_sound
+from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras
 from worldstate.adapters.files.checkpoint_file import Checkpoint
@@ -24,8 +24,7 @@ from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
 from .own_parts import OtherModality
-from .source import Source
-from .source_files import SourceParts, open_source
+from .source import Source, SourceParts, open_source
 
 # Half a hop.
 PARTS_PER_SECOND = 20

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from worldstate.adapters.camera.detections import Detector
 from worldstate.core.fixed_lag import Timed
@@ -26,54 +26,13 @@ Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.meas
 OtherModality: TypeAlias = Callable[[], Iterable[Timed]]
 
 
-class DetectorPart(Protocol):
-    """Makes a detector, a new one for every video; a class without arguments does.
-
-    Examples
-    --------
-    >>> from worldstate.adapters.camera.motion_detector import MotionDetector
-    >>> part: DetectorPart = MotionDetector
-    """
-
-    def __call__(self) -> Detector:
-        """Return a detector that has seen no image."""
-        ...
-
-
-class ExporterPart(Protocol):
-    """Opens what states go to: a file, a socket, another stack.
-
-    Examples
-    --------
-    >>> from contextlib import contextmanager
-    >>> @contextmanager
-    ... def printed(target):
-    ...     yield lambda state: print(target, state.seq)
-    >>> part: ExporterPart = printed
-    >>> with part("out") as export:
-    ...     export(WorldState(0, 7))
-    out 7
-    """
-
-    def __call__(self, target: str, /) -> AbstractContextManager[Callable[[WorldState], object]]:
-        """Return a context manager that lends a function of one state, called once a hop."""
-        ...
-
-
-class MeasurementsPart(Protocol):
-    """Reads what another sensor recorded, as measurements on the clock of the sound.
-
-    Examples
-    --------
-    >>> def silent(path): return iter(())
-    >>> part: MeasurementsPart = silent
-    >>> list(part(Path("radar.log")))
-    []
-    """
-
-    def __call__(self, path: Path, /) -> Iterable[Timed]:
-        """Return measurements in the order of their stamps; what wraps a `MeasurementAdapter` does."""
-        ...
+# Makes a detector that has seen no image, a new one for every video; a class without arguments does.
+DetectorPart: TypeAlias = Callable[[], Detector]
+# Opens what states go to, a file, a socket, another stack: lends a function of one state, called once a hop.
+ExporterPart: TypeAlias = Callable[[str], AbstractContextManager[Callable[[WorldState], object]]]
+# Reads what another sensor recorded as measurements on the clock of the sound, in the order of their stamps;
+# what wraps a `MeasurementAdapter` does.
+MeasurementsPart: TypeAlias = Callable[[Path], Iterable[Timed]]
 
 
 def installed(group: Group) -> list[str]:

@@ -1,9 +1,10 @@
-"""What is listened to: a recording with its array, model, camera and what was believed before."""
+"""What is listened to: a recording with its array, model, camera, and what was believed before."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypedDict, TypeVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.road_users import RoadUserModel
@@ -14,19 +15,25 @@ from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
-from worldstate.adapters.audio.open_sound import SoundInput, path_of
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
-from worldstate.adapters.camera.miss_rates import MissRates
-from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.audio.sound_file import SoundInput, SoundStream, as_sound, path_of
+from worldstate.adapters.camera.camera_channel import video_degradation, watched
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector, read_any_detections
+from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
+from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
-from worldstate.adapters.files.acoustic_domain import heard_with
-from worldstate.adapters.files.checkpoint_file import Checkpoint
+from worldstate.adapters.datasets.ovad import Recording, choose_array
+from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, heard_with, states_budget
+from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
+from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, feature_nfft
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
-from worldstate.ground import InvalidArgumentError, NotUsable, in_range
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context
 
@@ -34,6 +41,7 @@ from .acoustic import Grounding, Signature
 from .own_parts import OtherModality
 
 _LOG = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +117,9 @@ class ListenSettings:
         """Return how the site is learned, None for not at all."""
         if not self.site_adaptation:
             return None
-        given = () if self.forgetting_s is None else (self.forgetting_s,)
-        return SiteEstimateSettings(*given)
+        return (
+            SiteEstimateSettings() if self.forgetting_s is None else SiteEstimateSettings(self.forgetting_s)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,3 +276,197 @@ def street_listener(
         _LOG.warning("the street's sides were heard by another array (%s) and are left out", given.heard_by)
         before = known = None
     return StreetListener(before or StreetHearing(replace(known or SidePatterns(), heard_by=heard_by)))
+
+
+class SourceParts(TypedDict, total=False):
+    """What `open_source` takes of a recording beside its sound: files, or the objects that they hold."""
+
+    array: Path | str | MicrophoneArray | None
+    detections: Path | str | DetectionLog | None
+    detector: Detector | None
+    camera: Path | str | PinholeCamera | None
+    miss_rates: Path | str | MissRates | None
+    model: Path | str | Model | None
+    context: Context | None
+    settings: ListenSettings | None
+
+
+def open_source(
+    path: SoundInput | str | Sequence[str],
+    *,
+    array: Path | str | MicrophoneArray | None = None,
+    detections: Path | str | DetectionLog | None = None,
+    detector: Detector | None = None,
+    camera: Path | str | PinholeCamera | None = None,
+    miss_rates: Path | str | MissRates | None = None,
+    model: Path | str | Model | None = None,
+    context: Context | None = None,
+    sides: SidePatterns | None = None,
+    resume: Path | str | Checkpoint | None = None,
+    start_s: float = 0.0,
+    ego: OdometryLog | None = None,
+    moving_ego: bool = False,
+    others: Sequence[OtherModality] = (),
+    settings: ListenSettings | None = None,
+) -> Source:
+    """Find everything that belongs to a sound file or to a recording folder.
+
+    Parameters
+    ----------
+    path : path, sequence of paths, SoundStream or Audio
+        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
+        a stream (raw samples from a pipe, the sound of a bag), or an open recording.
+    array : path or MicrophoneArray, optional
+        Acoular XML, CSV or JSON as `read_array` reads them; that of the data set where not given, OVAD's
+        where it names none; the model's own for a sound file of as many channels.
+    detections : path or DetectionLog, optional
+        Camera detections per frame, in any form that `read_any_detections` knows; those of the recording
+        folder where not given.
+    detector : Detector, optional
+        Looks at the video of the recording folder, in place of `detections`.
+    camera : path or PinholeCamera, optional
+        What took the images, as `read_camera` reads it; OVAD's camera where not given.
+    miss_rates : path or MissRates, optional
+        What `worldstate model detector` wrote. Where it holds the camera's scale of health and the recording
+        folder has a video, the degradation is read from that.
+    model : path or Model, optional
+        Model; where not given, of the two that ship that for a standing or for a moving ego, as the data set
+        or the context says.
+    context : Context, optional
+        Rates, occluders and ego motion; defaults where not given.
+    sides : SidePatterns, optional
+        What either arm of this street sounds like, `LearnedStreet.patterns`; with site adaptation it is
+        learned on, or from nothing, from vehicles in view. What another array heard is left out, and a
+        warning says so.
+    resume : path or Checkpoint, optional
+        Belief and site to go on from. Hops up to its time are heard, which fills the windows, and not
+        measured: the same recording again goes on where the other run ended.
+    start_s : float
+        Time of the first sample on the clock of that belief, for a recording that follows another; a stream
+        with a clock of its own brings it.
+    ego : OdometryLog, optional
+        How the ego vehicle moves, in place of the one speed of the context.
+    moving_ego : bool
+        Whether the ego vehicle will be told to move, as by a running odometry: chooses the model.
+    others : sequence of callables, optional
+        What other sensors measured: functions that return `Measurement` and `PositionScan` in their order.
+    settings : ListenSettings, optional
+        How it is listened to: budget, band, azimuths, site adaptation, ego-noise, boxes.
+
+    Returns
+    -------
+    Source
+        For `listen_steps`.
+
+    Raises
+    ------
+    InputFileError
+        If a file is missing or damaged; the message names it.
+    InvalidArgumentError
+        If the model holds no threshold for the budget, or both detections and a detector are given.
+    OutOfDomainError
+        If the array is not that of the data set, or not the model's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     source = open_source(path, settings=ListenSettings(alpha=0.05))
+    >>> len(source.array.positions_m), source.policy.alpha
+    (56, 0.05)
+    """
+    settings, context = settings or ListenSettings(), context or Context()
+    sound = as_sound(path)
+    recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
+    told = moving_ego or (ego is not None and ego.moves)
+    moves = bool(told or (recording and recording.moving_ego) or context.ego_speed_mps)
+    known = model if isinstance(model, Model) else read_model(model, moving_ego=moves)
+    if settings.ego_noise is True and known.domain and known.domain.feature == CLEANED_FEATURE_VERSION:
+        # Trained without ego-noise: it is taken out of the feature, too.
+        settings = replace(settings, ego_noise=EgoNoiseSettings(feature=True))
+    heard_by, policy = _array_and_policy(sound, known, _read(array, read_array), settings, moves)
+    first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
+    source = Source(
+        sound=sound if recording is None else recording.audio_path,
+        array=heard_by,
+        detections=None,
+        model=known.signature,
+        policy=policy,
+        context=context,
+        settings=settings,
+        t0_s=None if recording is None else recording.t0_s,
+        hazard_free=recording is not None and recording.label == "none",
+        camera=_read(camera, read_camera) or PinholeCamera(),
+        miss_rates=_read(miss_rates, load_miss_rates),
+        before=_read(resume, read_checkpoint),
+        start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns,
+        guard=known.guard,
+        road_users=known.road_users,
+        sequence=_sequence_of(known, moves, settings.uncalibrated),
+        sides=sides,
+        others=tuple(others) if ego is None else (*others, ego.told.__iter__),
+    )
+    return _with_camera(source, recording, detections, detector)
+
+
+def _read(given: Path | str | T | None, reader: Callable[[Path | str], T]) -> T | None:
+    """Return what a file holds, and what is no path as it is."""
+    return reader(given) if isinstance(given, Path | str) else given
+
+
+def _array_and_policy(
+    sound: SoundInput, model: Model, array: MicrophoneArray | None, settings: ListenSettings, moves: bool
+) -> tuple[MicrophoneArray, CueingPolicy]:
+    """Return by which array is heard, and the thresholds; alpha is 0 where no budget can be stated."""
+    alpha, policies = settings.alpha, model.policies
+    policy = policies.policies[0] if alpha is None else policies.for_alpha(alpha)
+    if array is None and isinstance(sound, SoundStream):
+        raise InputFileError(sound.name, "expected --array: such a stream names no microphones")
+    assumed = None if model.domain is None else array_of(model.domain)
+    heard_by = choose_array(path_of(sound), array, assumed=assumed, trust_given=settings.uncalibrated)
+    stated = not settings.uncalibrated and states_budget(model, heard_by, moves)
+    return heard_by, policy if stated else replace(policy, alpha=0.0)
+
+
+def _sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable:
+    """Return the sequence model of a file where it was made for what is heard, else why it is not used."""
+    if model.sequence is None:
+        return NotUsable("the model states no times: `worldstate model make` makes one that does")
+    if uncalibrated:
+        return NotUsable("uncalibrated: times are stated of the array that the model was made for")
+    if not model.provenance.fit_for_use:
+        return NotUsable(UNFIT)
+    if model.domain is None:
+        return NotUsable("the model names no array that it was made for")
+    motion = "moving" if moving_ego else "standing"
+    if model.domain.ego_motion not in (motion, "any"):
+        return NotUsable(f"the model was made for a {model.domain.ego_motion} ego, this one is {motion}")
+    return model.sequence
+
+
+def _with_camera(
+    source: Source,
+    recording: Recording | None,
+    detections: Path | str | DetectionLog | None,
+    detector: Detector | None,
+) -> Source:
+    """Return the source with what the camera reported, on the clock of the sound, and how well it sees."""
+    video = None if recording is None else recording.path / VIDEO_NAME
+    camera, rates, degradation = source.camera, source.miss_rates, source.degradation
+    if detector is None:
+        given = recording.detections_path if detections is None and recording is not None else detections
+        size_px = camera.width_px, camera.height_px
+        log = _read(given, lambda path: read_any_detections(path, size_px=size_px))
+        if video is not None and rates is not None and rates.health is not None and video.is_file():
+            degradation = video_degradation(open_video(video), rates)
+    elif detections is not None or video is None:
+        raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
+    else:
+        log, degradation = watched(open_video(video), detector, rates)
+    log = None if log is None else log.shifted(camera.stamp_offset_s)
+    return replace(source, detections=log, degradation=degradation)

@@ -1,15 +1,14 @@
 """Snapshots of a log in any form: JSON lines of `worldstate run --out`, MCAP, or a bag of ROS 2."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 
-from worldstate.adapters.export.log_sinks import read_snapshot_lines
-from worldstate.adapters.files.atomic import atomic_path
-from worldstate.adapters.files.text_file import refused_as_file
-from worldstate.adapters.ros.bag_reader import is_bag
-from worldstate.adapters.ros.state_bag import bag_snapshot_lines
+from worldstate.adapters.export.log_messages import read_snapshot_lines
+from worldstate.adapters.files.file_io import line_writer, refused_as_file
+from worldstate.adapters.ros.bag_input import is_bag
+from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.serialisation import MOST_CHARACTERS, decode_json
 from worldstate.state import WorldState
@@ -65,14 +64,9 @@ def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:
         return WorldState.from_dict(nearest[1])
 
 
-@contextmanager
-def states_writer(path: Path | None) -> Iterator[Callable[[str], None]]:
+def states_writer(path: Path | None) -> AbstractContextManager[Callable[[str], None]]:
     """Lend a function that writes a snapshot's line; without a path one that writes nothing."""
-    if path is None:
-        yield lambda line: None
-        return
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        yield lambda line: print(line, file=file)
+    return nullcontext(lambda line: None) if path is None else line_writer(path)
 
 
 def _json_lines(path: str | Path) -> Iterator[str]:

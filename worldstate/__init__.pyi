@@ -10,7 +10,7 @@ from .adapters.files.model_file import read_model as read_model
 from .adapters.listener import listen as listen
 from .adapters.listener import listen_steps as listen_steps
 from .adapters.source import ListenSettings as ListenSettings
-from .adapters.source_files import open_source as open_source
+from .adapters.source import open_source as open_source
 from .belief.settings import FilterSettings as FilterSettings
 from .core.filter import WorldFilter as WorldFilter
 from .frontend.array.microphone_array import MicrophoneArray as MicrophoneArray

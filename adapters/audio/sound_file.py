@@ -1,16 +1,19 @@
-"""Multichannel sound files, read in blocks and checked when they are opened."""
+"""Recordings, read in blocks and checked when they are opened: one file, a file a microphone, a pipe."""
 
+import io
 import os
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Literal, Self, TypeAlias
 
 import numpy as np
 import soundfile
 
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array
 
 CONTAINERS = ("WAV", "WAVEX", "RF64", "W64", "FLAC")
@@ -134,10 +137,7 @@ class AudioSource(Audio):
             raise InvalidArgumentError(f"frames: expected at least 1, got {frames}")
         self._seek(0)
         for start in range(0, self.frames, frames):
-            block = self._read(min(frames, self.frames - start))
-            if self._floating:
-                check_finite(self.path, block, start)
-            yield block
+            yield self._read(start, min(frames, self.frames - start))
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
@@ -146,10 +146,7 @@ class AudioSource(Audio):
     def span(self, start: int, frames: int) -> Float32Array:
         """Return so many samples from one on, shape (frames, M)."""
         self._seek(start)
-        block = self._read(frames)
-        if self._floating:
-            check_finite(self.path, block, start)
-        return block
+        return self._read(start, frames)
 
     def _seek(self, frame: int) -> None:
         if self._file.closed:
@@ -159,13 +156,15 @@ class AudioSource(Audio):
         except soundfile.SoundFileError as error:
             raise _cut_short(self.path, self.frames) from error
 
-    def _read(self, frames: int) -> Float32Array:
+    def _read(self, start: int, frames: int) -> Float32Array:
         try:
             block: Float32Array = self._file.read(frames, dtype="float32", always_2d=True)
         except soundfile.SoundFileError as error:
             raise _cut_short(self.path, self.frames) from error
         if len(block) < frames:
             raise _cut_short(self.path, self.frames)
+        if self._floating:
+            check_finite(self.path, block, start)
         return block
 
 
@@ -280,45 +279,252 @@ def data_size(path: Path) -> tuple[int, int] | None:
     with path.open("rb") as file:
         magic = file.read(16)
         if magic[:4] in (b"RIFF", b"RF64") and magic[8:12] == b"WAVE":
-            file.seek(12)
-            return _riff_data(file)
+            return _data_chunk(file, 12, struct.Struct("<4sI"), counted=0, padded=2)
         if magic == W64_RIFF:
-            file.seek(40)
-            return _w64_data(file)
+            return _data_chunk(file, 40, struct.Struct("<4s12xQ"), counted=24, padded=8)
     return None
 
 
-def _remaining(file: BinaryIO) -> int:
-    return os.fstat(file.fileno()).st_size - file.tell()
-
-
-def _riff_data(file: BinaryIO) -> tuple[int, int] | None:
+def _data_chunk(
+    file: BinaryIO, first: int, header: struct.Struct, counted: int, padded: int
+) -> tuple[int, int] | None:
+    """Find the samples among chunks, of whose header the size counts some bytes, padded to a multiple."""
     wide_size: int | None = None
+    file.seek(first)
     for _ in range(MAX_CHUNKS):
-        header = file.read(8)
-        if len(header) < 8:
+        if len(head := file.read(header.size)) < header.size:
             return None
-        name, size = struct.unpack("<4sI", header)
+        name, size = header.unpack(head)
+        size -= counted
+        there = os.fstat(file.fileno()).st_size - file.tell()
         if name == b"data":
             declared = wide_size if size == UNKNOWN_SIZE else size
-            return None if declared is None else (declared, _remaining(file))
+            return None if declared is None else (declared, there)
         if name == b"ds64":
             ds64 = file.read(16)
             wide_size = struct.unpack("<8xQ", ds64)[0] if len(ds64) == 16 else None
             file.seek(-len(ds64), os.SEEK_CUR)
-        file.seek(size + size % 2, os.SEEK_CUR)
+        if not 0 <= size <= there:
+            return None
+        file.seek(size + -size % padded, os.SEEK_CUR)
     return None
 
 
-def _w64_data(file: BinaryIO) -> tuple[int, int] | None:
-    for _ in range(MAX_CHUNKS):
-        header = file.read(24)
-        if len(header) < 24:
-            return None
-        name, size = struct.unpack("<4s12xQ", header)
-        if name == b"data":
-            return size - 24, _remaining(file)
-        if not 24 <= size <= _remaining(file) + 24:
-            return None
-        file.seek(size - 24 + -size % 8, os.SEEK_CUR)
-    return None
+Encoding = Literal["s16", "s24", "s32", "f32"]
+SUBTYPES: dict[Encoding, str] = {"s16": "PCM_16", "s24": "PCM_24", "s32": "PCM_32", "f32": "FLOAT"}
+MAX_CHANNELS = 1024
+
+
+class SoundStream(ABC):
+    """Sound that is no file of its own: `open` gives its samples from the start on."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first sample on the clock of whoever recorded it; 0 where nothing tells."""
+        return 0
+
+    @abstractmethod
+    def open(self) -> Audio:
+        """Open it at its start, nothing checked."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawPcm(SoundStream):
+    """Samples without a header, little-endian, one sample of every channel after the other.
+
+    Parameters
+    ----------
+    stream : binary file
+        Such as ``sys.stdin.buffer``; read once, from where it stands.
+    sample_rate_hz : int
+        Samples per second and channel.
+    channels : int
+        Number of microphones.
+    encoding : {"s16", "s24", "s32", "f32"}
+        Whole numbers of so many bits, or floats of full scale 1.
+    name : str
+        For messages.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range or the encoding another one.
+
+    Examples
+    --------
+    >>> import io
+    >>> RawPcm(io.BytesIO(), 48_000, 8, "s24").frame_bytes
+    24
+    """
+
+    stream: BinaryIO
+    sample_rate_hz: int
+    channels: int
+    encoding: Encoding = "s16"
+    name: str = "/dev/stdin"
+
+    def __post_init__(self) -> None:
+        in_range("sample_rate_hz", self.sample_rate_hz, 1, 10_000_000)
+        in_range("channels", self.channels, 1, MAX_CHANNELS)
+        if self.encoding not in SUBTYPES:
+            known = ", ".join(SUBTYPES)
+            raise InvalidArgumentError(f"encoding: expected one of {known}, got {self.encoding!r}")
+
+    def open(self) -> "RawAudio":
+        """Read its first second."""
+        return RawAudio(self)
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one sample of all channels."""
+        return int(self.encoding[1:]) // 8 * self.channels
+
+    def to_samples(self, data: bytes) -> Float32Array:
+        """Return samples of full scale 1, shape (n, channels)."""
+        raw = {"format": "RAW", "subtype": SUBTYPES[self.encoding], "endian": "LITTLE"}
+        about = {"samplerate": self.sample_rate_hz, "channels": self.channels, "always_2d": True}
+        samples: Float32Array = soundfile.read(io.BytesIO(data), dtype="float32", **raw, **about)[0]
+        return samples
+
+
+# An open recording is one whose samples come from elsewhere, such as microphones that run.
+SoundInput: TypeAlias = Path | tuple[Path, ...] | SoundStream | Audio
+
+
+def as_sound(given: SoundInput | str | Sequence[str]) -> SoundInput:
+    """Return a path, several or a stream as such; one path in a sequence is that file."""
+    if isinstance(given, Path | SoundStream | Audio):
+        return given
+    paths = (Path(given),) if isinstance(given, str) else tuple(map(Path, given))
+    if not paths:
+        raise InvalidArgumentError("expected at least one sound file")
+    return paths[0] if len(paths) == 1 else paths
+
+
+def path_of(sound: SoundInput) -> Path:
+    """Return the name of a recording: its file, the first of several, that of a stream."""
+    if isinstance(sound, SoundStream):
+        return Path(sound.name)
+    if isinstance(sound, Audio):
+        return sound.path
+    return sound if isinstance(sound, Path) else sound[0]
+
+
+class RawAudio(Audio):
+    """A pipe that is being read; `frames` counts what has been read."""
+
+    def __init__(self, raw: RawPcm) -> None:
+        self._raw = raw
+        self.path = Path(raw.name)
+        self.sample_rate_hz, self.channels, self.frames = raw.sample_rate_hz, raw.channels, 0
+        self._first = self._read(raw.sample_rate_hz)
+        self.silent_channels = constant_channels(self._first)
+
+    def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
+        """Yield the samples up to the end of the stream in blocks of `frames`; the last may be shorter."""
+        for start in range(0, len(self._first), frames):
+            yield self._first[start : start + frames]
+        while len(block := self._read(frames)):
+            yield block
+
+    def close(self) -> None:
+        """Leave the stream to its owner."""
+
+    def _read(self, frames: int) -> Float32Array:
+        wanted = frames * self._raw.frame_bytes
+        parts: list[bytes] = []
+        # A pipe gives what it holds, which may be less than a block.
+        while (missing := wanted - sum(map(len, parts))) and (data := self._raw.stream.read(missing)):
+            parts.append(data)
+        joined = b"".join(parts)
+        if len(joined) % self._raw.frame_bytes:
+            got = f"{len(joined) % self._raw.frame_bytes} bytes too many"
+            raise InputFileError(self.path, f"expected whole samples of {self.channels} channels, got {got}")
+        block = self._raw.to_samples(joined)
+        if self._raw.encoding == "f32":
+            check_finite(self.path, block, self.frames)
+        self.frames += len(block)
+        return block
+
+
+class MonoFiles(Audio):
+    """Files of one channel each, read side by side."""
+
+    def __init__(self, sources: Sequence[AudioSource]) -> None:
+        self._sources = tuple(sources)
+        first = self._sources[0]
+        self.path, self.sample_rate_hz, self.frames = first.path, first.sample_rate_hz, first.frames
+        self.channels = len(self._sources)
+        self.silent_channels = tuple(i for i, one in enumerate(self._sources, 1) if one.silent_channels)
+        for other in self._sources[1:]:
+            if (other.sample_rate_hz, other.frames) != (first.sample_rate_hz, first.frames):
+                expected = f"{first.frames} samples at {first.sample_rate_hz} Hz as in {first.path.name}"
+                got = f"{other.frames} at {other.sample_rate_hz} Hz"
+                raise InputFileError(other.path, f"expected {expected}, got {got}")
+
+    def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
+        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+        for parts in zip(*(source.blocks(frames) for source in self._sources), strict=True):
+            yield np.hstack(parts)
+
+    def close(self) -> None:
+        """Close the files."""
+        for source in self._sources:
+            source.close()
+
+
+def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict: bool = True) -> Audio:
+    """Open whatever a recording stands in, checked as `open_audio` does.
+
+    Parameters
+    ----------
+    sound : Path, tuple of Path, SoundStream or Audio
+        A multichannel file, files of one channel each in the order of the microphones, a stream, or what is
+        open already.
+    expect_channels : int, optional
+        Number of microphones of the array that it shall fit.
+    strict : bool
+        As `open_audio`.
+
+    Returns
+    -------
+    Audio
+        Open, at its start.
+
+    Raises
+    ------
+    InputFileError
+        As `open_audio`; of mono files, if rates or lengths differ.
+    SilentChannelsError
+        Channels constant over the first second.
+
+    Examples
+    --------
+    >>> import io
+    >>> sound = np.arange(-16_000, 16_000, dtype="<i2").tobytes()
+    >>> with open_sound(RawPcm(io.BytesIO(sound), 16_000, 2)) as audio:
+    ...     [block.shape for block in audio.blocks(12_000)], audio.duration_s
+    ([(12000, 2), (4000, 2)], 1.0)
+    """
+    if isinstance(sound, Path):
+        return open_audio(sound, expect_channels, strict=strict)
+    if isinstance(sound, Audio):
+        sound.check_size(expect_channels)
+        return sound
+    with ExitStack() as opened:
+        audio = (
+            sound.open()
+            if isinstance(sound, SoundStream)
+            else MonoFiles([opened.enter_context(open_audio(path, 1, strict=False)) for path in sound])
+        )
+        audio.check_size(expect_channels)
+        audio.check_silence(strict)
+        opened.pop_all()  # what is fit to be read stays open
+    return audio

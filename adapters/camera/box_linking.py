@@ -1,21 +1,12 @@
-"""Boxes of one image and of the next: which overlap, which belong to one vehicle, which stand still.
-
-A parked car is no co-evidence for the sound of a moving one.
-"""
+"""Boxes of one image and of the next: which overlap, which belong to one vehicle."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, IntArray
-from worldstate.ground.values import nanoseconds
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-from .detections import STAMP_SLACK_NS, DetectionFilter, DetectionLog
-
-# A box is parked when a box stood at its place, every edge within so many pixels, in this share of the images
-# of so many seconds; below 1 because detectors miss now and then.
-PARKED_S, PARKED_PX, PARKED_SHARE = 1.0, 5.0, 0.8
 _SPAN = 4  # Boxes whose motion predicts the next one
 
 
@@ -99,42 +90,3 @@ def _predicted_rad(boxes: Sequence[AzimuthBox], time_s: float) -> float:
         return last.middle_rad
     rate = (last.middle_rad - before.middle_rad) / (last.time_s - before.time_s)
     return last.middle_rad + rate * (time_s - last.time_s)
-
-
-def parked(log: DetectionLog, frame: int, boxes_px: FloatArray) -> BoolArray:
-    """Return which boxes (n, 4) of an image are parked, from that image and earlier ones, shape (n,).
-
-    For a standing camera: from a moving one every box moves, and none is parked.
-    """
-    since_ns = int(log.stamps_ns[frame]) - nanoseconds(PARKED_S)
-    first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
-    past = log.frames[first:frame]
-    # Most images of a hidden approach are empty, and this is asked several times a hop.
-    if not past or not len(boxes_px) or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
-        return np.zeros(len(boxes_px), dtype=bool)
-    apart_px = (np.abs(boxes_px[:, None] - earlier.boxes_px[None]).max(axis=2) for earlier in past)
-    present = [(apart <= PARKED_PX).any(axis=1) for apart in apart_px]
-    return np.asarray(np.mean(present, axis=0) >= PARKED_SHARE)
-
-
-def kept_and_parked(log: DetectionLog, frame: int, keep: DetectionFilter) -> tuple[IntArray, BoolArray]:
-    """Return the indices of the boxes of an image that are used, and which of those are parked."""
-    here = log.frames[frame]
-    kept = here.select(keep)
-    return kept, parked(log, frame, here.boxes_px[kept])
-
-
-COUNTS_TOLD = (
-    "{counted} of {boxes} boxes in {frames} frames count; {other_class} of another class, "
-    "{low_score} below the score, {too_small} too small, {parked} parked"
-)
-
-
-def count_boxes(log: DetectionLog, keep: DetectionFilter) -> dict[str, int]:
-    """Count the boxes of a log by what becomes of them: each is put down to the first reason."""
-    looser = DetectionFilter(keep.labels, 0.0, 0.0), DetectionFilter(keep.labels, keep.min_score, 0.0), keep
-    named, scored, high = (sum(len(frame.select(one)) for frame in log.frames) for one in looser)
-    boxes = sum(map(len, log.frames))
-    still = sum(int(kept_and_parked(log, i, keep)[1].sum()) for i in range(len(log)))
-    apart = {"other_class": boxes - named, "low_score": named - scored, "too_small": scored - high}
-    return {"frames": len(log), "boxes": boxes, "counted": high - still, **apart, "parked": still}

@@ -9,10 +9,10 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
-from worldstate.adapters.files.text_file import read_json, read_text, refused_as_file
+from worldstate.adapters.files.file_io import read_json, read_text, refused_as_file
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
 from worldstate.ground.serialisation import Check, Count, Probability, decode
-from worldstate.ground.typing import FloatArray, ImageArray, IntArray
+from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 
 MAX_BYTES = 64 << 20
 MAX_FRAMES = 100_000
@@ -31,6 +31,9 @@ YOLO_CLASSES: Mapping[int, str] = {
 MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
 _FRAME_NUMBER = re.compile(r"(\d{1,9})\.txt$", re.ASCII)
 
+# A box is parked when a box stood at its place, every edge within so many pixels, in this share of the images
+# of so many seconds; below 1 because detectors miss now and then.
+PARKED_S, PARKED_PX, PARKED_SHARE = 1.0, 5.0, 0.8
 Row = tuple[tuple[float, float, float, float], float, str]
 # Beyond any image, and a sum of two is still a number.
 MAX_NUMBER = 1e9
@@ -178,6 +181,45 @@ class DetectionLog:
         return index
 
 
+def parked(log: DetectionLog, frame: int, boxes_px: FloatArray) -> BoolArray:
+    """Return which boxes (n, 4) of an image are parked, from that image and earlier ones, shape (n,).
+
+    For a standing camera: from a moving one every box moves, and none is parked.
+    """
+    since_ns = int(log.stamps_ns[frame]) - nanoseconds(PARKED_S)
+    first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
+    past = log.frames[first:frame]
+    # Most images of a hidden approach are empty, and this is asked several times a hop.
+    if not past or not len(boxes_px) or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
+        return np.zeros(len(boxes_px), dtype=bool)
+    apart_px = (np.abs(boxes_px[:, None] - earlier.boxes_px[None]).max(axis=2) for earlier in past)
+    present = [(apart <= PARKED_PX).any(axis=1) for apart in apart_px]
+    return np.asarray(np.mean(present, axis=0) >= PARKED_SHARE)
+
+
+def kept_and_parked(log: DetectionLog, frame: int, keep: DetectionFilter) -> tuple[IntArray, BoolArray]:
+    """Return the indices of the boxes of an image that are used, and which of those are parked."""
+    here = log.frames[frame]
+    kept = here.select(keep)
+    return kept, parked(log, frame, here.boxes_px[kept])
+
+
+COUNTS_TOLD = (
+    "{counted} of {boxes} boxes in {frames} frames count; {other_class} of another class, "
+    "{low_score} below the score, {too_small} too small, {parked} parked"
+)
+
+
+def count_boxes(log: DetectionLog, keep: DetectionFilter) -> dict[str, int]:
+    """Count the boxes of a log by what becomes of them: each is put down to the first reason."""
+    looser = DetectionFilter(keep.labels, 0.0, 0.0), DetectionFilter(keep.labels, keep.min_score, 0.0), keep
+    named, scored, high = (sum(len(frame.select(one)) for frame in log.frames) for one in looser)
+    boxes = sum(map(len, log.frames))
+    still = sum(int(kept_and_parked(log, i, keep)[1].sum()) for i in range(len(log)))
+    apart = {"other_class": boxes - named, "low_score": named - scored, "too_small": scored - high}
+    return {"frames": len(log), "boxes": boxes, "counted": high - still, **apart, "parked": still}
+
+
 class Detector(Protocol):
     """Detector of objects in images that are given in the order of time.
 
@@ -253,13 +295,9 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionL
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
         raise InputFileError(name, problem)
-    frames: list[DetectionFrame] = []
-    stamps: list[int | None] = []
     with refused_as_file(name):
-        for number, row in enumerate(rows):
-            read = decode(_OvadFrame, row, f"frame {number}")
-            frames.append(read.frame())
-            stamps.append(read.stamp_ns)
+        read = [decode(_OvadFrame, row, f"frame {number}") for number, row in enumerate(rows)]
+        frames, stamps = [one.frame() for one in read], [one.stamp_ns for one in read]
         if all(stamp is None for stamp in stamps):
             return DetectionLog.at_rate(frames, frame_rate_hz, source=str(name))
         if None in stamps:

@@ -1,6 +1,5 @@
 """Measured miss and clutter rates of a camera's detector, with their counts, on disk."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass, field
 from functools import cached_property
@@ -11,14 +10,11 @@ import numpy as np
 from scipy.special import betaincinv
 
 from worldstate.abduction.absence import MissRateTable, isotonic_grid
-from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.text_file import read_record
-from worldstate.ground import InvalidArgumentError, finite_array
+from worldstate.adapters.files.file_io import read_record, write_json
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.serialisation import ADDED, Layout, encode
-from worldstate.ground.typing import FloatArray
 
-from .camera_health import CameraHealth, Health
-from .degradation import LEVELS
+from .camera_health import LEVELS, CameraHealth, Health
 
 # Far more than there are kinds of degradation; a bound for files from elsewhere.
 MOST_FAMILIES = 100
@@ -138,9 +134,8 @@ class MissRates:
     @cached_property
     def table(self) -> MissRateTable:
         """Largest beta over the families at every d: absence is then never overrated."""
-        return self._table(
-            np.max([counts.miss_rates(self.repeats) for counts in self.families.values()], axis=0)
-        )
+        rates = [counts.miss_rates(self.repeats) for counts in self.families.values()]
+        return self._table(np.max(rates, axis=0))
 
     def level(self, health: Health) -> float:
         """Return the d at which `table` has, at boresight, the miss rate of the worst family.
@@ -166,9 +161,8 @@ class MissRates:
 
     def clutter_rate(self, degradation: float) -> float:
         """Return P(false detection in a query sector) at d, the largest over the families."""
-        return max(
-            float(np.interp(degradation, LEVELS, counts.clutter_rates)) for counts in self.families.values()
-        )
+        families = self.families.values()
+        return max(float(np.interp(degradation, LEVELS, one.clutter_rates)) for one in families)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values with the schema's name and version."""
@@ -206,7 +200,7 @@ def save_miss_rates(path: str | Path, rates: MissRates) -> None:
     ...     load_miss_rates(Path(folder) / "beta.json").families["noise"].misses
     ((0.0, 1.0, 2.0, 5.0, 10.0),)
     """
-    write_text(path, json.dumps(rates.to_dict(), allow_nan=False, indent=1) + "\n")
+    write_json(path, rates.to_dict(), indent=1)
 
 
 def load_miss_rates(path: str | Path) -> MissRates:

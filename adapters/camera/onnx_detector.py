@@ -1,8 +1,7 @@
 """A user's own detector: an ONNX model whose output is of YOLO's form."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +23,6 @@ SIDE_PX = 640  # Of the square that the model takes, where its input has no fixe
 GREY = 114
 
 
-class Session(Protocol):
-    """What is used of an `onnxruntime.InferenceSession`."""
-
-    def get_inputs(self) -> Sequence[Any]:
-        """Descriptions of the inputs."""
-        ...
-
-    def run(self, output_names: None, feed: dict[str, Float32Array], /) -> Sequence[Any]:
-        """All outputs."""
-        ...
-
-
 class OnnxDetector:
     """Run an ONNX model of YOLO's form on images.
 
@@ -44,7 +31,7 @@ class OnnxDetector:
 
     Parameters
     ----------
-    session : Session
+    session : onnxruntime.InferenceSession
         An open model; `open_onnx` opens one from a file.
     labels : tuple of str
         Names of the classes in the order of the model, at least one.
@@ -68,7 +55,7 @@ class OnnxDetector:
     (('car',), [[22.0, 27.0, 42.0, 37.0]])
     """
 
-    def __init__(self, session: Session, labels: tuple[str, ...]) -> None:
+    def __init__(self, session: Any, labels: tuple[str, ...]) -> None:
         if not labels:
             raise InvalidArgumentError("labels: expected at least one class name")
         inputs = session.get_inputs()

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.adapters.files.text_file import read_record, refused_as_file
-from worldstate.ground import InvalidArgumentError, finite_array, in_range, wrap_angle
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.adapters.files.file_io import read_record, refused_as_file
+from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, in_range, wrap_angle
 from worldstate.measurement.measurement import Sighting
 
 

@@ -20,8 +20,7 @@ from worldstate.ground import (
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 from worldstate.measurement.sector import WHOLE_SIDES, Sector
 
-from .box_linking import kept_and_parked
-from .detections import DetectionFilter, DetectionFrame, DetectionLog
+from .detections import DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
@@ -112,16 +111,16 @@ class VisionQuery:
         self.view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
         self._clutter = clutter or (lambda d: _CLUTTER_RATE)
-        if detections is not None:
-            _check_size(camera, detections)
-        self._take(detections)
+        self._asked = detections is not None
+        log = NO_LOOKS if detections is None else detections
+        _check_size(camera, log)
+        self._take(log)
 
-    def _take(self, detections: DetectionLog | None) -> None:
-        self.detections = detections
+    def _take(self, log: DetectionLog) -> None:
+        self.detections = log
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
         # As background subtraction does: asked for a truck it would never find one.
-        named = () if detections is None else (frame.labels for frame in detections.frames)
-        self._calls_all_cars = set().union(*named) == {"car"}
+        self._calls_all_cars = set().union(*(frame.labels for frame in log.frames)) == {"car"}
 
     def see(self, stamp_ns: int, frame: DetectionFrame) -> None:
         """Take what a running detector found in an image; one that is no later than the last is left out.
@@ -146,13 +145,13 @@ class VisionQuery:
         >>> type(query.ask(nanoseconds(1.0), Bearing(0.0, 0.05))).__name__
         'Absent'
         """
-        before = self.detections or NO_LOOKS
-        new = DetectionLog((frame,), np.array([stamp_ns]), before.source).shifted(self.camera.stamp_offset_s)
-        if len(before.frames) and new.stamps_ns[0] <= before.stamps_ns[-1]:
+        before, taken_ns = self.detections, stamp_ns + nanoseconds(self.camera.stamp_offset_s)
+        if len(before) and taken_ns <= before.stamps_ns[-1]:
             return
-        _check_size(self.camera, new)
+        _check_size(self.camera, DetectionLog((frame,), np.array([taken_ns]), before.source))
+        self._asked = True
         frames = (*before.frames, frame)[-REMEMBERED:]
-        stamps_ns = np.append(before.stamps_ns, new.stamps_ns)[-REMEMBERED:]
+        stamps_ns = np.append(before.stamps_ns, taken_ns)[-REMEMBERED:]
         self._take(DetectionLog(frames, stamps_ns, before.source))
 
     def ask(
@@ -187,7 +186,7 @@ class VisionQuery:
         >>> nothing.ask(0, Bearing(0.0, 0.05))
         Unqueried(reason='no detections file')
         """
-        if self.detections is None:
+        if not self._asked:
             return Unqueried("no detections file")
         if self._frame(stamp_ns) is None:
             return Unqueried(f"no frame at {seconds(stamp_ns):.3f} s")
@@ -227,10 +226,10 @@ class VisionQuery:
         ()
         """
         frame = self._frame(stamp_ns)
-        if frame is None or self.detections is None:
+        if frame is None:
             return ()
         if frame != self._last[0]:
-            self._last = (frame, self._look(self.detections, frame))
+            self._last = (frame, self._look(frame))
         return self._last[1]
 
     def last_look(self, stamp_ns: int) -> Look | None:
@@ -252,22 +251,19 @@ class VisionQuery:
         True
         """
         frame = self._frame(stamp_ns)
-        if frame is None or self.detections is None:
+        if frame is None:
             return None
-        d = self._degradation(stamp_ns)
-        beta = self._expected_miss_rate(self.view, d, self.keep.labels)
+        beta = self.miss_rate_over(self.view, stamp_ns, None)
         moving = any(sighting.moving for sighting in self.sightings(stamp_ns))
-        answer = (Present if moving else Absent)(1.0 if beta is None else beta, self._clutter(d))
+        answer = (Present if moving else Absent)(beta, self._clutter(self._degradation(stamp_ns)))
         return Look(SENSOR, int(self.detections.stamps_ns[frame]), answer)
 
     def _frame(self, stamp_ns: int) -> int | None:
-        if self.detections is None:
-            return None
         return self.detections.latest(stamp_ns, nanoseconds(MAX_IMAGE_AGE_S))
 
-    def _look(self, log: DetectionLog, number: int) -> tuple[Sighting, ...]:
-        frame = log.frames[number]
-        kept, still = kept_and_parked(log, number, self.keep)
+    def _look(self, number: int) -> tuple[Sighting, ...]:
+        frame = self.detections.frames[number]
+        kept, still = kept_and_parked(self.detections, number, self.keep)
         return tuple(
             self.camera.sighting(frame.boxes_px[i], frame.labels[i], float(frame.scores[i]), moving=not stood)
             for i, stood in zip(kept, still.tolist(), strict=True)

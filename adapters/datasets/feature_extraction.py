@@ -11,7 +11,7 @@ import numpy as np
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
-from worldstate.adapters.files.text_file import number, read_rows
+from worldstate.adapters.files.file_io import number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import FEATURE_VERSION, feature_nfft, published_feature
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings

@@ -6,7 +6,6 @@ degrees and grow to the right, as in the released data and in `frontend.directio
 """
 
 import csv
-import json
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +15,7 @@ import numpy as np
 
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES
-from worldstate.adapters.files.atomic import atomic_path, write_text
-from worldstate.adapters.files.text_file import number, read_record, read_rows
+from worldstate.adapters.files.file_io import atomic_path, number, read_record, read_rows, write_json
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
@@ -218,7 +216,7 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
     companion = Path(f"{path}.json")
     companion.unlink(missing_ok=True)
     if table.domain is not None:
-        write_text(companion, json.dumps(encode(table.domain), allow_nan=False) + "\n")
+        write_json(companion, encode(table.domain))
 
 
 def read_ids(path: str | Path) -> frozenset[str]:

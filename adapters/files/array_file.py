@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 from xml.sax.saxutils import quoteattr
 
 import defusedxml.ElementTree as SafeElementTree
@@ -15,13 +15,13 @@ from defusedxml.common import DefusedXmlException
 
 from worldstate.frontend.array.geometry import nearest_spacings_m
 from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, MicrophoneArray
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 
-from .atomic import write_text
-from .text_file import read_bytes
+from .file_io import read_bytes, write_text
 
 Axes = Literal["acoular", "base_link"]
+# The coordinates of a microphone as a file has them, each with its axis.
+Row: TypeAlias = list[tuple[str, object]]
 
 MAX_BYTES = 1 << 20
 # No vehicle carries a wider array, or one with its microphones farther apart or closer together: such a file
@@ -76,11 +76,10 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     data = read_bytes(name, "an array file", MAX_BYTES)
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
     if start == b"<":
-        return checked_array(name, _xml_positions(name, data), axes or "acoular")
-    if start in (b"[", b"{"):
-        positions, said = _json_positions(name, data)
-        return checked_array(name, positions, axes or said)
-    return checked_array(name, _csv_positions(name, data), axes or "base_link")
+        rows, said = _xml_rows(name, data), "acoular"
+    else:
+        rows, said = _json_rows(name, data) if start in (b"[", b"{") else (_csv_rows(name, data), "base_link")
+    return checked_array(name, _numbers(name, rows), axes or said)
 
 
 def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array") -> None:
@@ -149,7 +148,7 @@ def _check_size(path: Path, positions_m: FloatArray) -> None:
             raise InputFileError(path, problem)
 
 
-def _xml_positions(path: Path, data: bytes) -> list[list[float]]:
+def _xml_rows(path: Path, data: bytes) -> list[Row]:
     try:
         root: Any = SafeElementTree.fromstring(data, forbid_dtd=True)
     except DefusedXmlException as error:
@@ -157,11 +156,10 @@ def _xml_positions(path: Path, data: bytes) -> list[list[float]]:
         raise InputFileError(path, problem) from error
     except (SafeElementTree.ParseError, ValueError, LookupError) as error:
         raise InputFileError(path, f"expected array XML, it does not parse: {error}") from error
-    found = [[(axis, element.get(axis)) for axis in "xyz"] for element in root.findall("pos")]
-    return [_numbers(path, number, row) for number, row in enumerate(found, start=1)]
+    return [[(axis, element.get(axis)) for axis in "xyz"] for element in root.findall("pos")]
 
 
-def _csv_positions(path: Path, data: bytes) -> list[list[float]]:
+def _csv_rows(path: Path, data: bytes) -> list[Row]:
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -169,19 +167,13 @@ def _csv_positions(path: Path, data: bytes) -> list[list[float]]:
     kept = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     separator = next((mark for mark in ";,\t" if kept and mark in kept[0]), None)
     try:
-        rows = (
-            [line.split() for line in kept] if separator is None else [*csv.reader(kept, delimiter=separator)]
-        )
+        rows = [*csv.reader(kept, delimiter=separator)] if separator else [line.split() for line in kept]
     except csv.Error as error:
         raise InputFileError(path, f"expected microphones as XML, CSV or JSON: {error}") from error
     cells = [[cell.strip() for cell in row] for row in rows]
     columns, has_header = _csv_columns(path, cells[0] if cells else [])
-    return [
-        _numbers(
-            path, number, [(a, row[c] if c < len(row) else None) for a, c in zip("xyz", columns, strict=True)]
-        )
-        for number, row in enumerate(cells[has_header:], start=1)
-    ]
+    places = [*zip("xyz", columns, strict=True)]
+    return [[(a, row[c] if c < len(row) else None) for a, c in places] for row in cells[has_header:]]
 
 
 def _csv_columns(path: Path, first: list[str]) -> tuple[list[int], bool]:
@@ -200,7 +192,7 @@ def _csv_columns(path: Path, first: list[str]) -> tuple[list[int], bool]:
     return columns, False
 
 
-def _json_positions(path: Path, data: bytes) -> tuple[list[list[float]], str]:
+def _json_rows(path: Path, data: bytes) -> tuple[list[Row], str]:
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -209,19 +201,19 @@ def _json_positions(path: Path, data: bytes) -> tuple[list[list[float]], str]:
     rows = held.get("positions_m")
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
         raise InputFileError(path, "expected a list of positions [x, y, z], or one as positions_m")
-    positions = [
-        _numbers(path, number, [*zip("xyz", row, strict=True)]) for number, row in enumerate(rows, start=1)
-    ]
-    return positions, held.get("axes", "base_link")
+    return [[*zip("xyz", row, strict=True)] for row in rows], held.get("axes", "base_link")
 
 
-def _numbers(path: Path, number: int, row: Sequence[tuple[str, object]]) -> list[float]:
-    values = [_number(value) for _, value in row]
-    for (axis, value), read in zip(row, values, strict=True):
-        if read is None:
-            problem = f"microphone {number}: expected a finite number as {axis}, got {value!r:.40}"
-            raise InputFileError(path, problem)
-    return [value for value in values if value is not None]
+def _numbers(path: Path, rows: list[Row]) -> list[list[float]]:
+    """Return the coordinates of each microphone; refuse what is no finite number."""
+    found: list[list[float]] = [[] for _ in rows]
+    for number, row in enumerate(rows, start=1):
+        for axis, value in row:
+            if (read := _number(value)) is None:
+                problem = f"microphone {number}: expected a finite number as {axis}, got {value!r:.40}"
+                raise InputFileError(path, problem)
+            found[number - 1].append(read)
+    return found
 
 
 def _number(value: object) -> float | None:

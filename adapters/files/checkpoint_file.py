@@ -1,10 +1,8 @@
 """Checkpoints on disk: the filter's memory, site estimate, a sequence's history, the sound of the arms."""
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory
 from worldstate.abduction.sequence.street_sides import StreetHearing
@@ -12,10 +10,10 @@ from worldstate.abduction.signature.site_estimate import SiteEstimate
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.serialisation import decode, encode
 
-from .atomic import write_text
-from .text_file import read_json, refused_as_file
+from .file_io import read_json, refused_as_file, write_json
 
-T = TypeVar("T")
+# What a checkpoint holds beside the memory of the filter.
+_BESIDE: dict[str, Any] = {"site": SiteEstimate, "history": SequenceHistory, "street": StreetHearing}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +46,11 @@ class Checkpoint:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values: the filter's checkpoint with the other parts beside its memory."""
-        beside = {"site": self.site, "history": self.history, "street": self.street}
+        beside = {name: getattr(self, name) for name in _BESIDE}
         return self.world.to_dict() | {k: None if v is None else encode(v) for k, v in beside.items()}
 
     @classmethod
-    def from_dict(cls, data: object) -> "Checkpoint":
+    def from_dict(cls, data: Any) -> "Checkpoint":
         """Return what `to_dict` wrote; the filter's own checkpoint reads as one without the other parts.
 
         Raises
@@ -63,18 +61,8 @@ class Checkpoint:
             If a value is missing, of the wrong type or out of range; the message says where.
         """
         world = WorldFilter.from_dict(data)
-        beside: Mapping[str, object] = data if isinstance(data, Mapping) else {}
-        return cls(
-            world,
-            _part(SiteEstimate, beside, "site"),
-            _part(SequenceHistory, beside, "history"),
-            _part(StreetHearing, beside, "street"),
-        )
-
-
-def _part(kind: type[T], beside: Mapping[str, object], name: str) -> T | None:
-    value = beside.get(name)
-    return None if value is None else decode(kind, value, name)
+        beside = {name: (kind, data.get(name)) for name, kind in _BESIDE.items()}
+        return cls(world, **{k: v if v is None else decode(kind, v, k) for k, (kind, v) in beside.items()})
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
@@ -100,7 +88,7 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     ...     read_checkpoint(Path(folder) / "now.json").world.stamp_ns
     300000000
     """
-    write_text(path, json.dumps(checkpoint.to_dict(), allow_nan=False) + "\n")
+    write_json(path, checkpoint.to_dict())
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:

@@ -1,14 +1,14 @@
 """A context from JSON: corners and lanes of a junction, how fast people drive there, how often they come."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode
 from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_side
 
-from .text_file import read_json, refused_as_file
+from .file_io import check_keys, read_json, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +103,5 @@ def read_context(path: str | Path) -> Context:
     """
     with refused_as_file(path):
         given = read_json(path, "a context file")
-        # Written by hand: a name that is spelt wrong would be left out in silence.
-        known = {one.name for one in fields(_ContextFile)}
-        if isinstance(given, dict) and (unknown := sorted(set(given) - known)):
-            raise InvalidArgumentError(f"context: expected keys among {sorted(known)}, got {unknown}")
+        check_keys(given, _ContextFile, "context")
         return decode(_ContextFile, given, "context").context()

@@ -16,8 +16,7 @@ from worldstate.abduction.signature.ensemble import AnySignature
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.ground.serialisation import ADDED, Layout, Via, encode
 
-from .atomic import write_text
-from .text_file import read_record
+from .file_io import read_record, write_text
 
 
 @dataclass(frozen=True, slots=True)

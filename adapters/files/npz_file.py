@@ -11,7 +11,7 @@ import numpy as np
 
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
-from .atomic import atomic_path
+from .file_io import atomic_path
 
 Result = TypeVar("Result")
 

@@ -8,7 +8,7 @@ from worldstate.ground import InvalidArgumentError, nanoseconds
 from worldstate.ground.serialisation import ADDED
 from worldstate.measurement.odometry import EgoPose, Odometry
 
-from .text_file import number, read_rows, refused_as_file
+from .file_io import number, read_rows, refused_as_file
 
 # Odometry of a standing vehicle scatters by some centimetres a second.
 STANDING_MPS = 0.2

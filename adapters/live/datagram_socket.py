@@ -11,7 +11,7 @@ from worldstate.adapters.files.odometry_file import OdometryRecord
 from worldstate.ground import InvalidArgumentError, WorldstateError, in_range
 from worldstate.ground.serialisation import decode, decode_json
 
-from .bounded_channel import BoundedChannel
+from .live_sound import BoundedChannel
 
 T = TypeVar("T")
 # A second of images of a fast camera; what a stalled machine finds there beyond is too old to be of use.

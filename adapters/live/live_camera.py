@@ -12,7 +12,7 @@ from worldstate.adapters.camera.video import opencv
 from worldstate.ground import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import ImageArray
 
-from .bounded_channel import BoundedChannel
+from .live_sound import BoundedChannel
 
 # Images that wait at most: a detector that is slower than the camera looks at the newest ones.
 WAITING_IMAGES = 4

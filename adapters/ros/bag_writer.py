@@ -1,23 +1,28 @@
-"""Write bags of ROS 2, and a recording as the bag that a vehicle would have recorded."""
+"""Bags of ROS 2 written: a recording as a vehicle would have recorded it, and world-states."""
 
 import heapq
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from worldstate.adapters.audio.open_sound import SoundInput, open_sound
-from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.audio.sound_file import Audio, SoundInput, open_audio, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME, Recording
-from worldstate.adapters.files.atomic import atomic_path, check_target
+from worldstate.adapters.export.other_stacks import CROSSING_M, autoware_objects
+from worldstate.adapters.export.scene import SceneItem, SceneLine, SceneTriangles, scene_update
+from worldstate.adapters.files.file_io import atomic_path, check_target, read_json
 from worldstate.adapters.files.odometry_file import OdometryLog
-from worldstate.adapters.files.text_file import read_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, nanoseconds
+from worldstate.ground.serialisation import encode
 from worldstate.measurement.odometry import Odometry
+from worldstate.state import RiskCue, WorldState
 
-from .message_types import ARRAY, AUDIO, DETECTIONS, ODOMETRY, header, message, typestore
+from . import message_types as types
+from .bag_input import open_bag
+from .message_types import header, message, time_of, typestore
 
 Storage = Literal["mcap", "sqlite3"]
 # Takes topic, type, stamp in ns and the values of the message's fields.
@@ -97,21 +102,16 @@ def write_bag(
         open_sound(sound, array.n_microphones, strict=False) as audio,
         bag_writer(path, storage) as write,
     ):
-        write(ARRAY_TOPIC, ARRAY, start_ns, _array(array, start_ns))
+        write(ARRAY_TOPIC, types.ARRAY, start_ns, _array(array, start_ns))
         rate_hz, taken = audio.sample_rate_hz, 0
-        others = heapq.merge(_seen(detections, start_ns), _driven(ego, start_ns), key=lambda event: event[0])
-        ahead = next(others, None)
-        for block in audio.blocks(max(rate_hz // _BLOCKS_PER_SECOND, 1)):
-            stamp_ns = start_ns + round(taken * 1_000_000_000 / rate_hz)
-            while ahead is not None and ahead[0] <= stamp_ns:
-                _write(write, ahead)
-                ahead = next(others, None)
-            about = {"sample_rate": rate_hz, "channels": audio.channels, "layout": "interleaved"}
-            write(AUDIO_TOPIC, AUDIO, stamp_ns, about | {"header": header(stamp_ns), "data": block.ravel()})
-            taken += len(block)
-            yield taken / rate_hz
-        for event in () if ahead is None else (ahead, *others):
-            _write(write, event)
+        events = heapq.merge(
+            _seen(detections, start_ns), _driven(ego, start_ns), _heard(audio, start_ns), key=itemgetter(0)
+        )
+        for stamp_ns, topic, kind, values in events:
+            write(topic, kind, stamp_ns, values)
+            if topic == AUDIO_TOPIC:
+                taken += len(values["data"]) // audio.channels
+                yield taken / rate_hz
 
 
 def odometry_of(recording: Recording) -> OdometryLog | None:
@@ -131,14 +131,18 @@ def _simulated_speeds(path: Path) -> list[float]:
     return speeds if isinstance(speeds, list) else []
 
 
-def _write(write: WriteMessage, event: _Event) -> None:
-    stamp_ns, topic, kind, values = event
-    write(topic, kind, stamp_ns, values)
-
-
 def _array(array: MicrophoneArray, stamp_ns: int) -> dict[str, Any]:
     places = [{"x": x, "y": y, "z": z} for x, y, z in array.positions_m.tolist()]
     return {"header": header(stamp_ns), "name": array.name, "positions": places}
+
+
+def _heard(audio: Audio, start_ns: int) -> Iterator[_Event]:
+    about = {"sample_rate": audio.sample_rate_hz, "channels": audio.channels, "layout": "interleaved"}
+    taken = 0
+    for block in audio.blocks(max(audio.sample_rate_hz // _BLOCKS_PER_SECOND, 1)):
+        stamp_ns = start_ns + round(taken * 1_000_000_000 / audio.sample_rate_hz)
+        yield stamp_ns, AUDIO_TOPIC, types.AUDIO, about | {"header": header(stamp_ns), "data": block.ravel()}
+        taken += len(block)
 
 
 def _seen(detections: DetectionLog | None, start_ns: int) -> Iterator[_Event]:
@@ -148,7 +152,7 @@ def _seen(detections: DetectionLog | None, start_ns: int) -> Iterator[_Event]:
         stamp_ns += start_ns
         head = header(stamp_ns, "camera")
         boxes = [{"header": head} | one for one in _boxes(frame)]
-        yield stamp_ns, DETECTIONS_TOPIC, DETECTIONS, {"header": head, "detections": boxes}
+        yield stamp_ns, DETECTIONS_TOPIC, types.DETECTIONS, {"header": head, "detections": boxes}
 
 
 def _boxes(frame: DetectionFrame) -> Iterator[dict[str, Any]]:
@@ -171,4 +175,116 @@ def _driven(ego: OdometryLog | None, start_ns: int) -> Iterator[_Event]:
             "child_frame_id": "base_link",
             "twist": {"twist": twist},
         }
-        yield stamp_ns, ODOMETRY_TOPIC, ODOMETRY, values
+        yield stamp_ns, ODOMETRY_TOPIC, types.ODOMETRY, values
+
+
+ADVISORIES_TOPIC, OBJECTS_TOPIC = "/worldstate/advisories", "/worldstate/objects"
+MARKERS_TOPIC, SNAPSHOT_TOPIC = "/worldstate/markers", "/worldstate/snapshot"
+# Of visualization_msgs/Marker.
+ARROW, CUBE, LINE_STRIP, LABEL, TRIANGLE_LIST = 0, 1, 4, 9, 11
+ADD, DELETE_ALL = 0, 3
+
+
+@contextmanager
+def state_bag(
+    path: Path, crossing_m: float = CROSSING_M, storage: Storage = "mcap"
+) -> Iterator[Callable[[WorldState], None]]:
+    """Lend a function that writes states to a new bag."""
+    with bag_writer(path, storage) as write:
+
+        def write_state(state: WorldState) -> None:
+            write(ADVISORIES_TOPIC, types.ADVISORIES, state.stamp_ns, risk_advisories(state))
+            write(OBJECTS_TOPIC, types.OBJECTS, state.stamp_ns, autoware_objects(state, crossing_m))
+            write(MARKERS_TOPIC, types.MARKERS, state.stamp_ns, scene_markers(state))
+            write(SNAPSHOT_TOPIC, types.TEXT, state.stamp_ns, {"data": state.to_json()})
+
+        yield write_state
+
+
+def bag_snapshot_lines(path: Path) -> Iterator[str]:
+    """Yield the snapshots of a bag as the text that was written."""
+    with open_bag(path) as bag:
+        if bag.count(SNAPSHOT_TOPIC) and bag.kind_of(SNAPSHOT_TOPIC) == types.TEXT:
+            for _, message in bag.messages(SNAPSHOT_TOPIC):
+                yield message.data
+
+
+def risk_advisories(state: WorldState) -> dict[str, Any]:
+    """Return the values of a RiskAdvisories message.
+
+    Examples
+    --------
+    >>> risk_advisories(WorldState(0, 3))["seq"]
+    3
+    """
+    return {
+        "header": header(state.stamp_ns, state.frame_id),
+        "seq": state.seq,
+        "valid_until": time_of(state.valid_until_ns or 0),
+        "calibrated": state.calibrated,
+        "advisories": [_advisory(cue) for cue in state.cues],
+    }
+
+
+def _advisory(cue: RiskCue) -> dict[str, Any]:
+    out = cue.advisory
+    within = cue.within or {}
+    return {
+        "direction": cue.direction,
+        "azimuth": cue.azimuth_rad,
+        "azimuth_std": cue.azimuth_std_rad,
+        "risk": cue.risk,
+        "confidence": cue.confidence,
+        "hidden": cue.hypotheses.hidden,
+        "visible": cue.hypotheses.visible,
+        "none": cue.hypotheses.none,
+        "raised": out is not None,
+        "since": time_of(0 if out is None else out.since_ns),
+        "valid_until": time_of(0 if out is None else out.valid_until_ns),
+        "alpha": [] if cue.alpha is None else [cue.alpha],
+        "horizon": [float(horizon) for horizon in within],
+        "within": list(within.values()),
+        "time_to_visible": list(cue.time_to_visible_s or ()),
+        "entity_id": cue.entity_id or "",
+    }
+
+
+def scene_markers(state: WorldState) -> dict[str, Any]:
+    """Return the values of a MarkerArray: what was drawn before goes, what the snapshot says comes.
+
+    Examples
+    --------
+    >>> [one["ns"] for one in scene_markers(WorldState(0, 0))["markers"]][:3]
+    ['', 'ego', 'occluder corner_left']
+    """
+    head = header(state.stamp_ns, state.frame_id)
+    markers: list[dict[str, Any]] = [{"header": head, "ns": "", "action": DELETE_ALL}]
+    for item in scene_update(state).entities:
+        lifetime = {"sec": item.lifetime.sec, "nanosec": item.lifetime.nsec}
+        for number, shape in enumerate(_shapes(item)):
+            named = {"header": head, "ns": item.id, "id": number, "action": ADD}
+            markers.append(named | {"lifetime": lifetime, "frame_locked": item.frame_locked} | shape)
+    return {"markers": markers}
+
+
+def _shapes(item: SceneItem) -> Iterator[dict[str, Any]]:
+    for arrow in item.arrows:
+        length = arrow.shaft_length + arrow.head_length
+        yield _shape(ARROW, arrow, (length, arrow.shaft_diameter, arrow.shaft_diameter))
+    for cube in item.cubes:
+        yield _shape(CUBE, cube, (cube.size.x, cube.size.y, cube.size.z))
+    for line in item.lines:
+        yield _shape(LINE_STRIP, line, (line.thickness, 0.0, 0.0)) | _points(line)
+    for area in item.triangles:
+        yield _shape(TRIANGLE_LIST, area, (1.0, 1.0, 1.0)) | _points(area)
+    for text in item.texts:
+        yield _shape(LABEL, text, (0.0, 0.0, text.font_size)) | {"text": text.text}
+
+
+def _points(drawn: SceneLine | SceneTriangles) -> dict[str, Any]:
+    return {"points": [encode(one) for one in drawn.points]}
+
+
+def _shape(kind: int, drawn: Any, scale: tuple[float, float, float]) -> dict[str, Any]:
+    size = dict(zip("xyz", scale, strict=True))
+    return {"type": kind, "pose": encode(drawn.pose), "scale": size, "color": encode(drawn.color)}

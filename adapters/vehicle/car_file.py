@@ -1,10 +1,8 @@
 """The sensors of a vehicle in one file: its array, its cameras and what they reported, odometry, model."""
 
-import json
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +12,10 @@ from numpy.typing import ArrayLike
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
 from worldstate.adapters.files.array_file import checked_array, read_array
-from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.text_file import read_json, read_record, refused_as_file
+from worldstate.adapters.files.file_io import check_keys, read_json, read_record, refused_as_file, write_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground import InputFileError, InvalidArgumentError, finite_array, in_range
+from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import ADDED, decode
-from worldstate.ground.typing import FloatArray
 
 # No vehicle carries a sensor farther from its origin; such a number was written in millimetres.
 MAX_OFFSET_M = 30.0
@@ -59,9 +55,11 @@ class Mounting:
     @property
     def rotation(self) -> FloatArray:
         """From the sensor's axes to those of `base_link`, shape (3, 3)."""
-        yaw, pitch, roll = (math.radians(one) for one in (self.yaw_deg, self.pitch_deg, self.roll_deg))
-        about_z, upwards, about_x = _turn(0, 1, yaw), _turn(0, 2, pitch), _turn(1, 2, roll)
-        return np.asarray(about_z @ upwards @ about_x)
+        # Imported where it is used: most commands read no car file.
+        from scipy.spatial.transform import Rotation
+
+        angles_deg = self.yaw_deg, -self.pitch_deg, self.roll_deg
+        return np.asarray(Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix())
 
     def applied(self, points_m: ArrayLike) -> FloatArray:
         """Return points of the sensor, shape (n, 3), in `base_link`."""
@@ -183,7 +181,7 @@ def read_car(path: str | Path) -> CarSensors:
     """
     with refused_as_file(path):
         given = read_json(path, "a car file")
-        _check_keys(given, "car", {one.name for one in fields(_CarFile)})
+        _check_all_keys(given)
         record = decode(_CarFile, given, "car")
         return record.car(Path(path))
 
@@ -211,7 +209,7 @@ def write_aligned(
     one = next(each for each in document["cameras"] if camera is None or each["name"] == camera)
     one["stamp_offset_s"] = round((one.get("stamp_offset_s") or 0.0) + offset_s, 4)
     one["yaw_deg"] = round((one.get("yaw_deg") or 0.0) + yaw_deg, 3)
-    write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    write_json(out, document, indent=1)
 
 
 def read_camera_setup(path: str | Path) -> tuple[PinholeCamera, CameraSetup]:
@@ -311,14 +309,6 @@ class _CarFile:
         )
 
 
-def _turn(first: int, second: int, angle_rad: float) -> FloatArray:
-    """Return the rotation of one axis towards another."""
-    turn, cosine, sine = np.eye(3), math.cos(angle_rad), math.sin(angle_rad)
-    turn[[first, second], [first, second]] = cosine
-    turn[first, second], turn[second, first] = -sine, sine
-    return turn
-
-
 def _beside(folder: Path, file: str | None) -> Path | None:
     return None if file is None else folder / file
 
@@ -339,14 +329,10 @@ def _placed_at(where: str) -> Iterator[None]:
         raise InvalidArgumentError(f"{where}: {str(error).removeprefix('camera: ')}") from error
 
 
-def _check_keys(given: object, where: str, known: set[str]) -> None:
-    """Refuse keys that mean nothing: one that is spelt wrong would be left out in silence."""
-    if not isinstance(given, dict):
-        return  # the decoder says what it is
-    unknown = sorted(set(given) - known)
-    if unknown:
-        raise InvalidArgumentError(f"{where}: expected keys among {sorted(known)}, got {unknown}")
-    _check_keys(given.get("array"), "car.array", {one.name for one in fields(_ArrayRecord)})
-    cameras = given.get("cameras")
-    for number, camera in enumerate(cameras if isinstance(cameras, list) else ()):
-        _check_keys(camera, f"car.cameras[{number}]", {one.name for one in fields(_CameraEntry)})
+def _check_all_keys(given: object) -> None:
+    check_keys(given, _CarFile, "car")
+    if isinstance(given, dict):  # else the decoder says what it is
+        check_keys(given.get("array"), _ArrayRecord, "car.array")
+        cameras = given.get("cameras")
+        for number, camera in enumerate(cameras if isinstance(cameras, list) else ()):
+            check_keys(camera, _CameraEntry, f"car.cameras[{number}]")

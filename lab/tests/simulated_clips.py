@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from worldstate_lab.signatures.traffic_clips import BACKGROUND, CLIP_S, ClipLabels
 
-from worldstate.adapters.datasets.traffic_clips import BACKGROUND, CLIP_S, ClipLabels
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.simulation.scene.junction import site

@@ -27,7 +27,7 @@ def test_the_files_of_a_hop_are_those_that_it_executes(capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["n_files"] == len(report["files"])
     assert {"worldstate/adapters/listener.py", "worldstate/core/filter.py"} < {*report["files"]}
-    assert "worldstate/adapters/source_files.py" not in report["files"]
+    assert "worldstate/adapters/source.py" not in report["files"]
 
 
 def test_keys_and_consistency(capsys):

@@ -51,10 +51,9 @@ from worldstate_lab.trials.pass_cache import PassCache
 
 from worldstate.abduction.absence import default_miss_rates
 from worldstate.abduction.co_evidence import Absent
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.camera.camera_channel import watched
-from worldstate.adapters.camera.camera_health import learn_health
-from worldstate.adapters.camera.degradation import degrade
+from worldstate.adapters.camera.camera_health import degrade, learn_health
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.adapters.camera.motion_detector import MotionDetector
@@ -62,7 +61,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
 from worldstate.adapters.listener import listen_steps, measure_steps
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError

@@ -15,7 +15,7 @@ from worldstate_lab.evaluation.evaluation import whole_sweep
 from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.trials.takes import Take, TakeList
 
-from worldstate.adapters.camera.degradation import LEVELS
+from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.adapters.camera.miss_rates import FamilyCounts
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, Recording

@@ -19,8 +19,7 @@ from worldstate_lab.signatures.signature_study import (
     signature_study,
     transferred,
 )
-
-from worldstate.adapters.datasets.traffic_clips import BACKGROUND, KINDS, ClipLabels
+from worldstate_lab.signatures.traffic_clips import BACKGROUND, KINDS, ClipLabels
 
 RECORDINGS = {TOWN_ROAD: 4, CITY_STREET: 2}
 

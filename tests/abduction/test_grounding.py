@@ -16,8 +16,7 @@ from worldstate.abduction.grounding.grounded_likelihood import (
 )
 from worldstate.adapters.acoustic import LINE_SPACING, AcousticAdapter, Grounding, observe
 from worldstate.adapters.listener import measure_steps
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.published_signature import SignatureModel
+from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.files.model_file import (
     Model,
     read_model,
     save_model,
 )
-from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.ground.errors import InputFileError, SchemaVersionError, WorldstateError
 from worldstate.ground.serialisation import decode, encode
 

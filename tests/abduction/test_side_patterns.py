@@ -23,8 +23,7 @@ from worldstate.abduction.sequence.street_sides import (
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import listen_steps
-from worldstate.adapters.source import ListenSettings, street_listener
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source, street_listener
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, forgotten, with_pass

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.detections import read_detections
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.adapters.files.atomic import atomic_path, write_text
+from worldstate.adapters.files.file_io import atomic_path, write_text
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError, WorldstateError

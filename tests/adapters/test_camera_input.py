@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.camera.box_linking import count_boxes
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, count_boxes
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.listener import listen
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import open_source
 from worldstate.cli.common.sensors import given_sensors
 from worldstate.cli.main import PROGRAM, main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.adapters.camera.box_linking import parked
 from worldstate.adapters.camera.detections import (
     DetectionFilter,
     DetectionFrame,
     DetectionLog,
+    parked,
     read_detections,
 )
 from worldstate.ground.errors import InvalidArgumentError

@@ -15,14 +15,19 @@ from street_frames import HEIGHT, WIDTH, reference, street
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.camera_health import (
+    FAMILIES,
+    LEVELS,
+    STRENGTHS,
     CameraHealth,
     DegradationLog,
     HealthMonitor,
     ImageQuality,
+    darkness_of,
+    degrade,
     image_quality,
     learn_health,
+    strength,
 )
-from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, STRENGTHS, darkness_of, degrade, strength
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates, save_miss_rates
 from worldstate.adapters.camera.motion_detector import MotionDetector

@@ -13,14 +13,13 @@ from worldstate_lab.cli.main import main as study
 
 from conftest import Approach
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
+from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.adapters.listener import listen, measure_steps
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
 from worldstate.ground.errors import InputFileError, OutOfDomainError

@@ -26,8 +26,7 @@ from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.adapters.listener import Listener, Step, listen_steps
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.commissioning.commission import stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.frontend.approach.looming import Looming

@@ -18,8 +18,7 @@ from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
 from worldstate.adapters.listener import listen_steps, measure_steps
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError

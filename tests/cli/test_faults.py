@@ -110,7 +110,7 @@ def test_a_folder_in_the_place_of_a_figure_is_seen_before_the_work(file, tmp_pat
 
 
 def test_an_output_through_a_link_keeps_the_link(tmp_path):
-    from worldstate.adapters.files.atomic import write_text
+    from worldstate.adapters.files.file_io import write_text
 
     (tmp_path / "real").mkdir()
     (tmp_path / "link.json").symlink_to("real/model.json")
@@ -120,7 +120,7 @@ def test_an_output_through_a_link_keeps_the_link(tmp_path):
 
 
 def test_an_output_keeps_the_permissions_of_the_file_it_replaces(tmp_path):
-    from worldstate.adapters.files.atomic import write_text
+    from worldstate.adapters.files.file_io import write_text
 
     private = tmp_path / "model.json"
     write_text(private, "old")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from scripted_states import scripted_states
 
-from worldstate.adapters.export.log_message import image_message, srp_message, state_messages
+from worldstate.adapters.export.log_messages import image_message, srp_message, state_messages
 from worldstate.adapters.export.scene import scene_update
 from worldstate.cli.main import main
 from worldstate.state import SearchedView, WorldState

@@ -10,8 +10,7 @@ import time
 import pytest
 from scripted_states import scripted_states
 
-from worldstate.adapters.export.log_message import state_messages
-from worldstate.adapters.export.log_sinks import live_server
+from worldstate.adapters.export.log_messages import live_server, state_messages
 from worldstate.ground.errors import InvalidArgumentError
 
 pytest.importorskip("foxglove")

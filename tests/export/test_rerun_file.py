@@ -50,8 +50,7 @@ def test_every_entity_of_the_scene_is_in_the_recording(tmp_path):
 
 def test_power_and_images_of_a_run_are_there_too(tmp_path):
     pytest.importorskip("rerun")
-    from worldstate.adapters.export.log_message import image_message, srp_message
-    from worldstate.adapters.export.log_sinks import rerun_file
+    from worldstate.adapters.export.log_messages import image_message, rerun_file, srp_message
 
     out = tmp_path / "out.rrd"
     with rerun_file(out) as write:

@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_states import scripted_states
 
-from worldstate.adapters.export.lane_objects import autoware_objects, lane_objects
-from worldstate.adapters.export.odas import OdasTracks
+from worldstate.adapters.export.other_stacks import OdasTracks, autoware_objects, lane_objects
 from worldstate.cli.main import main
 
 STATES = scripted_states()

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldstate.adapters.live.bounded_channel import BoundedChannel
 from worldstate.adapters.live.live_camera import image_channel
+from worldstate.adapters.live.live_sound import BoundedChannel
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 DAY_IMAGES = 24 * 3600 * 10

@@ -14,12 +14,10 @@ from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import NO_LOOKS, REMEMBERED, VisionQuery
-from worldstate.adapters.live.bounded_channel import BoundedChannel
 from worldstate.adapters.live.datagram_socket import DetectionSocket
 from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, image_channel
-from worldstate.adapters.live.live_sound import LiveSound
-from worldstate.adapters.source import ListenSettings, Source
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.live.live_sound import BoundedChannel, LiveSound
+from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import nanoseconds

@@ -20,13 +20,11 @@ import pytest
 import soundfile
 from rich.console import Console
 
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.live.live_listening import live_steps
-from worldstate.adapters.live.live_sound import LiveSound
-from worldstate.adapters.live.microphones import Playback
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.live.live_sound import LiveSound, Playback
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.common.live_view import view_of
 from worldstate.cli.main import main
 from worldstate.state import WorldState
@@ -122,7 +120,7 @@ def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch)
     (tmp_path / "camera.json").write_text(json.dumps(lens))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "worldstate.adapters.live.microphones.PortAudioInput",
+        "worldstate.adapters.live.live_sound.PortAudioInput",
         lambda channels, sample_rate_hz: Playback(open_sound(street / "street.wav"), speed=2.0),
     )
     found = DetectionFrame(np.array([[260.0, 100.0, 380.0, 300.0]]), np.array([0.9]), ("car",))

@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from worldstate.adapters.live import microphones
-from worldstate.adapters.live.live_sound import LiveSound
-from worldstate.adapters.live.microphones import MissingPortAudioError, PortAudioInput, portaudio
+from worldstate.adapters.live import live_sound
+from worldstate.adapters.live.live_sound import LiveSound, MissingPortAudioError, PortAudioInput, portaudio
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError, MissingExtraError
 
@@ -126,7 +125,7 @@ def test_what_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "sounddevice", None)
     with pytest.raises(MissingExtraError, match=r"worldstate\[live\]"):
         portaudio()
-    monkeypatch.setattr(microphones, "optional", without_library)
+    monkeypatch.setattr(live_sound, "optional", without_library)
     with pytest.raises(MissingPortAudioError, match="apt-get install libportaudio2"):
         portaudio()
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.audio.open_sound import RawPcm, open_sound
+from worldstate.adapters.audio.sound_file import RawPcm, open_sound
 from worldstate.adapters.files.array_file import read_array
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray

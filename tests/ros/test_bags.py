@@ -15,14 +15,13 @@ import pytest
 import soundfile
 from scripted_states import scripted_states
 
-from worldstate.adapters.audio.open_sound import open_sound
-from worldstate.adapters.export.lane_objects import autoware_objects
+from worldstate.adapters.audio.sound_file import open_sound
+from worldstate.adapters.export.other_stacks import autoware_objects
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.ros.bag_input import BagTopics, read_bag
-from worldstate.adapters.ros.bag_writer import bag_writer
+from worldstate.adapters.ros.bag_writer import bag_writer, state_bag
 from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
-from worldstate.adapters.ros.state_bag import state_bag
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
 from worldstate.measurement.odometry import Odometry
@@ -290,8 +289,7 @@ def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
 
 def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
     from worldstate.adapters.listener import listen_steps
-    from worldstate.adapters.source import ListenSettings
-    from worldstate.adapters.source_files import open_source
+    from worldstate.adapters.source import ListenSettings, open_source
     from worldstate.frontend import MicrophoneArray
 
     path = write_blocks(tmp_path / "bag", sound_of(2 * RATE_HZ))

@@ -14,8 +14,7 @@ from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.adapters.files.acoustic_domain import check_tables, feature_order
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.feature import feature_nfft, published_feature

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.adapters.camera.box_linking import overlaps
-from worldstate.adapters.camera.degradation import degrade
+from worldstate.adapters.camera.camera_health import degrade
 from worldstate.adapters.camera.detections import read_detections
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera

@@ -15,8 +15,7 @@ import soundfile
 from scipy.signal import welch
 from worldstate_lab.trials.takes import find_takes
 
-from worldstate.adapters.datasets.array_choice import choose_array
-from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.datasets.ovad import Recording, choose_array
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError

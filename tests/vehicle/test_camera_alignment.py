@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.adapters.vehicle.car_file import read_car, write_aligned
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError

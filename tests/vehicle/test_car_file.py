@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.adapters.vehicle.car_file import Mounting, read_car
 from worldstate.cli.main import main
 from worldstate.frontend.settings import FrontEndSettings

@@ -2,45 +2,19 @@
 
 Print a script for bash that completes commands, options and the words that an option takes; everything else
 completes as files do.
+
+Examples
+--------
+  source <(worldstate completion bash)
+  worldstate completion bash > ~/.local/share/bash-completion/completions/worldstate
 """
 
 import argparse
 from collections.abc import Iterator
+from importlib.resources import files
 
 from worldstate.cli.common.command import Program
 from worldstate.cli.common.output import CommandResult
-
-EXAMPLE = """\
-examples:
-  source <(worldstate completion bash)
-  worldstate completion bash > ~/.local/share/bash-completion/completions/worldstate"""
-
-# Written once: to ask the command at every key would take a third of a second each time.
-_SCRIPT = """\
-_worldstate() {{
-    local current="${{COMP_WORDS[COMP_CWORD]}}" called="${{COMP_WORDS[1]}}" words="" first=2
-    case "$called" in
-    {groups}) called="$called ${{COMP_WORDS[2]}}"; first=3 ;;
-    esac
-    if [ "$COMP_CWORD" -eq 1 ]; then
-        words="{commands} --help --version"
-    elif [ "$COMP_CWORD" -lt "$first" ]; then
-        case "${{COMP_WORDS[1]}}" in
-{members}
-        esac
-    else
-        case "$called ${{COMP_WORDS[COMP_CWORD-1]}}" in
-{choices}
-        *) if [ "${{current:0:1}}" = "-" ]; then
-            case "$called" in
-{options}
-            esac
-        fi ;;
-        esac
-    fi
-    COMPREPLY=($(compgen -W "$words" -- "$current"))
-}}
-complete -o bashdefault -o default -F _worldstate worldstate"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -59,13 +33,18 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def bash_script(program: Program) -> str:
     """Return the script for the commands of a program."""
     parsers = {name: program.parser(name) for name in program.commands}
-    return _SCRIPT.format(
-        groups="|".join(program.groups),
-        commands=" ".join([*program.members(""), *program.groups, *program.hidden]),
-        members=_cases({group: program.members(group) for group in program.groups}),
-        choices="\n".join(line for name, one in parsers.items() for line in _choices(name, one)),
-        options=_cases({name: _options(one) for name, one in parsers.items()}),
-    )
+    words = {
+        "groups": "|".join(program.groups),
+        "commands": " ".join([*program.members(""), *program.groups, *program.hidden]),
+        "members": _cases({group: program.members(group) for group in program.groups}),
+        "choices": "\n".join(line for name, one in parsers.items() for line in _choices(name, one)),
+        "options": _cases({name: _options(one) for name, one in parsers.items()}),
+    }
+    # Written once: to ask the command at every key would take a third of a second each time.
+    script = (files("worldstate") / "data" / "completion.bash").read_text("utf-8").rstrip("\n")
+    for place, filled in words.items():
+        script = script.replace(f"@{place}@", filled)
+    return script
 
 
 def _cases(words: dict[str, list[str]]) -> str:

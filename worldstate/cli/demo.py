@@ -2,6 +2,8 @@
 
 Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
 before any camera can see it. Leaves timeline.png, states.jsonl and summary.json in the output folder.
+
+example: worldstate demo --out out/demo --seed 7
 """
 
 import argparse
@@ -9,17 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.output import CommandResult, output_folder, write_report
+from worldstate import adapters, simulation
+from worldstate.cli.common import listening, output, progress
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from worldstate.simulation.scene.settings import SimulationSettings
 
 # Louder than a car, so that the first recording that a newcomer sees is not a marginal one.
 VAN_OVER_CAR_DB = 6.0
-
-EXAMPLE = "example: worldstate demo --out out/demo --seed 7"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -33,41 +33,35 @@ def simulate_approach(root: Path, seed: int) -> Path:
     """Write one recording of a van that `seed` puts at a site and on a side; return its folder."""
     import numpy as np
 
-    from worldstate.cli.common.progress import progress_bar
-    from worldstate.simulation.dataset.dataset import write_log, write_recording
-    from worldstate.simulation.dataset.recording import simulate_recording
+    from worldstate.simulation.dataset.dataset import write_log
 
     rng = np.random.default_rng(seed)
     settings = _delivery_van(rng)
     root.mkdir(parents=True, exist_ok=True)
-    with progress_bar(f"simulating {settings.duration_s:g} s at {settings.site.name}", None):
-        recording = simulate_recording(settings, rng)
-        row = write_recording(root, recording)
+    with progress.progress_bar(f"simulating {settings.duration_s:g} s at {settings.site.name}", None):
+        recording = simulation.simulate_recording(settings, rng)
+        row = simulation.write_recording(root, recording)
     write_log(root, [row])
     return root / row.folder
 
 
-def _delivery_van(rng: "np.random.Generator") -> "SimulationSettings":
+def _delivery_van(rng: "np.random.Generator") -> "simulation.SimulationSettings":
     """Return an easy approach: a van, louder than a car, at 20 to 29 km/h without braking."""
-    from worldstate.simulation.scene.junction import SITES
-    from worldstate.simulation.scene.settings import draw_settings
-
-    site, side = str(rng.choice(SITES)), str(rng.choice(("left", "right")))
-    drawn = draw_settings(site, side, rng)
+    site, side = str(rng.choice(simulation.SITES)), str(rng.choice(("left", "right")))
+    drawn = simulation.draw_settings(site, side, rng)
     louder = replace(drawn.preset, vehicle_level_db=drawn.preset.vehicle_level_db + VAN_OVER_CAR_DB)
     return replace(drawn, speed_mps=rng.uniform(5.5, 8.0), braking_mps2=0.0, preset=louder)
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.source_files import open_source
-    from worldstate.cli.common.listening import listen_with_progress
     from worldstate.operations.viewing.state_figure import drawn_run
 
-    out = output_folder(arguments.out, "timeline.png", "states.jsonl", "summary.json")
+    out = output.output_folder(arguments.out, "timeline.png", "states.jsonl", "summary.json")
     folder = simulate_approach(out / "recording", arguments.seed)
-    source, title = open_source(folder), f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}"
+    source = adapters.open_source(folder)
+    title = f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}"
     with drawn_run(out / "timeline.png", source, title) as draw:
-        report = listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
-    write_report(out / "summary.json", report.to_dict())
-    return CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}"])
+        report = listening.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
+    output.write_report(out / "summary.json", report.to_dict())
+    return output.CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}"])

@@ -6,6 +6,12 @@ the alarm goes by, then and when the advisory began; the entity; the sensors; wh
 
 Without --time all advisories are listed and the first one is explained, or the highest risk where there is
 none.
+
+Examples
+--------
+  worldstate explain states.jsonl
+  worldstate explain states.jsonl --time 5.2
+  worldstate explain out/demo/states.jsonl --time 5.2 --side left --json
 """
 
 import argparse
@@ -14,16 +20,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.output import CommandResult
+from worldstate import ground
+from worldstate.cli.common import output
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.state import WorldState
-
-EXAMPLE = """\
-examples:
-  worldstate explain states.jsonl
-  worldstate explain states.jsonl --time 5.2
-  worldstate explain out/demo/states.jsonl --time 5.2 --side left --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -34,11 +36,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--side", help="of this side only, such as left (default: every side)")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.state_log import read_log, read_state_near
-    from worldstate.ground.checks import in_range
-    from worldstate.ground.values import nanoseconds, seconds
     from worldstate.operations.recordings.evidence_report import (
         common_lines,
         evidence_report,
@@ -52,16 +52,16 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         listed = ["advisories", *(f"  {one.line()}" for one in found), f"  {which}, another by --time", ""]
         told = {"advisories": [asdict(one) for one in found]}
     else:
-        stamp_ns = nanoseconds(in_range("--time", arguments.time, -9e9, 9e9))
+        stamp_ns = ground.nanoseconds(ground.in_range("--time", arguments.time, -9e9, 9e9))
     state = read_state_near(arguments.states, stamp_ns)
     _check_side(state, arguments.side)
     reports = evidence_report(state, partial(read_state_near, arguments.states), arguments.side)
-    now_s = seconds(state.stamp_ns)
+    now_s = ground.seconds(state.stamp_ns)
     written = state.to_dict()
     common = {key: written[key] for key in ("sensors", "searched", "events", "domain", "no_sequence")}
     lines = [line for report in reports.values() for line in report.lines(now_s)]
     sides = {side: one.to_dict() for side, one in reports.items()}
-    return CommandResult(
+    return output.CommandResult(
         told | {"time_s": now_s, "sides": sides} | common,
         table={},
         lines=[*listed, f"time  {now_s:.2f} s", *lines, *common_lines(state)],
@@ -69,7 +69,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _check_side(state: "WorldState", side: str | None) -> None:
-    from worldstate.ground.errors import InvalidArgumentError
 
     sides = [cue.direction for cue in state.cues]
     if side not in (None, *sides):

@@ -19,9 +19,18 @@ the model of a moving ego is taken where --model names none.
 
 --save-state keeps belief and site at the end, --resume goes on from them: from the time at which they end, or
 by --start from a later one.
+
+Examples
+--------
+  worldstate live --array mics.csv --device 2 --model mine.json --out states.jsonl
+  worldstate live --array mics.csv --model mine.json --camera-device 0 --camera camera.json
+  worldstate live --array mics.csv --model mine.json --detections 127.0.0.1:9100
+  worldstate live --play ovad_dataset/SA1/left/1_00_0002
+  worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4
 """
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
@@ -30,29 +39,19 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from worldstate.cli.common import exports, inputs, listening, sensors
-from worldstate.cli.common.command import stopped_by_signals
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import can_draw
-from worldstate.ground.values import seconds
+from worldstate import adapters, ground
+from worldstate.cli.common import command, exports, inputs, listening, output, progress, sensors
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.adapters.listener import Listener
     from worldstate.adapters.live.datagram_socket import DatagramSocket
     from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
-    from worldstate.adapters.source import Source
 
     HandIn = Callable[[Listener], None]
     Losses = Callable[[], dict[str, object]]
 
-EXAMPLE = """\
-examples:
-  worldstate live --array mics.csv --device 2 --model mine.json --out states.jsonl
-  worldstate live --array mics.csv --model mine.json --camera-device 0 --camera camera.json
-  worldstate live --array mics.csv --model mine.json --detections 127.0.0.1:9100
-  worldstate live --play ovad_dataset/SA1/left/1_00_0002
-  worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4"""
 
 # Lost sound is said at most so often.
 SAID_EVERY_NS = 1_000_000_000
@@ -92,12 +91,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.live.live_listening import live_steps
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
-    check_outputs(arguments, "out", "keep_sound", "save_state")
+    output.check_outputs(arguments, "out", "keep_sound", "save_state")
     given = listening.checked_sensors(arguments, [] if arguments.play is None else [arguments.play])
     with ExitStack() as opened:
         recorded = None if arguments.play is None else _source(arguments, given, arguments.play)
@@ -110,20 +109,19 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         tell, odometry_lost = _odometry(arguments, sound, opened)
         steps = live_steps(source, look, tell)
         figures = _listen(arguments, given, source, sound, steps) | looks_lost() | odometry_lost()
-        return CommandResult(figures | {"array": inputs.stance(source.array)})
+        return output.CommandResult(figures | {"array": inputs.stance(source.array)})
 
 
 def _source(
     arguments: argparse.Namespace, given: sensors.GivenSensors, sound: "LiveSound | Path"
-) -> "Source":
-    from worldstate.adapters.files.checkpoint_file import read_checkpoint
+) -> "adapters.Source":
     from worldstate.adapters.files.odometry_file import read_odometry
 
-    before = None if arguments.resume is None else read_checkpoint(arguments.resume)
+    before = None if arguments.resume is None else adapters.read_checkpoint(arguments.resume)
     # Of a running car the file tells that it moves, and where it was only of a recording that is played.
     path = None if arguments.odometry is not None else given.car.odometry
     drive = None if path is None else read_odometry(path)
-    ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
+    ended_s = 0.0 if before is None else ground.seconds(before.world.stamp_ns)
     return listening.open_given(
         given,
         sound,
@@ -138,9 +136,7 @@ def _source(
 
 
 def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "SoundFeed":
-    from worldstate.adapters.live.microphones import PortAudioInput
-    from worldstate.ground.checks import in_range
-    from worldstate.ground.errors import InvalidArgumentError
+    from worldstate.adapters.live.live_sound import PortAudioInput
 
     array = given.car.array
     if array is None:
@@ -148,21 +144,21 @@ def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> 
         raise InvalidArgumentError(f"--array: {problem}")
     device = arguments.device
     number = int(device) if device is not None and device.isdecimal() else device
-    rate_hz = int(in_range("--rate", arguments.rate, 1000, 1_000_000))
+    rate_hz = int(ground.in_range("--rate", arguments.rate, 1000, 1_000_000))
     return PortAudioInput(array.n_microphones, rate_hz, number)
 
 
-def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
-    from worldstate.adapters.audio.open_sound import open_sound
-    from worldstate.adapters.live.microphones import Playback
+def _played(arguments: argparse.Namespace, recorded: "adapters.Source") -> "SoundFeed":
+    from worldstate.adapters.audio.sound_file import open_sound
+    from worldstate.adapters.live.live_sound import Playback
 
     audio = open_sound(recorded.sound, recorded.array.n_microphones, strict=False)
     return Playback(audio, arguments.speed, arguments.duration)
 
 
 def _with_cameras(
-    given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
-) -> "tuple[Source, HandIn, Losses]":
+    given: sensors.GivenSensors, source: "adapters.Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[adapters.Source, HandIn, Losses]":
     """Return the source with the cameras that were asked for, what hands their looks in, and their losses."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS, SENSOR
     from worldstate.adapters.live.datagram_socket import DetectionSocket
@@ -189,8 +185,8 @@ def _with_cameras(
 
 
 def _with_device(
-    given: sensors.GivenSensors, source: "Source", sound: "LiveSound", opened: ExitStack
-) -> "tuple[Source, HandIn, Losses]":
+    given: sensors.GivenSensors, source: "adapters.Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[adapters.Source, HandIn, Losses]":
     """Return the source with a camera of this machine."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS
     from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, image_channel
@@ -233,24 +229,24 @@ def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") 
 def _listen(
     arguments: argparse.Namespace,
     given: sensors.GivenSensors,
-    source: "Source",
+    source: "adapters.Source",
     sound: "LiveSound",
     steps: "Iterator[LiveStep]",
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
-    from worldstate.adapters.files.checkpoint_file import save_checkpoint
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
     from worldstate.adapters.state_log import states_writer
     from worldstate.operations.recordings.warning import WarningMeter
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice = _loss_notices()
-    start_s, last = seconds(source.start_ns), None
+    start_s, last = ground.seconds(source.start_ns), None
+    longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
         states_writer(arguments.out) as write,
         exports.exported_hops(arguments, source, given.car.crossing_m, paced=False) as export,
         _view(arguments) as show,
-        stopped_by_signals(sound.close),
+        command.stopped_by_signals(sound.close),
     ):
         for live in steps:
             write(live.step.state.to_json())
@@ -260,13 +256,10 @@ def _listen(
             show(live)
             notice(live)
             last = live.step
-            if (
-                arguments.duration is not None
-                and seconds(last.state.stamp_ns) - start_s >= arguments.duration
-            ):
+            if ground.seconds(last.state.stamp_ns) - start_s >= longest_s:
                 break
     if arguments.save_state is not None and last is not None:
-        save_checkpoint(arguments.save_state, last.checkpoint)
+        adapters.save_checkpoint(arguments.save_state, last.checkpoint)
     return {
         "states": warnings.states,
         "sound_s": sound.frames / sound.sample_rate_hz,
@@ -284,7 +277,7 @@ def _listen(
 @contextmanager
 def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
     """Lend a function that shows a hop where --view or a terminal asks for it."""
-    if not (can_draw() if arguments.view is None else arguments.view):
+    if not (progress.can_draw() if arguments.view is None else arguments.view):
         yield lambda live: None
         return
     from worldstate.cli.common.live_view import live_view
@@ -303,6 +296,6 @@ def _loss_notices() -> "Callable[[LiveStep], None]":
         if live.overruns > said and stamp_ns - said_ns >= SAID_EVERY_NS:
             said, said_ns = live.overruns, stamp_ns
             lost = f"{live.overruns} overruns, {live.lost_s:.2f} s of sound lost"
-            print(f"worldstate: {seconds(stamp_ns):.1f} s: {lost}", file=sys.stderr)
+            print(f"worldstate: {ground.seconds(stamp_ns):.1f} s: {lost}", file=sys.stderr)
 
     return notice

@@ -1,7 +1,9 @@
-"""Entry point: one module per command, each with `EXAMPLE`, `add_options` and `run`."""
+"""Entry point: one module per command, with `add_options` and `run` and a docstring that ends in examples."""
 
+import json
 import sys
 from collections.abc import Sequence
+from importlib.resources import files
 
 from worldstate.cli.common.command import Program, run_program
 from worldstate.ground.errors import InvalidArgumentError
@@ -23,64 +25,11 @@ GROUPS = {
     "log": "the snapshots of a run: drawn, replayed",
     "sim": "simulated streets",
 }
-# Former names of commands, read through the next minor version.
-FORMER = {
-    "doctor": "array check",
-    "bounds": "array bounds",
-    "bearings": "array bearings",
-    "align": "array align",
-    "commission": "model make",
-    "train": "model fit",
-    "calibrate": "model threshold",
-    "extract-features": "model features",
-    "measure-absence": "model detector",
-    "learn-street": "street learn",
-    "label": "street label",
-    "plot": "log plot",
-    "replay": "log replay",
-    "simulate": "sim make",
-    "to-bag": "sim to-bag",
-}
-# Studies are commands of `worldstate-lab`, which the wheel of the library does not hold.
-STUDIES = {
-    "evaluate": "table",
-    "evaluate-features": "windows",
-    "evaluate-streams": "streams",
-    "evaluate-signatures": "corpora",
-    "evaluate-planner": "planner",
-    "ablations": "ablations",
-    "realism": "realism",
-    "identifiability": "reach",
-    "foreign-sounds": "foreign",
-    "road-users": "kinds",
-    "place": "place",
-    "bench": "bench",
-}
-
-_CAMERA_FILE = "a key of the camera in --camera or --car"
-# Options that are gone, with what stands in their place.
-FORMER_OPTIONS = {
-    **dict.fromkeys(("--rate", "--channels", "--format"), "INPUT pcm:RATE:CHANNELS:FORMAT"),
-    **{f"--{name}-topic": f"--topic {name}=TOPIC" for name in ("audio", "detections", "odometry")},
-    **{f"--{name}": f"--export {name}=FILE" for name in ("mcap", "rerun", "osi", "autoware")},
-    "--live": "--export foxglove=PORT",
-    "--odas": "--export odas=HOST:PORT",
-    "--ros-bag": "--export rosbag=FOLDER",
-    "--ros-storage": "--export rosbag-sqlite3=FOLDER",
-    "--crossing": "crossing_m in --car",
-    "--camera-name": "--camera NAME",
-    "--camera-detections": "--detections NAME=PATH",
-    "--image-rate": f"image_rate_hz, {_CAMERA_FILE}",
-    "--min-box-px": f"min_box_px, {_CAMERA_FILE}",
-    "--min-score": f"min_score, {_CAMERA_FILE}",
-    "--classes": f"classes, {_CAMERA_FILE}",
-    "--onnx-model": "--detector FILE.onnx",
-    "--labels": f"labels, {_CAMERA_FILE}",
-    "--forgetting": "--site-memory S",
-    "--site-adaptation": "--site-memory S",
-    "--no-site-adaptation": "--site-memory 0",
-}
-
+# Former names of commands and options, read through the next minor version, and what stands in their place;
+# studies are commands of `worldstate-lab`, which the wheel of the library does not hold.
+FORMER, STUDIES, FORMER_OPTIONS = json.loads(
+    (files("worldstate") / "data" / "former_names.json").read_text("utf-8")
+).values()
 DESCRIPTION = "Keep a structured world-state alive from sound when vision fails."
 EPILOG = """\
 example: worldstate demo --out out/demo

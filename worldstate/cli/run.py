@@ -13,33 +13,32 @@ that of detections with stamps, too).
 the corner that hides the arm (x ahead, y left of the ego) and the lane behind it, metres, or "open": true of
 an arm that hides nothing; optional "speed_mps" and "corner_std_m" of an arm, "rates", "priors",
 "ego_speed_mps", "site", "view_half_angle_deg". With --odometry corners move as the ego does.
-"""
 
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from worldstate.cli.common import exports, inputs, listening, sensors
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.ground.errors import InputFileError
-
-if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import SoundInput
-    from worldstate.adapters.camera.detections import DetectionLog
-    from worldstate.adapters.files.odometry_file import OdometryLog
-    from worldstate.adapters.listener import Step
-    from worldstate.adapters.source import Source
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-
-EXAMPLE = """\
-examples:
+Examples
+--------
   worldstate run some.wav --array mics.csv --detections d.json --camera camera.json --out states.jsonl
   worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png
   worldstate run ovad_dataset/SB1/left/2_00_0005 --context elm_street.json
   worldstate run second.wav --resume state.json --start 60 --save-state state2.json
   worldstate run drive.wav --car car.json --ego-noise
   worldstate run ovad_dataset/SA1/left/1_00_0002 --export mcap=out.mcap
-  worldstate run street_bag --export rosbag=states_bag"""
+  worldstate run street_bag --export rosbag=states_bag
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate import adapters, frontend
+from worldstate.cli.common import exports, inputs, listening, output, sensors
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+if TYPE_CHECKING:
+    from worldstate.adapters.audio.sound_file import SoundInput
+    from worldstate.adapters.files.odometry_file import OdometryLog
+
+    Seen = Path | adapters.DetectionLog | None
+
 # What a first user needs.
 FIRST_OPTIONS = (
     *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--detections", "--camera"),
@@ -63,21 +62,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     other = "what another sensor recorded, by a reader that an installed package brings; may be repeated"
     add("--measurements", action="append", default=[], metavar="NAME=FILE", help=other)
     sensors.add_detector_option(parser, default=None)
-    output = exports.add_output_options(parser)
-    output.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
+    group = exports.add_output_options(parser)
+    group.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    check_outputs(arguments, "out", "save_state", figures=("figure",))
+    output.check_outputs(arguments, "out", "save_state", figures=("figure",))
     given = listening.checked_sensors(arguments, arguments.input if inputs.bag_of(arguments) is None else [])
-    return _heard(arguments, given)
-
-
-def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> CommandResult:
-    """Listen to the recording; return what was found."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
-    from worldstate.adapters.files.checkpoint_file import save_checkpoint
     from worldstate.operations.viewing.state_figure import drawn_run
 
     source = _source(arguments, given)
@@ -87,7 +80,7 @@ def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> Comman
             exports.exported_hops(arguments, source, given.car.crossing_m) as export,
         ):
 
-            def on_hop(step: "Step") -> None:
+            def on_hop(step: "adapters.Step") -> None:
                 export(step)
                 draw(step)
 
@@ -97,15 +90,15 @@ def _heard(arguments: argparse.Namespace, given: sensors.GivenSensors) -> Comman
             raise
         raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
     if arguments.save_state is not None and report.end is not None:
-        save_checkpoint(arguments.save_state, report.end)
+        adapters.save_checkpoint(arguments.save_state, report.end)
     summary = report.to_dict() | {
         "array": inputs.stance(source.array),
         "detections": sensors.box_counts(source, as_json=arguments.json),
     }
-    return CommandResult(summary)
+    return output.CommandResult(summary)
 
 
-def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "Source":
+def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "adapters.Source":
     from worldstate.adapters.own_parts import other_modality
     from worldstate.operations.recordings.car_cameras import with_cameras
 
@@ -129,12 +122,11 @@ def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "Sour
 
 
 def _input(
-    arguments: argparse.Namespace, given: sensors.GivenSensors, seen: "Path | DetectionLog | None"
-) -> "tuple[SoundInput, MicrophoneArray | None, Path | DetectionLog | None, OdometryLog | None]":
+    arguments: argparse.Namespace, given: sensors.GivenSensors, seen: "Seen"
+) -> "tuple[SoundInput, frontend.MicrophoneArray | None, Seen, OdometryLog | None]":
     """Return sound, array, detections and odometry: options, the car's, or what a bag holds."""
     from worldstate.adapters.files.odometry_file import read_odometry
     from worldstate.adapters.ros.bag_input import needed_array, read_bag
-    from worldstate.ground.errors import InvalidArgumentError
 
     bag, moves = inputs.bag_of(arguments), arguments.odometry or given.car.odometry
     if bag is None:

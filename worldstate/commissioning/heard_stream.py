@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.acoustic import LEVEL_BAND_HZ, heard_of
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability

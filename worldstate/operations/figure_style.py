@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.file_io import atomic_path
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.extras import check_extra
 from worldstate.ground.typing import FloatArray

@@ -6,6 +6,12 @@ weight of looming are set on other recordings, in five folds that are the same i
 
 INPUT is a data set in the OVAD layout or hop streams that `worldstate model threshold --save-streams` wrote;
 approaches need a T0, and there have to be hazard-free recordings.
+
+Examples
+--------
+  worldstate sim make --out sim --static 40 && worldstate-lab ablations sim
+  worldstate model threshold sim --out model.json --save-streams sim.npz
+  worldstate-lab ablations sim.npz --json
 """
 
 import argparse
@@ -274,13 +280,6 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
 def _share(flags: Sequence[BoolArray]) -> float | None:
     hops = np.concatenate(flags) if flags else np.empty(0)
     return float(hops.mean()) if hops.size else None
-
-
-EXAMPLE = """\
-examples:
-  worldstate sim make --out sim --static 40 && worldstate-lab ablations sim
-  worldstate model threshold sim --out model.json --save-streams sim.npz
-  worldstate-lab ablations sim.npz --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -12,6 +12,11 @@ bicycles and trams are rows of their own, by models that never heard them.
 
   --idmt      the folder of IDMT-Traffic, with audio/ and annotation/ (doi:10.5281/zenodo.7551553)
   --melaudis  a folder with MELAUDIS_Vehicles/ and MELAUDIS_BG/ (doi:10.6084/m9.figshare.27115870)
+
+Examples
+--------
+  worldstate-lab corpora --idmt IDMT_Traffic --json
+  worldstate-lab corpora --idmt IDMT_Traffic --melaudis MELAUDIS --jobs 4 --out signatures
 """
 
 import argparse
@@ -20,8 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.datasets.traffic_clips import TrafficClip, idmt_traffic, melaudis
-from worldstate.adapters.files.atomic import write_text
+from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
@@ -39,6 +43,7 @@ from worldstate_lab.signatures.signature_study import (
     SignatureStudy,
     signature_study,
 )
+from worldstate_lab.signatures.traffic_clips import TrafficClip, idmt_traffic, melaudis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -106,11 +111,6 @@ def _number(value: float | None, row: SignatureRow) -> str:
 Corpora = tuple[ClipSignatures | None, ClipSignatures | None]
 
 NAMES = ("signatures.json", "signatures.txt", "signatures.png")
-
-EXAMPLE = """\
-examples:
-  worldstate-lab corpora --idmt IDMT_Traffic --json
-  worldstate-lab corpora --idmt IDMT_Traffic --melaudis MELAUDIS --jobs 4 --out signatures"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -8,6 +8,10 @@ sites: at most .025 of the hops of each of hidden, in view and empty are flagged
 Speech, music, bells, tools, tones, birds, steps and rain are foreign; siren, horn, reversing beeper and bell
 of a bicycle are warning signals, which come from vehicles. A hop counts where the sound is as loud as the
 ambience or louder, from 250 to 2600 Hz over one second.
+
+Examples
+--------
+  worldstate-lab foreign SA1-busy-1.npz SB1-busy-1.npz SB2-busy-1.npz --out foreign
 """
 
 import argparse
@@ -18,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.abduction.signature.domain_guard import DomainGuard, Foreign, WarningSignal
-from worldstate.adapters.files.atomic import write_text
+from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import (
@@ -124,10 +128,6 @@ def _code(guard: DomainGuard, measures: FloatArray) -> float:
 
 NAMES = ("foreign_sounds.json", "foreign_sounds.txt")
 SITES = 3  # At least: one that is judged and two others that set its threshold
-
-EXAMPLE = """\
-examples:
-  worldstate-lab foreign SA1-busy-1.npz SB1-busy-1.npz SB2-busy-1.npz --out foreign"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -7,6 +7,10 @@ lies more than 6 dB below the ambience are of the class *unknown*. Figures are o
 
 With --streams such hops of streams are judged, as they come, where one vehicle is heard alone; streams are to
 be of other junctions than the drawn ones.
+
+Examples
+--------
+  worldstate-lab kinds --junctions 16 --passes 2 --jobs 2
 """
 
 import argparse
@@ -112,11 +116,6 @@ def _examined(near: RoadUserRows, said: FloatArray, weights: FloatArray, shares:
         recall=np.bincount(classes, hits, len(CLASSES)) / np.maximum(counts, 1.0),
         recall_of_equals=np.bincount(classes, equals, len(CLASSES)) / np.maximum(counts, 1.0),
     )
-
-
-EXAMPLE = """\
-examples:
-  worldstate-lab kinds --junctions 16 --passes 2 --jobs 2"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

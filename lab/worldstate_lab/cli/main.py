@@ -1,4 +1,4 @@
-"""Entry point of `worldstate-lab`: one module per study, each with `EXAMPLE`, `add_options` and `run`."""
+"""Entry point of `worldstate-lab`: one module per study, as those of `worldstate`."""
 
 import argparse
 import json
@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from worldstate.adapters.files.atomic import check_target, write_text
+from worldstate.adapters.files.file_io import check_target, write_text
 from worldstate.cli.common.command import CommandParser, Program, run_program
 from worldstate.cli.common.output import CommandResult
 from worldstate.ground.errors import InputFileError

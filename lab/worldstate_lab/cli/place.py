@@ -11,6 +11,11 @@ far ahead vehicles cross follows from where they come into view, 4.5 m and 4.0 m
 Columns of a file of spatial spectra, one row a hop: ``time_s``, ``x_m`` (along the crossing street, right
 positive; may be empty) and ``srp_0`` to ``srp_179``, the steered response on `numpy.linspace(-90, 90, 180)`
 degrees, right positive.
+
+Examples
+--------
+  worldstate-lab place --passes 10
+  worldstate-lab place trials/*.csv --passes 30 --json
 """
 
 import argparse
@@ -24,7 +29,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from worldstate.adapters.files.text_file import number, read_rows
+from worldstate.adapters.files.file_io import number, read_rows
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -284,11 +289,6 @@ def _with_errors(
 def _rms(errors_m: FloatArray) -> float:
     return float(np.sqrt(np.mean(errors_m**2)))
 
-
-EXAMPLE = """\
-examples:
-  worldstate-lab place --passes 10
-  worldstate-lab place trials/*.csv --passes 30 --json"""
 
 _COLUMNS = {
     "hops": "hops",

@@ -5,6 +5,11 @@ vehicles cross as they did and do not mind it. Three planners drive the same car
 one knows nothing and brakes for whom it sees, one assumes a vehicle behind both corners at every time, and
 one assumes it only from a chance of the state on, which is set on streams of other seeds (`--set-on`).
 Printed are collisions, braking that no vehicle made necessary, and time.
+
+Examples
+--------
+  worldstate-lab planner streams/*-200[23]*.npz --set-on streams/*-approaches-2001*.npz --cache chances
+  worldstate-lab planner streams/SB1-*.npz --threshold 0.005 --count 100 --figure planner.png
 """
 
 import argparse
@@ -30,11 +35,6 @@ from worldstate_lab.planner.planner_exam import (
     write_planner_figure,
 )
 from worldstate_lab.report.table import figure_lines
-
-EXAMPLE = """\
-examples:
-  worldstate-lab planner streams/*-200[23]*.npz --set-on streams/*-approaches-2001*.npz --cache chances
-  worldstate-lab planner streams/SB1-*.npz --threshold 0.005 --count 100 --figure planner.png"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -13,6 +13,12 @@ beside the error that the classifier of --method makes on recordings that it was
 
 Of --recordings, a data set in the OVAD layout: the Fisher ratio of each band between windows with a vehicle
 and without one, by level and by the shape of the spectrum alone, and the range in which shape tells most.
+
+Examples
+--------
+  worldstate-lab reach --array mics.xml --snr-db -5 --figure bounds.png
+  worldstate-lab reach --features features.csv --json
+  worldstate sim make --out sim --static 40 && worldstate-lab reach --recordings sim
 """
 
 import argparse
@@ -76,12 +82,6 @@ def _draw_data(axes: "Axes", data: ReachOnData) -> None:
 
 # Both ways to endfire of an array across the vehicle, where the bound diverges.
 AZIMUTHS_DEG = tuple(range(-90, 91, 15))
-
-EXAMPLE = """\
-examples:
-  worldstate-lab reach --array mics.xml --snr-db -5 --figure bounds.png
-  worldstate-lab reach --features features.csv --json
-  worldstate sim make --out sim --static 40 && worldstate-lab reach --recordings sim"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -16,6 +16,12 @@ FEATURES.csv is a table of labelled windows, such as the one released with OVAD,
 wrote of a folder in its layout. OUT/realism.json is the report, OUT/windows-SEED.csv what was simulated,
 OUT/permuted-SEED.csv the same with permuted positions: given as --simulated and --permuted, they are held
 against the table again without simulating. OUT/realism.png shows the measures junction by junction.
+
+Examples
+--------
+  worldstate-lab realism extracted_features.csv --jobs 2 --out realism
+  worldstate-lab realism extracted_features.csv --sites SA1 SB1 SB2 --measures-only --real-only
+  worldstate-lab realism extracted_features.csv --group dynamic --json
 """
 
 import argparse
@@ -124,12 +130,6 @@ Pair = tuple[FeatureTable, FeatureTable | None]
 # Windows from either side at every site; the seeds show what one draw of streets changes.
 WINDOWS = 10
 SEEDS = (1, 2, 3)
-
-EXAMPLE = """\
-examples:
-  worldstate-lab realism extracted_features.csv --jobs 2 --out realism
-  worldstate-lab realism extracted_features.csv --sites SA1 SB1 SB2 --measures-only --real-only
-  worldstate-lab realism extracted_features.csv --group dynamic --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

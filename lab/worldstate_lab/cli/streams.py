@@ -11,6 +11,11 @@ becomes of its entity. How much it adds stands first, last the trade between nam
 other side of one. "worst" is of the junctions with eight cases or more.
 
 The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
+
+Examples
+--------
+  worldstate-lab streams streams/*-2001-*.npz --model my_model.json
+  worldstate-lab streams streams/SA1-*.npz --model my_model.json --camera none --json
 """
 
 import argparse
@@ -27,11 +32,6 @@ from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import pass_figures, sides_by_risk
 from worldstate_lab.passes.second_vehicle import hearing_allows, second_figures
 from worldstate_lab.report.table import figure_lines
-
-EXAMPLE = """\
-examples:
-  worldstate-lab streams streams/*-2001-*.npz --model my_model.json
-  worldstate-lab streams streams/SA1-*.npz --model my_model.json --camera none --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

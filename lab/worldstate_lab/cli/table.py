@@ -24,6 +24,13 @@ hour in every state beside those of the clean camera, on the same minutes: half 
 
 A recording that cannot be heard is named and left out. Rows of a model that was not made for the array of the
 recordings are named and not scored.
+
+Examples
+--------
+  worldstate-lab table --smoke --out smoke
+  worldstate-lab table --out streets --jobs 2
+  worldstate-lab table ovad_dataset --features extracted_features.csv --out report --jobs 2
+  worldstate-lab table mine --hazard-free quiet_hour.wav --out report --against before
 """
 
 import argparse
@@ -35,8 +42,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.camera.detections import DetectionFilter
-from worldstate.adapters.datasets.array_choice import choose_array
-from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset
+from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, choose_array
 from worldstate.adapters.files.acoustic_domain import check_array
 from worldstate.adapters.files.array_match import microphone_order
 from worldstate.adapters.files.model_file import read_model
@@ -73,13 +79,6 @@ from worldstate_lab.trials.classification import Classifiers, model_from_windows
 from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import model_refusal
 from worldstate_lab.trials.takes import Take, TakeList, find_takes
-
-EXAMPLE = """\
-examples:
-  worldstate-lab table --smoke --out smoke
-  worldstate-lab table --out streets --jobs 2
-  worldstate-lab table ovad_dataset --features extracted_features.csv --out report --jobs 2
-  worldstate-lab table mine --hazard-free quiet_hour.wav --out report --against before"""
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59

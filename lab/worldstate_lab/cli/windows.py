@@ -25,6 +25,11 @@ same for every method.
 
 With --model a finished model is evaluated instead; it is refused where it was trained on these recordings.
 Keys that end in _absent are of eq. (6) with the visible explanation removed.
+
+Examples
+--------
+  worldstate-lab windows features.csv --group static --protocol lojo --json
+  worldstate-lab windows features.csv --model model.json --only testset.csv
 """
 
 import argparse
@@ -44,7 +49,7 @@ from worldstate.abduction.cueing.calibration_error import (
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, read_ids
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.file_io import atomic_path
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.output import CommandResult, check_outputs
@@ -314,11 +319,6 @@ def draw_figures(
 Report = dict[str, Any]
 # What fits a line of the table; the JSON object has the gains of all figures.
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
-
-EXAMPLE = """\
-examples:
-  worldstate-lab windows features.csv --group static --protocol lojo --json
-  worldstate-lab windows features.csv --model model.json --only testset.csv"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.adapters.camera.degradation import LEVELS
+from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import (

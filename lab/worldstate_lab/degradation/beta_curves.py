@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from worldstate.adapters.camera.degradation import LEVELS
+from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.adapters.camera.detections import DetectionLog
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera

@@ -9,9 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from scipy.special import ndtr
 
-from worldstate.adapters.audio.open_sound import RawPcm, open_sound
-from worldstate.adapters.audio.sound_file import Audio
-from worldstate.adapters.camera.degradation import (
+from worldstate.adapters.audio.sound_file import Audio, RawPcm, open_sound
+from worldstate.adapters.camera.camera_health import (
     LEVELS,
     QUANTILES,
     Family,

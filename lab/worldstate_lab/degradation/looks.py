@@ -11,6 +11,7 @@ import numpy as np
 from worldstate.adapters.camera.camera_channel import any_motion
 from worldstate.adapters.camera.camera_health import (
     LARGEST_PX,
+    LEVELS,
     CameraHealth,
     DegradationLog,
     HealthMonitor,
@@ -18,7 +19,6 @@ from worldstate.adapters.camera.camera_health import (
     health_scale,
     image_quality,
 )
-from worldstate.adapters.camera.degradation import LEVELS
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.motion_detector import Background, MotionDetector

@@ -14,16 +14,20 @@ import numpy as np
 
 from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.adapters.acoustic import asked_again
-from worldstate.adapters.camera.box_linking import kept_and_parked, overlaps
+from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.camera_health import DegradationLog
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import (
+    DetectionFilter,
+    DetectionFrame,
+    DetectionLog,
+    kept_and_parked,
+)
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import MAX_IMAGE_AGE_S, VisionQuery
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
-from worldstate.adapters.source import Source, unoccluded_sector
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import Source, open_source, unoccluded_sector
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray

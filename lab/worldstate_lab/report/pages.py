@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from worldstate.adapters.files.atomic import check_target
+from worldstate.adapters.files.file_io import check_target
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.figure_style import figure_file
 from worldstate.simulation.parallel import deferred_signals

@@ -6,12 +6,13 @@ from functools import cache
 
 import numpy as np
 
-from worldstate.adapters.datasets.traffic_clips import BACKGROUND, ClipLabels, TrafficClip, read_clip
 from worldstate.frontend.levels import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.simulation.parallel import in_processes
+
+from .traffic_clips import BACKGROUND, ClipLabels, TrafficClip, read_clip
 
 # Bands end at whole bins of 512 samples, so clips of two rates would have different bands: all are brought
 # to the rate of the larger corpus first.

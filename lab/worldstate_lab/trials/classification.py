@@ -9,7 +9,6 @@ import numpy as np
 
 from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_extraction import (
     FRONT,
     FRONT_LATER_S,
@@ -18,6 +17,7 @@ from worldstate.adapters.datasets.feature_extraction import (
     sample_windows,
 )
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
+from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_array, ovad_domain
 from worldstate.adapters.files.model_file import save_model
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError

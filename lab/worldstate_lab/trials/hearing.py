@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.datasets.array_choice import named_array
+from worldstate.adapters.datasets.ovad import named_array
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode

@@ -13,14 +13,13 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings
 from worldstate.adapters.acoustic import Grounding, observe
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
-from worldstate.adapters.camera.box_linking import kept_and_parked
+from worldstate.adapters.camera.detections import kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.adapters.files.array_match import TRAIN
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import Step, listen_steps, measure_steps
-from worldstate.adapters.source import ListenSettings, Source
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.approach.doppler import radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
-from worldstate.adapters.files.atomic import write_text
+from worldstate.adapters.files.file_io import write_text
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 

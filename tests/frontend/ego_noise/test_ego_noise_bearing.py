@@ -9,14 +9,13 @@ import scipy.signal
 import soundfile
 
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.adapters.files.acoustic_domain import check_tables
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import listen_steps, measure_steps
-from worldstate.adapters.source import ListenSettings, Source
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings

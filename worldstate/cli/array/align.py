@@ -7,55 +7,52 @@ apart.
 Each interval is a bootstrap over the vehicles, and does not hold what all vehicles share: where a vehicle is
 heard, taken as a third of its length behind the front (a tenth more or less is 0.1 s of offset), and 10 m for
 the way of the sound (3 ms a metre).
+
+Examples
+--------
+  worldstate array align drives/* --car car.json --camera front --out aligned.json
+  worldstate array align ovad_dataset --json
 """
 
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.inputs import add_search_options, search_of
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.sensors import add_sensor_options, recorded
-
-EXAMPLE = """\
-examples:
-  worldstate array align drives/* --car car.json --camera front --out aligned.json
-  worldstate array align ovad_dataset --json"""
+from worldstate.cli.common import inputs, output, progress, sensors
+from worldstate.ground.errors import InvalidArgumentError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    inputs = "data sets, recording folders, or a sound file with --detections"
-    add("input", type=Path, nargs="+", metavar="RECORDING", help=inputs)
-    add_sensor_options(parser)
-    add_search_options(parser)
+    told = "data sets, recording folders, or a sound file with --detections"
+    add("input", type=Path, nargs="+", metavar="RECORDING", help=told)
+    sensors.add_sensor_options(parser)
+    inputs.add_search_options(parser)
     add("--out", type=Path, metavar="FILE", help="the file of --car, with both added, beside it")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from dataclasses import asdict, replace
 
     from worldstate.adapters.vehicle.car_file import write_aligned
-    from worldstate.cli.common.progress import track
-    from worldstate.ground.errors import InvalidArgumentError
     from worldstate.operations.alignment.camera_alignment import LARGEST_OFFSET_S, align, heard_passes
     from worldstate.operations.calibration.calibration_input import find_inputs
 
-    check_outputs(arguments, "out")
+    output.check_outputs(arguments, "out")
     if arguments.out is not None and arguments.car is None:
         raise InvalidArgumentError("--out: expected --car with it, whose camera is aligned")
-    inputs = [found for path in arguments.input for found in find_inputs(path)]
-    if arguments.detections and len(inputs) > 1:
+    recordings = [found for path in arguments.input for found in find_inputs(path)]
+    if arguments.detections and len(recordings) > 1:
         raise InvalidArgumentError("--detections: expected one recording with it, folders bring their own")
-    settings = replace(search_of(arguments), mask_dead=True)
+    settings = replace(inputs.search_of(arguments), mask_dead=True)
     passes = [
         one
-        for path in track(inputs, "listening", len(inputs))
-        for one in heard_passes(recorded(arguments, path, settings), LARGEST_OFFSET_S)
+        for path in progress.track(recordings, "listening", len(recordings))
+        for one in heard_passes(sensors.recorded(arguments, path, settings), LARGEST_OFFSET_S)
     ]
     found = align(passes)
     if arguments.out is not None:
         name = None if arguments.camera is None else str(arguments.camera)
         write_aligned(arguments.car, arguments.out, name, found.offset_s, found.yaw_deg)
-    return CommandResult({"recordings": len(inputs)} | asdict(found))
+    return output.CommandResult({"recordings": len(recordings)} | asdict(found))

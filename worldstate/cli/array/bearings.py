@@ -6,18 +6,17 @@ Write the bearing of the loudest source every tenth of a second, for any array, 
 positive), std_deg (standard deviation as the front-end states it) and prominence (peak over median of the
 spatial spectrum; 1 in silence). --sources adds the number of plane waves in each second by an information
 criterion: reflections count, so it is no number of vehicles.
+
+Examples
+--------
+  worldstate array bearings some.wav --array mics.csv --out bearings.csv --figure bearings.png
+  worldstate array bearings mic1.wav mic2.wav --array pair.json --azimuth-span 360 --out bearings.csv
 """
 
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common import inputs
-from worldstate.cli.common.output import CommandResult, check_outputs
-
-EXAMPLE = """\
-examples:
-  worldstate array bearings some.wav --array mics.csv --out bearings.csv --figure bearings.png
-  worldstate array bearings mic1.wav mic2.wav --array pair.json --azimuth-span 360 --out bearings.csv"""
+from worldstate.cli.common import inputs, output, progress
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -30,18 +29,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw azimuth over time")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.atomic import write_text
-    from worldstate.cli.common.progress import sound_bar
+    from worldstate.adapters.files.file_io import write_text
     from worldstate.operations.recordings.bearing_track import (
         bearings_csv,
         track_bearings,
         write_bearings_figure,
     )
 
-    check_outputs(arguments, "out", figures=("figure",))
-    with inputs.opened_front_end(arguments) as (audio, front_end), sound_bar(audio) as bar:
+    output.check_outputs(arguments, "out", figures=("figure",))
+    with inputs.opened_front_end(arguments) as (audio, front_end), progress.sound_bar(audio) as bar:
         track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
         silent = list(audio.silent_channels)
     write_text(arguments.out, bearings_csv(track))
@@ -54,4 +52,4 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "hops": len(track),
         "silent_channels": silent,
     }
-    return CommandResult(summary)
+    return output.CommandResult(summary)

@@ -3,60 +3,51 @@
 Print the second moment S_xx, aperture and alias frequency of an array, and the Cramer-Rao bound of a bearing
 at several azimuths: the standard deviation that no unbiased estimator can beat. The SNR is per microphone and
 snapshot, N snapshots independent.
+
+Examples
+--------
+  worldstate array bounds
+  worldstate array bounds --array mics.xml --frequency 800 --snr-db 0 10 20
 """
 
 import argparse
-from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import add_array_options, given_array, stance
-from worldstate.cli.common.output import CommandResult
-
-if TYPE_CHECKING:
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-    from worldstate.operations.arrays.array_bounds import ArrayBounds
+from worldstate import frontend, ground, operations
+from worldstate.cli.common import inputs, output
 
 AZIMUTHS_DEG = (0.0, 20.0, 40.0, 60.0, 80.0)
 # From below the threshold SNR, where estimators fail, to well above it.
 SNR_DB = (-15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
 
-EXAMPLE = """\
-examples:
-  worldstate array bounds
-  worldstate array bounds --array mics.xml --frequency 800 --snr-db 0 10 20"""
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_array_options(parser, "the 56-microphone roof array")
+    inputs.add_array_options(parser, "the 56-microphone roof array")
     add = parser.add_argument
     add("--frequency", type=float, default=1000.0, metavar="HZ", help="of the source (default: %(default)g)")
     add("--snr-db", type=float, nargs="+", default=list(SNR_DB), metavar="DB", help="(default: -15 to 30)")
     add("--snapshots", type=int, default=20, metavar="N", help="(default: %(default)s)")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.frontend.array.microphone_array import roof_array_56
-    from worldstate.ground.checks import in_range
-    from worldstate.operations.arrays.array_bounds import array_bounds
-
-    in_range("--frequency", arguments.frequency, 0.0, 1e6, open_low=True)
-    in_range("--snapshots", arguments.snapshots, 1, 1e6)
+    ground.in_range("--frequency", arguments.frequency, 0.0, 1e6, open_low=True)
+    ground.in_range("--snapshots", arguments.snapshots, 1, 1e6)
     for level in arguments.snr_db:
-        in_range("--snr-db", level, -100.0, 100.0)
-    array = given_array(arguments) or roof_array_56()
-    bounds = array_bounds(array, arguments.frequency, AZIMUTHS_DEG)
+        ground.in_range("--snr-db", level, -100.0, 100.0)
+    array = inputs.given_array(arguments) or frontend.roof_array_56()
+    bounds = operations.array_bounds(array, arguments.frequency, AZIMUTHS_DEG)
     report = bounds.to_dict() | {"snapshots": arguments.snapshots, "snr_db": arguments.snr_db}
-    return CommandResult(report, table=_as_table(bounds, array, arguments))
+    return output.CommandResult(report, table=_as_table(bounds, array, arguments))
 
 
 def _as_table(
-    bounds: "ArrayBounds", array: "MicrophoneArray", arguments: argparse.Namespace
+    bounds: "operations.ArrayBounds", array: "frontend.MicrophoneArray", arguments: argparse.Namespace
 ) -> dict[str, object]:
     """One line a quantity, and one an azimuth, for people."""
     N, levels = arguments.snapshots, arguments.snr_db
     table: dict[str, object] = {
-        "array": stance(array),
+        "array": inputs.stance(array),
         "S_xx": f"{bounds.horizontal_moment_m2:.4g} m^2",
         "alias-free to": f"{bounds.alias_hz:.0f} Hz (mean spacing {100 * bounds.mean_spacing_m:.1f} cm)",
         "cannot tell apart": bounds.ambiguity,

@@ -7,24 +7,23 @@ samples, the sample rate. Channels are counted from 1.
 Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
 and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
 ten for small ones; levels and gusts take six seconds, drifts twenty.
+
+Examples
+--------
+  worldstate array check some.wav --array mics.xml
+  worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common import inputs
-from worldstate.cli.common.output import CommandResult, check_outputs
+from worldstate import frontend
+from worldstate.cli.common import inputs, output, progress
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
-    from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.channel_report import RecordingHealth
-
-EXAMPLE = """\
-examples:
-  worldstate array check some.wav --array mics.xml
-  worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from dataclasses import replace
 
@@ -46,7 +45,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
     from .check_report import as_json, as_text
 
-    check_outputs(arguments, figures=("figure",))
+    output.check_outputs(arguments, figures=("figure",))
     with inputs.opened_front_end(arguments) as (audio, front_end):
         array, health = front_end.array, examine(audio, front_end)
         if arguments.duration is not None:
@@ -57,16 +56,15 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         report, lines = as_json(health, audio, array), list(as_text(health, audio, array))
     if arguments.figure is not None:
         write_array_figure(array, health, arguments.figure)
-    return CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
+    return output.CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
 
 
-def examine(audio: "Audio", front_end: "FrontEnd") -> "RecordingHealth":
+def examine(audio: "Audio", front_end: "frontend.FrontEnd") -> "RecordingHealth":
     """Listen to an open recording to its end."""
-    from worldstate.cli.common.progress import sound_bar
     from worldstate.operations.recordings.channel_report import HealthLog
 
     log = HealthLog()
-    with sound_bar(audio) as bar:
+    with progress.sound_bar(audio) as bar:
         for block in audio.blocks(audio.sample_rate_hz):
             for frame in front_end.process(block):
                 log.add(frame)

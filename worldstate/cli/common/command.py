@@ -29,10 +29,10 @@ _HELP = "-h", "--help"
 class Program:
     """A program and its commands.
 
-    The documentation of a command's module is "`PROGRAM [GROUP] NAME`: summary.", an empty line, and the
-    description; the module has `EXAMPLE`, `add_options` and `run`, and `NEEDS`, the optional modules without
-    which it does nothing. Where it has `FIRST_OPTIONS`, `--help` shows those and the first paragraph only,
-    and `--help-all` everything.
+    The documentation of a command's module is "`PROGRAM [GROUP] NAME`: summary.", the description, and
+    examples in the last paragraph; the module has `add_options` and `run`, and `NEEDS`, the optional modules
+    without which it does nothing. Where it has `FIRST_OPTIONS`, `--help` shows those and the first paragraph
+    only, and `--help-all` everything.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Program:
         lines = [f"{group}: {self.groups[group]}"] if group else ["commands:"]
         for name in self.members(group):
             words = f"{group} {name}".strip()
-            summary, _ = _documentation(_docstring(self.commands[words]))
+            summary, _, _ = _documentation(_docstring(self.commands[words]))
             lines += textwrap.wrap(f"  {words:<16} {summary}", _WIDTH, subsequent_indent=" " * 19)
         return "\n".join(lines)
 
@@ -79,11 +79,11 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of one command, with --json."""
 
     def __init__(self, program: str, module: ModuleType) -> None:
-        _, description = _documentation(module.__doc__ or "")
+        _, description, examples = _documentation(module.__doc__ or "")
         super().__init__(
             program,
             description=description,
-            epilog=module.EXAMPLE,
+            epilog=examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
@@ -128,10 +128,12 @@ def _docstring(module: str) -> str:
     return ast.get_docstring(ast.parse(Path(found.origin).read_text(encoding="utf-8"))) or ""
 
 
-def _documentation(docstring: str) -> tuple[str, str]:
-    """Return the summary and the description of a command."""
-    head, _, description = docstring.partition("\n\n")
-    return head.partition("`: ")[2].removesuffix("."), description.strip()
+def _documentation(docstring: str) -> tuple[str, str, str]:
+    """Return the summary of a command, its description and its examples, the last paragraph."""
+    head, _, rest = docstring.partition("\n\n")
+    description, _, examples = f"\n\n{rest.strip()}".rpartition("\n\n")
+    examples = examples.replace("Examples\n--------", "examples:")
+    return head.partition("`: ")[2].removesuffix("."), description.strip(), examples
 
 
 def add_choice(parser: argparse.ArgumentParser, option: str, help_text: str, *choices: str) -> None:

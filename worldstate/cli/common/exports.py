@@ -1,7 +1,6 @@
 """--export: viewers, logs and other stacks that a command sends world-states to, hop by hop."""
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -9,10 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate import adapters
+from worldstate.ground.errors import InvalidArgumentError
+
 if TYPE_CHECKING:
-    from worldstate.adapters.export.log_message import LogMessage, LogSink
-    from worldstate.adapters.listener import Step
-    from worldstate.adapters.source import Source
+    from worldstate.adapters.export.log_messages import LogMessage, LogSink
     from worldstate.state import WorldState
 
     Stack = AbstractContextManager[Callable[[WorldState], object]]
@@ -35,6 +35,8 @@ EXPORTERS = {
     "rosbag": "rosbags", "rosbag-sqlite3": "rosbags",
 }  # fmt: skip
 _FILES = "mcap", "rerun", "osi", "autoware"
+# These are given messages on topics, the others states.
+_VIEWERS = "mcap", "rerun", "foxglove"
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
@@ -81,7 +83,7 @@ class Exports:
 
     def state(self, state: "WorldState") -> None:
         """Pass a state on."""
-        from worldstate.adapters.export.log_message import state_messages
+        from worldstate.adapters.export.log_messages import state_messages
 
         for message in state_messages(state) if self.viewers else ():
             self.message(message)
@@ -97,30 +99,24 @@ def open_exports(
     with ExitStack() as opened:
         exports = Exports()
         for name, target in _asked(arguments):
-            viewer = _viewer(name, target, paced=paced)
-            if viewer is not None:
-                exports.viewers.append(opened.enter_context(viewer))
+            if name in _VIEWERS:
+                exports.viewers.append(opened.enter_context(_viewer(name, target, paced)))
             else:
                 exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m)))
         yield exports
 
 
-def _viewer(name: str, target: str, *, paced: bool) -> "AbstractContextManager[LogSink] | None":
-    if name == "mcap":
-        from worldstate.adapters.export.log_sinks import mcap_file
+def _viewer(name: str, target: str, paced: bool) -> "AbstractContextManager[LogSink]":
+    from worldstate.adapters.export.log_messages import mcap_file, rerun_file
 
-        return mcap_file(Path(target))
-    if name == "rerun":
-        from worldstate.adapters.export.log_sinks import rerun_file
-
-        return rerun_file(Path(target))
-    return _websocket(target, paced=paced) if name == "foxglove" else None
+    if name == "foxglove":
+        return _websocket(target, paced)
+    return mcap_file(Path(target)) if name == "mcap" else rerun_file(Path(target))
 
 
 @contextmanager
-def _websocket(port: str, *, paced: bool) -> "Iterator[LogSink]":
-    from worldstate.adapters.export.log_sinks import live_server
-    from worldstate.ground.errors import InvalidArgumentError
+def _websocket(port: str, paced: bool) -> "Iterator[LogSink]":
+    from worldstate.adapters.export.log_messages import live_server
 
     if not port.isdecimal():
         raise InvalidArgumentError(f"--export foxglove: expected a port, got {port}")
@@ -130,49 +126,36 @@ def _websocket(port: str, *, paced: bool) -> "Iterator[LogSink]":
 
 
 def _stack(name: str, target: str, crossing_m: float) -> "Stack":
-    if name == "osi":
-        from worldstate.adapters.export.lane_objects import osi_trace
-
-        return osi_trace(Path(target), crossing_m)
-    if name == "autoware":
-        return _autoware_lines(Path(target), crossing_m)
-    if name in ("rosbag", "rosbag-sqlite3"):
-        from worldstate.adapters.ros.state_bag import state_bag
-
-        return state_bag(Path(target), crossing_m, "mcap" if name == "rosbag" else "sqlite3")
-    if name == "odas":
-        from worldstate.adapters.export.odas import odas_socket
-
-        return odas_socket(target)
+    from worldstate.adapters.export import other_stacks
     from worldstate.adapters.own_parts import ExporterPart, load_part
+    from worldstate.adapters.ros.bag_writer import state_bag
 
-    export: ExporterPart = load_part("worldstate.exporters", name, "--export", EXPORTERS)
-    return export(target)
-
-
-@contextmanager
-def _autoware_lines(path: Path, crossing_m: float) -> "Iterator[Callable[[WorldState], object]]":
-    from worldstate.adapters.export.lane_objects import autoware_objects
-    from worldstate.adapters.state_log import states_writer
-
-    with states_writer(path) as write:
-        yield lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+    own: dict[str, ExporterPart] = {
+        "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m),
+        "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m),
+        "odas": other_stacks.odas_socket,
+        "rosbag": lambda path: state_bag(Path(path), crossing_m),
+        "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),
+    }
+    export = own.get(name) or load_part("worldstate.exporters", name, "--export", EXPORTERS)
+    opened: Stack = export(target)
+    return opened
 
 
 @contextmanager
 def exported_hops(
-    arguments: argparse.Namespace, source: "Source", crossing_m: float, *, paced: bool = True
-) -> "Iterator[Callable[[Step], None]]":
+    arguments: argparse.Namespace, source: "adapters.Source", crossing_m: float, *, paced: bool = True
+) -> "Iterator[Callable[[adapters.Step], None]]":
     """Lend a function that exports a hop of a recording: state, power over azimuth, the camera's image."""
     with open_exports(arguments, crossing_m=crossing_m, paced=paced) as exports:
         if not exports.viewers:
             yield lambda step: exports.state(step.state)
             return
-        from worldstate.adapters.export.log_message import camera_images, srp_message
+        from worldstate.adapters.export.log_messages import camera_images, srp_message
 
         image_before = camera_images(source.audio_path.parent, source.start_ns)
 
-        def export_hop(step: "Step") -> None:
+        def export_hop(step: "adapters.Step") -> None:
             for message in image_before(step.state.stamp_ns):
                 exports.message(message)
             exports.state(step.state)

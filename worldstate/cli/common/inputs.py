@@ -6,13 +6,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from worldstate import adapters, frontend
+from worldstate.ground.errors import InvalidArgumentError
+
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import Encoding, SoundInput
-    from worldstate.adapters.audio.sound_file import Audio
+    from worldstate.adapters.audio.sound_file import Audio, Encoding, SoundInput
     from worldstate.adapters.ros.bag_input import BagTopics
-    from worldstate.adapters.source import ListenSettings
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-    from worldstate.frontend.stream import FrontEnd
 
 SOUND_HELP = """\
 INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
@@ -66,7 +65,6 @@ def topics_of(arguments: argparse.Namespace) -> "BagTopics":
     """Return the topics that were asked for."""
     from worldstate.adapters.own_parts import part_and_target
     from worldstate.adapters.ros.bag_input import BagTopics
-    from worldstate.ground.errors import InvalidArgumentError
 
     named = dict(part_and_target("--topic", text) for text in arguments.topic)
     if not named.keys() <= {*_TOPICS}:
@@ -76,7 +74,7 @@ def topics_of(arguments: argparse.Namespace) -> "BagTopics":
 
 def sound_of(arguments: argparse.Namespace) -> "SoundInput":
     """Return what INPUT names."""
-    from worldstate.adapters.audio.open_sound import as_sound
+    from worldstate.adapters.audio.sound_file import as_sound
     from worldstate.adapters.ros.bag_input import read_sound
 
     bag = bag_of(arguments)
@@ -90,47 +88,39 @@ def sound_of(arguments: argparse.Namespace) -> "SoundInput":
 def _raw_samples(name: str, *, alone: bool) -> "SoundInput":
     import sys
 
-    from worldstate.adapters.audio.open_sound import RawPcm
-    from worldstate.ground.errors import InvalidArgumentError
-
     told = name.removeprefix(_RAW).split(":")
     if not (alone and len(told) in (2, 3) and told[0].isdecimal() and told[1].isdecimal()):
         problem = f"expected standard input alone, as {_RAW}RATE:CHANNELS:FORMAT"
         raise InvalidArgumentError(f"{name}: {problem}")
     rate, channels, kind = [*told, "s16"][:3]
-    return RawPcm(sys.stdin.buffer, int(rate), int(channels), cast("Encoding", kind))
+    return adapters.RawPcm(sys.stdin.buffer, int(rate), int(channels), cast("Encoding", kind))
 
 
 def bag_of(arguments: argparse.Namespace) -> Path | None:
     """Return the bag that INPUT names, None where it is none."""
-    from worldstate.adapters.ros.bag_reader import is_bag
+    from worldstate.adapters.ros.bag_input import is_bag
 
     alone = arguments.input[0] if len(arguments.input) == 1 else None
     return alone if alone is not None and is_bag(alone) else None
 
 
-def given_array(arguments: argparse.Namespace) -> "MicrophoneArray | None":
+def given_array(arguments: argparse.Namespace) -> "frontend.MicrophoneArray | None":
     """Return the array that --array names, None without it: a recording may then bring its own."""
-    from worldstate.adapters.files.array_file import read_array
-
-    return None if arguments.array is None else read_array(arguments.array, arguments.array_axes)
+    return None if arguments.array is None else adapters.read_array(arguments.array, arguments.array_axes)
 
 
-def search_of(arguments: argparse.Namespace) -> "ListenSettings":
+def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
     """Return where a bearing is looked for, all else by default."""
-    from worldstate.adapters.source import ListenSettings
-
     band = arguments.band
-    return ListenSettings(
+    return adapters.ListenSettings(
         band_hz=None if band is None else (band[0], band[1]), azimuth_span_deg=arguments.azimuth_span
     )
 
 
-def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, MicrophoneArray]":
+def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, frontend.MicrophoneArray]":
     """Return what INPUT and --array name, or the array that belongs to the sound."""
-    from worldstate.adapters.audio.open_sound import path_of
-    from worldstate.adapters.datasets.array_choice import choose_array
-    from worldstate.adapters.datasets.ovad import Recording
+    from worldstate.adapters.audio.sound_file import path_of
+    from worldstate.adapters.datasets.ovad import choose_array
     from worldstate.adapters.ros.bag_input import needed_array, read_sound
 
     bag = bag_of(arguments)
@@ -140,23 +130,22 @@ def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, Microp
     sound = sound_of(arguments)
     array = choose_array(path_of(sound), given_array(arguments))
     if isinstance(sound, Path) and sound.is_dir():
-        sound = Recording.open(sound).audio_path
+        sound = adapters.Recording.open(sound).audio_path
     return sound, array
 
 
 @contextmanager
-def opened_front_end(arguments: argparse.Namespace) -> "Iterator[tuple[Audio, FrontEnd]]":
+def opened_front_end(arguments: argparse.Namespace) -> "Iterator[tuple[Audio, frontend.FrontEnd]]":
     """Open what INPUT and --array name, and the front-end that hears it."""
-    from worldstate.adapters.audio.open_sound import open_sound
-    from worldstate.frontend.stream import FrontEnd
+    from worldstate.adapters.audio.sound_file import open_sound
 
     sound, array = _sound_and_array(arguments)
     with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
         settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
-        yield audio, FrontEnd(array, audio.sample_rate_hz, settings)
+        yield audio, frontend.FrontEnd(array, audio.sample_rate_hz, settings)
 
 
-def stance(array: "MicrophoneArray") -> str:
+def stance(array: "frontend.MicrophoneArray") -> str:
     """Say in one line how an array stands on the vehicle: microphones, extent, what it tells apart.
 
     Examples

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from worldstate import adapters, frontend, operations
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
 
@@ -16,15 +17,9 @@ from .progress import progress_bar, track
 from .sensors import MOVING, GivenSensors, given_sensors
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import SoundInput
-    from worldstate.adapters.camera.detections import DetectionFilter
+    from worldstate.adapters.audio.sound_file import SoundInput
     from worldstate.adapters.files.odometry_file import OdometryLog
-    from worldstate.adapters.listener import Step
     from worldstate.adapters.live.live_sound import LiveSound
-    from worldstate.adapters.source import Source
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-    from worldstate.operations.recordings.hop_table import HopTable
-    from worldstate.operations.recordings.recording_report import RecordingReport
 
 # A signature is a line of a model file; no model that `save_model` writes has a longer one.
 _LONGEST_LINE = 1 << 20
@@ -84,8 +79,8 @@ def checked_sensors(arguments: argparse.Namespace, sound: list[Path]) -> GivenSe
     return given
 
 
-def _check_array(given: "GivenSensors", made_for: "MicrophoneArray", sound: list[Path]) -> None:
-    from worldstate.adapters.datasets.array_choice import check_channels, named_array
+def _check_array(given: "GivenSensors", made_for: "frontend.MicrophoneArray", sound: list[Path]) -> None:
+    from worldstate.adapters.datasets.ovad import check_channels, named_array
     from worldstate.adapters.files.array_match import WAY_OUT, matched_order
 
     if any(named_array(path) is not None for path in sound):
@@ -98,7 +93,7 @@ def _check_array(given: "GivenSensors", made_for: "MicrophoneArray", sound: list
         matched_order(made_for, array, WAY_OUT)
 
 
-def array_of_model(path: Path | None = None) -> "MicrophoneArray | None":
+def array_of_model(path: Path | None = None) -> "frontend.MicrophoneArray | None":
     """Return the array that the first lines of a model file name, None where they are of another form.
 
     Examples
@@ -108,15 +103,13 @@ def array_of_model(path: Path | None = None) -> "MicrophoneArray | None":
     """
     from importlib.resources import files
 
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-
     shipped = files("worldstate") / "data" / "default_model.json"
     try:
         with (shipped if path is None else path).open(encoding="utf-8") as file:
             lines = iter(lambda: file.readline(_LONGEST_LINE), "")
             line = next(one for one in lines if one.startswith('"signature": {'))
         domain = json.loads(f"{{{line.rstrip().rstrip(',')}}}")["signature"]["domain"]
-        return MicrophoneArray(domain["positions_m"], domain["array"])
+        return frontend.MicrophoneArray(domain["positions_m"], domain["array"])
     except (OSError, StopIteration, ValueError, LookupError, TypeError, InvalidArgumentError):
         return None  # what reads the whole file says what is wrong with it
 
@@ -125,18 +118,16 @@ def open_given(
     given: GivenSensors,
     sound: "SoundInput | LiveSound",
     *,
-    boxes: "DetectionFilter",
+    boxes: "adapters.DetectionFilter",
     mask_dead: bool,
     ego: "OdometryLog | None" = None,
     moving_ego: bool = False,
     **own: Any,
-) -> "Source":
+) -> "adapters.Source":
     """Return what is listened to, as the options say; `own` are further arguments of `open_source`."""
     from dataclasses import replace
 
-    from worldstate.adapters.acoustic import Grounding
     from worldstate.adapters.files.context_file import read_context
-    from worldstate.adapters.source_files import open_source
     from worldstate.operations.labelling.street_file import read_street
     from worldstate.smoothing.learned_street import context_of
 
@@ -150,7 +141,7 @@ def open_given(
         alpha=arguments.alpha,
         site_adaptation=arguments.site_memory != 0.0,
         forgetting_s=arguments.site_memory or None,
-        grounding=Grounding() if arguments.grounded else None,
+        grounding=adapters.Grounding() if arguments.grounded else None,
         ego_noise=arguments.ego_noise,
         uncalibrated=arguments.uncalibrated,
         boxes=boxes,
@@ -158,7 +149,7 @@ def open_given(
     )
     if given.model is None and (moving_ego or (ego is not None and ego.moves)):
         print("worldstate: the model of a moving ego is used, as odometry is given", file=sys.stderr)
-    return open_source(
+    return adapters.open_source(
         sound,
         ego=ego,
         moving_ego=moving_ego,
@@ -173,31 +164,30 @@ def open_given(
 
 
 def listen_with_progress(
-    source: "Source",
+    source: "adapters.Source",
     *,
     states_path: Path | None,
-    on_hop: "Callable[[Step], None]" = lambda step: None,
-) -> "RecordingReport":
+    on_hop: "Callable[[adapters.Step], None]" = lambda step: None,
+) -> "operations.RecordingReport":
     """Listen to `source` to its end while a bar on standard error counts seconds of audio."""
-    from worldstate.adapters.audio.open_sound import RawPcm, open_sound
-    from worldstate.operations.recordings.recording_report import run_recording
+    from worldstate.adapters.audio.sound_file import open_sound
 
     hops = None
-    if not isinstance(source.sound, RawPcm):
+    if not isinstance(source.sound, adapters.RawPcm):
         with open_sound(source.sound, strict=not source.settings.mask_dead) as audio:
             hops = 10.0 * audio.duration_s
     with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
 
-        def follow(step: "Step") -> None:
+        def follow(step: "adapters.Step") -> None:
             on_hop(step)
             bar.advance()
 
-        return run_recording(source, states_path=states_path, on_hop=follow)
+        return operations.run_recording(source, states_path=states_path, on_hop=follow)
 
 
 def read_streams(
-    inputs: Iterable[Path], array: "MicrophoneArray | None", model: Path | None
-) -> "list[HopTable]":
+    inputs: Iterable[Path], array: "frontend.MicrophoneArray | None", model: Path | None
+) -> "list[operations.HopTable]":
     """Return the hop streams of data sets, recordings, sound files and what --save-streams wrote."""
     from worldstate.operations.calibration.calibration_input import find_inputs, read_input
 

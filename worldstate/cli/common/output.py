@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from worldstate.adapters.files.atomic import write_text
 from worldstate.ground.errors import InputFileError
 
 from .exports import exported_files
@@ -47,7 +46,9 @@ def print_result(result: CommandResult, *, as_json: bool) -> None:
 
 def write_report(path: Path, report: Mapping[str, object]) -> None:
     """Write a report as JSON, whole or not at all."""
-    write_text(path, json.dumps(report, allow_nan=False, indent=1) + "\n")
+    from worldstate.adapters.files.file_io import write_json
+
+    write_json(path, report, indent=1)
 
 
 def _readable(value: object) -> str:
@@ -72,7 +73,7 @@ def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[s
     ...     sound.touch()
     ...     check_outputs(argparse.Namespace(input=sound, out=Path(folder, "b.jsonl")), "out")
     """
-    from worldstate.adapters.files.atomic import check_target
+    from worldstate.adapters.files.file_io import check_target
     from worldstate.operations.figure_style import check_suffix
 
     given = vars(arguments)
@@ -96,7 +97,7 @@ def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[s
 
 def output_folder(folder: Path, *files: str) -> Path:
     """Make the folder that a command writes to, and refuse one in which its files cannot be written."""
-    from worldstate.adapters.files.atomic import check_target
+    from worldstate.adapters.files.file_io import check_target
 
     folder.mkdir(parents=True, exist_ok=True)
     for name in files:

@@ -6,14 +6,13 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate import adapters
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
 from .inputs import add_array_options, given_array
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import SoundInput
-    from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
-    from worldstate.adapters.camera.onnx_detector import OnnxDetector
-    from worldstate.adapters.camera.pinhole import PinholeCamera
-    from worldstate.adapters.source import ListenSettings, Source
+    from worldstate.adapters.audio.sound_file import SoundInput
     from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 
@@ -84,7 +83,7 @@ class GivenSensors:
 
     arguments: argparse.Namespace
     car: "CarSensors"
-    camera: "PinholeCamera | None"  # The one that is asked
+    camera: "adapters.PinholeCamera | None"  # The one that is asked
     setup: "CameraSetup"  # Of that camera
 
     @property
@@ -99,7 +98,7 @@ class GivenSensors:
         rates: Path | None = self.arguments.miss_rates or self.setup.miss_rates
         return rates
 
-    def boxes(self) -> "DetectionFilter":
+    def boxes(self) -> "adapters.DetectionFilter":
         """Return which boxes count: all of a motion detector's, whose score is no confidence."""
         from worldstate.adapters.camera.camera_channel import any_motion
 
@@ -113,7 +112,6 @@ class GivenSensors:
     def named(self) -> dict[str, str]:
         """Return what --detections has for several cameras of --car, by their names; empty for one camera."""
         from worldstate.adapters.own_parts import part_and_target
-        from worldstate.ground.errors import InvalidArgumentError
 
         given = list(map(str, self.arguments.detections))
         if self.arguments.car is None or not any("=" in text for text in given):
@@ -135,23 +133,19 @@ class GivenSensors:
         files = {name: path for name, path in known.items() if path is not None}
         return files if len(files) > 1 else {}
 
-    def detections(self) -> "Path | DetectionLog | None":
+    def detections(self) -> "Path | adapters.DetectionLog | None":
         """Return what the one camera that is asked reported, read where its images do not come at 10 Hz."""
-        from worldstate.adapters.camera.detections import read_any_detections
-        from worldstate.adapters.camera.pinhole import PinholeCamera
-
         given = self.arguments.detections
         path = given[0] if given else self.setup.detections
         if path is None or self.setup.image_rate_hz is None:
             return path
-        lens = self.camera or PinholeCamera()
-        return read_any_detections(path, self.setup.image_rate_hz, (lens.width_px, lens.height_px))
+        lens = self.camera or adapters.PinholeCamera()
+        return adapters.read_any_detections(path, self.setup.image_rate_hz, (lens.width_px, lens.height_px))
 
 
 def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
     """Return the sensors that --car, or --array and --camera, name."""
     from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors, read_camera_setup, read_car
-    from worldstate.ground.errors import InvalidArgumentError
 
     if arguments.car is None:
         setup, camera = CameraSetup(), None
@@ -166,14 +160,14 @@ def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
     return GivenSensors(arguments, car, None if name is None else car.camera(name), setup)
 
 
-def recorded(arguments: argparse.Namespace, sound: "SoundInput", settings: "ListenSettings") -> "Source":
+def recorded(
+    arguments: argparse.Namespace, sound: "SoundInput", settings: "adapters.ListenSettings"
+) -> "adapters.Source":
     """Return a recording of which sound, boxes and camera are used, and no model has to fit the array."""
     from dataclasses import replace
 
-    from worldstate.adapters.source_files import open_source
-
     given = given_sensors(arguments)
-    return open_source(
+    return adapters.open_source(
         sound,
         array=given.car.array,
         detections=given.detections(),
@@ -182,7 +176,9 @@ def recorded(arguments: argparse.Namespace, sound: "SoundInput", settings: "List
     )
 
 
-def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[Source, DetectionLog]":
+def camera_source(
+    arguments: argparse.Namespace, sound: "SoundInput"
+) -> "tuple[adapters.Source, adapters.DetectionLog]":
     """Return a recording, and the boxes of its camera.
 
     Raises
@@ -190,19 +186,16 @@ def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[
     InputFileError
         If there are no boxes of a camera.
     """
-    from worldstate.adapters.source import ListenSettings
-    from worldstate.ground.errors import InputFileError
-
-    source = recorded(arguments, sound, ListenSettings())
+    source = recorded(arguments, sound, adapters.ListenSettings())
     if source.detections is None:
         problem = "expected boxes of a camera beside it, or --detections with what a detector reported"
         raise InputFileError(source.audio_path, problem)
     return source, source.detections
 
 
-def box_counts(source: "Source", *, as_json: bool) -> object:
+def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
     """Say how many boxes count and why the others do not; None without a camera."""
-    from worldstate.adapters.camera.box_linking import COUNTS_TOLD, count_boxes
+    from worldstate.adapters.camera.detections import COUNTS_TOLD, count_boxes
 
     if source.detections is None:
         return None
@@ -218,7 +211,6 @@ def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetect
     InvalidArgumentError
         If no package brings a detector of that name.
     """
-    from worldstate.adapters.camera.motion_detector import MotionDetector
     from worldstate.adapters.own_parts import DetectorPart, load_part
 
     if name.endswith(".onnx"):
@@ -229,15 +221,13 @@ def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetect
         known = (*MOVING, "FILE.onnx")
         make_own: DetectorPart = load_part("worldstate.detectors", name, "--detector", known)
         return make_own
-    return partial(MotionDetector, "knn" if name == "knn" else "mog2")
+    return partial(adapters.MotionDetector, "knn" if name == "knn" else "mog2")
 
 
 @cache
-def _opened(path: Path, labels: tuple[str, ...]) -> "OnnxDetector":
+def _opened(path: Path, labels: tuple[str, ...]) -> "adapters.OnnxDetector":
     """Open a model once a process."""
-    from worldstate.adapters.camera.onnx_detector import open_onnx
-
-    return open_onnx(path, labels)
+    return adapters.open_onnx(path, labels)
 
 
 def detector_name(name: str) -> str:

@@ -3,24 +3,25 @@
 Draw what the filter believed: over time (--out), from above at one time (--birds-eye with --time), and from
 above as an animation (--animate). With --recording the power of its sound lies below the azimuths, so that
 belief and sound are seen together.
+
+Examples
+--------
+  worldstate log plot states.jsonl --out states.png
+  worldstate log plot out.mcap --out states.png --recording some.wav --array mics.csv
+  worldstate log plot states.jsonl --birds-eye above.png --time 5.2
+  worldstate log plot states.jsonl --animate above.gif
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common import inputs
-from worldstate.cli.common.output import CommandResult, check_outputs
+from worldstate import ground, operations
+from worldstate.cli.common import inputs, output, progress
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.operations.viewing.state_figure import SoundPower
-
-EXAMPLE = """\
-examples:
-  worldstate log plot states.jsonl --out states.png
-  worldstate log plot out.mcap --out states.png --recording some.wav --array mics.csv
-  worldstate log plot states.jsonl --birds-eye above.png --time 5.2
-  worldstate log plot states.jsonl --animate above.gif"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -37,47 +38,39 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_search_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.state_log import read_log
-    from worldstate.cli.common.progress import progress_bar
-    from worldstate.ground.errors import InvalidArgumentError
-    from worldstate.ground.values import nanoseconds, seconds
-    from worldstate.operations.viewing.state_figure import (
-        check_gif,
-        write_animation,
-        write_birds_eye,
-        write_state_figure,
-    )
+    from worldstate.operations.viewing.state_figure import check_gif, write_animation, write_birds_eye
 
     asked = arguments.out, arguments.birds_eye, arguments.animate
     if not any(asked):
         raise InvalidArgumentError("plot: expected one of --out, --birds-eye and --animate")
-    check_outputs(arguments, "animate", figures=("out", "birds_eye"))
+    output.check_outputs(arguments, "animate", figures=("out", "birds_eye"))
     if arguments.animate is not None:
         check_gif(arguments.animate)
     states, title = [state for _, state in read_log(arguments.log)], arguments.log.name
     shown = max(states, key=lambda state: state.risk)
     if arguments.time is not None:
-        shown = min(states, key=lambda state: abs(state.stamp_ns - nanoseconds(arguments.time)))
+        shown = min(states, key=lambda state: abs(state.stamp_ns - ground.nanoseconds(arguments.time)))
     if arguments.out is not None:
         sound = _sound(arguments) if arguments.input else None
-        write_state_figure(states, arguments.out, title=title, sound=sound)
+        operations.write_state_figure(states, arguments.out, title=title, sound=sound)
     if arguments.birds_eye is not None:
         write_birds_eye(shown, arguments.birds_eye, title=title)
     if arguments.animate is not None:
-        with progress_bar("drawing", len(states)) as bar:
+        with progress.progress_bar("drawing", len(states)) as bar:
             write_animation(states, arguments.animate, title=title, on_frame=bar.advance)
     written = [str(path) for path in asked if path is not None]
-    return CommandResult({"states": len(states), "birds_eye_s": seconds(shown.stamp_ns), "written": written})
+    shown_s = ground.seconds(shown.stamp_ns)
+    return output.CommandResult({"states": len(states), "birds_eye_s": shown_s, "written": written})
 
 
 def _sound(arguments: argparse.Namespace) -> "SoundPower":
-    from worldstate.cli.common.progress import progress_bar
     from worldstate.operations.viewing.state_figure import sound_power
 
     with (
         inputs.opened_front_end(arguments) as (audio, front_end),
-        progress_bar("listening", audio.duration_s) as bar,
+        progress.progress_bar("listening", audio.duration_s) as bar,
     ):
         return sound_power(audio, front_end, on_second=bar.advance)

@@ -1,4 +1,4 @@
-"""`worldstate model detector`: the miss rate of a camera's detector on staged-degraded frames.
+r"""`worldstate model detector`: the miss rate of a camera's detector on staged-degraded frames.
 
 Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
 blur, darkness, sensor noise and the three together are staged on clean video, four levels each, and a
@@ -10,25 +10,23 @@ YOLO text. Without any, what the detector itself reports on clean frames is the 
 on those is zero by definition.
 
 The file also holds the scale by which d is read from this camera's own images.
+
+Examples
+--------
+  worldstate model detector sim --detector motion --out beta.json --figure beta.png
+  worldstate model detector street.mp4 --reference boxes.json --detector m.onnx \
+      --labels person bicycle car --out beta.json
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import progress_bar
-from worldstate.cli.common.sensors import add_detector_option, detector_maker, detector_name
+from worldstate import adapters, operations
+from worldstate.cli.common import output, progress, sensors
 
 if TYPE_CHECKING:
-    from worldstate.adapters.camera.miss_rates import MissRates
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, MakeDetector
-
-EXAMPLE = """\
-examples:
-  worldstate model detector sim --detector motion --out beta.json --figure beta.png
-  worldstate model detector street.mp4 --reference boxes.json --detector m.onnx \\
-      --labels person bicycle car --out beta.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
     add("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
-    add_detector_option(parser)
+    sensors.add_detector_option(parser)
     add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of an ONNX model")
     add("--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)")
     add("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
@@ -45,32 +43,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--figure", type=Path, metavar="PNG", help="draw beta over d")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate.adapters.camera.miss_rates import save_miss_rates
-    from worldstate.operations.detectors.miss_rate_measurement import (
-        find_videos,
-        measure_absence,
-        write_absence_figure,
-    )
+    from worldstate.operations.detectors.miss_rate_measurement import find_videos, write_absence_figure
 
-    check_outputs(arguments, "out", figures=("figure",))
-    make = detector_maker(arguments.detector, tuple(arguments.labels))
+    output.check_outputs(arguments, "out", figures=("figure",))
+    make = sensors.detector_maker(arguments.detector, tuple(arguments.labels))
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
-    with progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
-        rates = measure_absence(
+    with progress.progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
+        rates = operations.measure_absence(
             scenes,
             make,
             np.random.default_rng(arguments.seed),
             provenance=_provenance(arguments, len(scenes)),
             on_frame=bar.advance,
         )
-    save_miss_rates(arguments.out, rates)
+    adapters.save_miss_rates(arguments.out, rates)
     if arguments.figure is not None:
         write_absence_figure(rates, arguments.figure)
-    return CommandResult(_summary(arguments, rates))
+    return output.CommandResult(_summary(arguments, rates))
 
 
 def _scene(
@@ -79,20 +72,17 @@ def _scene(
     from dataclasses import replace
     from math import radians
 
-    from worldstate.adapters.camera.detections import read_any_detections
-    from worldstate.adapters.camera.pinhole import PinholeCamera
-    from worldstate.adapters.camera.video import open_video
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, reference_by
 
-    video = open_video(path)
-    camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)
+    video = adapters.open_video(path)
+    camera = adapters.PinholeCamera(width_px=video.width_px, height_px=video.height_px)
     if arguments.half_angle is not None:
         camera = replace(camera, half_angle_rad=radians(arguments.half_angle))
     boxes = arguments.reference or reference
     if boxes is None:
         return LabelledVideo(video, reference_by(make(), video), camera)
     size = (video.width_px, video.height_px)
-    return LabelledVideo(video, read_any_detections(boxes, video.frame_rate_hz, size), camera)
+    return LabelledVideo(video, adapters.read_any_detections(boxes, video.frame_rate_hz, size), camera)
 
 
 def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
@@ -101,13 +91,13 @@ def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
     return {
         "data": arguments.input.name,
         "videos": str(videos),
-        "detector": detector_name(arguments.detector),
+        "detector": sensors.detector_name(arguments.detector),
         "seed": str(arguments.seed),
         "worldstate": __version__,
     }
 
 
-def _summary(arguments: argparse.Namespace, rates: "MissRates") -> dict[str, object]:
+def _summary(arguments: argparse.Namespace, rates: "adapters.MissRates") -> dict[str, object]:
     table = rates.table
     summary: dict[str, object] = {
         "out": str(arguments.out),

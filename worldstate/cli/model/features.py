@@ -9,24 +9,24 @@ looked for.
 
 Without --labels, DATASET is in the OVAD layout and DataLog.csv says what is in it: windows of left, right and
 none end at T0, 0.5 s later where the ego moves, front windows 1.5 s after that.
+
+Examples
+--------
+  worldstate sim make --out sim --static 40 && worldstate model features sim --out features.csv
+  worldstate model features recordings --labels labels.csv --array mics.xml --out features.csv
+  worldstate model fit features.csv --out model.json
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import add_array_options, given_array, stance
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import track
+from worldstate import adapters
+from worldstate.cli.common import inputs, output, progress
+from worldstate.ground.errors import InputFileError
 
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_extraction import LabelledWindow
-
-EXAMPLE = """\
-examples:
-  worldstate sim make --out sim --static 40 && worldstate model features sim --out features.csv
-  worldstate model features recordings --labels labels.csv --array mics.xml --out features.csv
-  worldstate model fit features.csv --out model.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,30 +36,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
     ego_noise = "take the own vehicle's noise out, learned from each file's beginning (default: off)"
     parser.add_argument("--ego-noise", action="store_true", help=ego_noise)
-    add_array_options(parser)
+    inputs.add_array_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate.adapters.datasets.array_choice import choose_array
-    from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table
-    from worldstate.adapters.datasets.feature_table import write_features
+    from worldstate.adapters.datasets.feature_extraction import feature_table
+    from worldstate.adapters.datasets.ovad import choose_array
     from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, FEATURE_VERSION
 
-    check_outputs(arguments, "out")
-    array = choose_array(arguments.dataset, given_array(arguments))
+    output.check_outputs(arguments, "out")
+    array = choose_array(arguments.dataset, inputs.given_array(arguments))
     windows, left_out = _windows(arguments)
     cleaned = arguments.ego_noise
-    extracted = extract_features(windows, array, ego_noise=cleaned)
-    features = list(track(extracted, "extracting", len(windows)))
+    extracted = adapters.extract_features(windows, array, ego_noise=cleaned)
+    features = list(progress.track(extracted, "extracting", len(windows)))
     version = CLEANED_FEATURE_VERSION if cleaned else FEATURE_VERSION
     table = feature_table(windows, features, array, version)
-    write_features(arguments.out, table)
+    adapters.write_features(arguments.out, table)
     summary = {
         "out": str(arguments.out),
-        "array": stance(array),
+        "array": inputs.stance(array),
         "feature": version,
         "n_windows": len(table),
         "n_left_out": left_out,
@@ -67,13 +66,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "n_hazard": int(table.hazards.sum()),
         "n_hazard_free": int(table.hazard_free.sum()),
     }
-    return CommandResult(summary)
+    return output.CommandResult(summary)
 
 
 def _windows(arguments: argparse.Namespace) -> "tuple[list[LabelledWindow], int]":
     from worldstate.adapters.datasets.feature_extraction import read_labels, sample_windows
     from worldstate.adapters.datasets.ovad import LOG_NAME
-    from worldstate.ground.errors import InputFileError
 
     if arguments.labels is not None:
         return read_labels(arguments.labels, arguments.dataset), 0

@@ -8,24 +8,23 @@ released one, counts as OVAD's unless --array and --sample-rate say otherwise.
 The classifier is a mirror-symmetric ensemble on windows compared with their site, for unseen junctions, its
 thresholds half-way between recordings left out and junctions left out. With --simulated it learns simulated
 windows too, with --streams the classes both and direct as well: for a standing ego.
+
+Examples
+--------
+  worldstate model fit features.csv --group static --exclude testset.csv --out model.json
+  worldstate model fit features.csv --labels recordings/labels.csv --out model.json
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import progress_bar, track
+from worldstate import adapters, frontend, operations
+from worldstate.cli.common import command, output, progress
 
 if TYPE_CHECKING:
     from worldstate.abduction.signature.ensemble_training import SimulatedWindows
-    from worldstate.adapters.datasets.feature_table import FeatureTable
 
-EXAMPLE = """\
-examples:
-  worldstate model fit features.csv --group static --exclude testset.csv --out model.json
-  worldstate model fit features.csv --labels recordings/labels.csv --out model.json"""
 
 NEEDS = ("sklearn",)
 
@@ -60,24 +59,22 @@ def add_table_options(parser: argparse.ArgumentParser) -> None:
 
 def add_group(parser: argparse.ArgumentParser, of: str) -> None:
     """Declare --group."""
-    add_choice(parser, "--group", of, "static", "dynamic", "all")
+    command.add_choice(parser, "--group", of, "static", "dynamic", "all")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.datasets.feature_table import read_features, read_ids
-    from worldstate.adapters.files.model_file import save_model
-    from worldstate.operations.training.training import TrainingSettings, train_model
+    from worldstate.adapters.datasets.feature_table import read_ids
 
-    check_outputs(arguments, "out")
-    table = _with_domain(arguments, read_features(arguments.table)).group(arguments.group)
+    output.check_outputs(arguments, "out")
+    table = _with_domain(arguments, adapters.read_features(arguments.table)).group(arguments.group)
     labelled = [_heard_windows(path, table) for path in arguments.labels]
     for one in labelled:
         table = table.joined(one.group(arguments.group))
     kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
-    settings = TrainingSettings(seed=arguments.seed, sustain_hops=arguments.sustain_hops)
-    with progress_bar("training", settings.steps) as bar:
-        model = train_model(
+    settings = operations.TrainingSettings(seed=arguments.seed, sustain_hops=arguments.sustain_hops)
+    with progress.progress_bar("training", settings.steps) as bar:
+        model = operations.train_model(
             kept,
             settings,
             dataset=arguments.source or arguments.table.name,
@@ -86,7 +83,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             simulated=read_beside(arguments, kept),
             on_step=bar.advance,
         )
-    save_model(arguments.out, model)
+    adapters.save_model(arguments.out, model)
     summary = {
         "out": str(arguments.out),
         "n_windows": len(kept),
@@ -96,14 +93,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     }
     if labelled:
         summary["n_labelled"] = sum(map(len, labelled))
-    return CommandResult(summary)
+    return output.CommandResult(summary)
 
 
-def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "SimulatedWindows | None":
+def read_beside(arguments: argparse.Namespace, table: "adapters.FeatureTable") -> "SimulatedWindows | None":
     """Return the simulated windows that are to be learned beside a table, None without any."""
     import numpy as np
 
-    from worldstate.adapters.datasets.feature_table import read_features
     from worldstate.commissioning.heard_stream import HeardStream
     from worldstate.commissioning.simulated_windows import (
         N_OPEN,
@@ -111,39 +107,41 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
         open_field_features,
         open_field_windows,
     )
-    from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
     from worldstate.operations.training.site_references import simulated_beside
 
-    tables = [read_features(path).group(arguments.group) for path in arguments.simulated or ()]
+    tables = [adapters.read_features(path).group(arguments.group) for path in arguments.simulated or ()]
     streams = [HeardStream.load(path) for path in arguments.streams or ()]
     if not streams:
         return simulated_beside(tables) if tables else None
-    # A table that does not say, as the released one, is OVAD's.
-    array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
+    array = _array_of(table)
     moves = any(one.ego_moves for one in streams)
     features = open_field_features(array, N_OPEN, np.random.default_rng(0), moving_ego=moves)
     in_the_open = open_field_windows(features)
     return learned_beside(streams, in_the_open, tables).beside(table.environments)
 
 
-def _heard_windows(labels: Path, table: "FeatureTable") -> "FeatureTable":
-    """Return the features of labelled windows, by the microphones that the table's were heard by."""
-    from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table, read_labels
-    from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+def _array_of(table: "adapters.FeatureTable") -> "frontend.MicrophoneArray":
+    # A table that does not say, as the released one, is OVAD's.
+    domain = table.domain
+    return frontend.ovad_array() if domain is None else frontend.MicrophoneArray(domain.positions_m)
 
-    array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
+
+def _heard_windows(labels: Path, table: "adapters.FeatureTable") -> "adapters.FeatureTable":
+    """Return the features of labelled windows, by the microphones that the table's were heard by."""
+    from worldstate.adapters.datasets.feature_extraction import feature_table, read_labels
+
+    array = _array_of(table)
     windows = read_labels(labels, labels.parent)
-    features = list(track(extract_features(windows, array), "listening", len(windows)))
+    features = list(progress.track(adapters.extract_features(windows, array), "listening", len(windows)))
     return feature_table(windows, features, array)
 
 
-def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "FeatureTable":
+def _with_domain(arguments: argparse.Namespace, table: "adapters.FeatureTable") -> "adapters.FeatureTable":
     """Return the table with what its windows were made with: as it says, as the options say, or as OVAD's."""
     import sys
     from dataclasses import replace
 
     from worldstate.adapters.files.acoustic_domain import check_array, domain_of, ovad_domain
-    from worldstate.adapters.files.array_file import read_array
     from worldstate.frontend.direction.feature import FEATURE_RATE_HZ
 
     environments = table.environments.tolist()
@@ -151,7 +149,7 @@ def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "Featu
         if table.domain is None:
             print(f"worldstate: {arguments.table} names no array: taken as OVAD's", file=sys.stderr)
         return replace(table, domain=table.domain or ovad_domain(environments))
-    array = read_array(arguments.array)
+    array = adapters.read_array(arguments.array)
     if table.domain is not None:
         check_array(table.domain, array)
         return table

@@ -6,33 +6,29 @@ detected, lead, alarms an hour, both sides, times to visible. Usable before any 
 
 Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes on
 there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
+
+Examples
+--------
+  worldstate model make --array mics.csv --out my_model.json --streams streams --jobs 2
+  worldstate model make --array mics.csv --out my_model.json --streams streams --quiet night.wav
+  worldstate model make --array mics.csv --out my_model.json --streams streams --mounting-errors
+  worldstate model make --array mics.csv --out moving.json --streams streams --ego moving --jobs 2
+  worldstate model make --array mics.csv --out try.json --quick
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import progress_bar
+from worldstate import adapters, frontend
+from worldstate.cli.common import command, inputs, output, progress
 
 if TYPE_CHECKING:
-    from worldstate.adapters.datasets.feature_table import FeatureTable
-    from worldstate.adapters.files.model_file import Model
     from worldstate.commissioning.heard_stream import CommissionSettings
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
     from worldstate.operations.metrics.approach_table import Figures
 
 # Alarms an hour by what the ego does: its own noise leaves less to be heard of others.
 ONSETS = {"standing": 30.0, "moving": 60.0}
-EXAMPLE = """\
-examples:
-  worldstate model make --array mics.csv --out my_model.json --streams streams --jobs 2
-  worldstate model make --array mics.csv --out my_model.json --streams streams --quiet night.wav
-  worldstate model make --array mics.csv --out my_model.json --streams streams --mounting-errors
-  worldstate model make --array mics.csv --out moving.json --streams streams --ego moving --jobs 2
-  worldstate model make --array mics.csv --out try.json --quick"""
 
 NEEDS = ("sklearn",)
 
@@ -40,7 +36,7 @@ NEEDS = ("sklearn",)
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add_array_options(parser, "OVAD's")
+    inputs.add_array_options(parser, "OVAD's")
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
     add("--report", type=Path, metavar="JSON", help="write what the exam found")
     add("--figure", type=Path, metavar="PNG", help="draw what the exam found")
@@ -53,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
     quiet = "recordings without a vehicle: the alarm is set on them"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
-    add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
+    command.add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
     allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"
     add("--onsets", type=float, metavar="N", help=allowed)
     add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
@@ -70,10 +66,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.model_file import save_model
-    from worldstate.cli.common.output import write_report
     from worldstate.commissioning.commission import LEARNING_STEPS, commission, exam_of
     from worldstate.commissioning.heard_stream import exam_streams, learned_streams
     from worldstate.commissioning.stream_exam import (
@@ -83,15 +77,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         mounting_lines,
         write_exam_figure,
     )
-    from worldstate.frontend.array.microphone_array import ovad_array
 
-    check_outputs(arguments, "out", "report", figures=("figure",))
+    output.check_outputs(arguments, "out", "report", figures=("figure",))
     settings = _settings(arguments)
     folder = arguments.streams or arguments.out.with_suffix(".streams")
-    array = given_array(arguments) or ovad_array()
+    array = inputs.given_array(arguments) or frontend.ovad_array()
     # Streams take nearly all of the time; what is learned from them counts as a few more.
     steps = len(learned_streams(settings)) + LEARNING_STEPS
-    with progress_bar("commissioning", steps) as bar:
+    with progress.progress_bar("commissioning", steps) as bar:
         model = commission(
             array,
             settings,
@@ -103,10 +96,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             jobs=arguments.jobs,
             on_step=bar.advance,
         )
-    save_model(arguments.out, model)
+    adapters.save_model(arguments.out, model)
     report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": model.provenance.fit_for_use}
     if arguments.exam:
-        with progress_bar("exam", len(exam_streams(settings))) as bar:
+        with progress.progress_bar("exam", len(exam_streams(settings))) as bar:
             examined = exam_of(array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance)
         report |= exam_figures(examined)
         if arguments.figure is not None:
@@ -120,29 +113,30 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if not settings.moving_ego:
         report["reference"] = dict(REFERENCE)
     if arguments.report is not None:
-        write_report(arguments.report, report)
+        output.write_report(arguments.report, report)
     lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
-    return CommandResult(report, told, lines)
+    return output.CommandResult(report, told, lines)
 
 
-def _labelled(arguments: argparse.Namespace) -> "FeatureTable | None":
+def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":
     """Return the labelled windows that are learned, too; None without any."""
-    from worldstate.adapters.datasets.feature_table import read_features, read_ids
+    from worldstate.adapters.datasets.feature_table import Group, read_ids
 
     if arguments.labelled is None:
         return None
-    table = read_features(arguments.labelled).group("dynamic" if arguments.ego == "moving" else "static")
+    group: Group = "dynamic" if arguments.ego == "moving" else "static"
+    table = adapters.read_features(arguments.labelled).group(group)
     return table.without([name for path in arguments.exclude for name in read_ids(path)])
 
 
 def _mounted(
-    array: "MicrophoneArray", model: "Model", settings: "CommissionSettings", folder: Path
+    array: "frontend.MicrophoneArray", model: "adapters.Model", settings: "CommissionSettings", folder: Path
 ) -> "dict[str, Figures]":
     from worldstate.commissioning.commission import exam_of_mountings
     from worldstate.commissioning.heard_stream import mounting_streams
     from worldstate.commissioning.stream_exam import exam_figures
 
-    with progress_bar("mounting", len(mounting_streams(settings))) as bar:
+    with progress.progress_bar("mounting", len(mounting_streams(settings))) as bar:
         heard = exam_of_mountings(array, model, settings, folder, on_step=bar.advance)
     return {name: exam_figures(streams) for name, streams in heard.items()}
 

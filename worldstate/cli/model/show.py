@@ -2,17 +2,18 @@
 
 Say what a model was made of and made for: data, recordings, array, sample rates, band, feature, ego's motion,
 thresholds, limits, licence.
+
+Examples
+--------
+  worldstate model
+  worldstate model my_model.json --json
 """
 
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.output import CommandResult
-
-EXAMPLE = """\
-examples:
-  worldstate model
-  worldstate model my_model.json --json"""
+from worldstate import adapters
+from worldstate.cli.common import output
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -21,13 +22,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("file", type=Path, nargs="?", metavar="FILE", help="model file (default: the one that ships)")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.model_file import read_model
     from worldstate.operations.training.model_card import model_card
 
-    card = model_card(read_model(arguments.file))
-    return CommandResult(card, table=_readable(card))
+    card = model_card(adapters.read_model(arguments.file))
+    return output.CommandResult(card, table=_readable(card))
 
 
 def _readable(card: dict[str, object]) -> dict[str, object]:

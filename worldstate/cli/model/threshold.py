@@ -7,24 +7,19 @@ that --save-streams wrote with the same signature. Recordings labelled none and 
 hazard-free. Approaches with a T0, where there are some, give the risk map (Platt for few, isotonic for many);
 without them the model's own is kept. A budget that the hours do not suffice for is warned about, with the
 hours that it would take.
+
+Examples
+--------
+  worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
+  worldstate model threshold my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json
 """
 
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.output import CommandResult, check_outputs
-
-if TYPE_CHECKING:
-    from worldstate.operations.calibration.cueing_calibration import CueingCalibration
-
-EXAMPLE = """\
-examples:
-  worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
-  worldstate model threshold my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json"""
+from worldstate import adapters, operations
+from worldstate.cli.common import command, inputs, listening, output
 
 NEEDS = ("sklearn",)
 
@@ -33,13 +28,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
-    add_array_options(parser)
+    inputs.add_array_options(parser)
     add("--model", type=Path, help="model file to start from (default: the one that ships)")
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
     budgets = "budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)"
     add("--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A", help=budgets)
     guarantee = "with a finite-sample guarantee, or the smallest threshold that fits"
-    add_choice(parser, "--method", guarantee, "conformal", "plain")
+    command.add_choice(parser, "--method", guarantee, "conformal", "plain")
     add("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
     add("--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)")
     add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
@@ -47,17 +42,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from dataclasses import replace
 
-    from worldstate.adapters.files.model_file import read_model, save_model
-    from worldstate.cli.common.listening import read_streams
-    from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
     from worldstate.operations.recordings.hop_table import save_tables
 
-    check_outputs(arguments, "out", "save_streams")
-    settings = CueingSettings(
+    output.check_outputs(arguments, "out", "save_streams")
+    settings = operations.CueingSettings(
         alphas=tuple(arguments.alpha),
         sustain_hops=arguments.sustain_hops,
         method=arguments.method,
@@ -65,20 +57,20 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         block_s=arguments.block,
         keep_per_hour=arguments.keep,
     )
-    model = read_model(arguments.model)
-    streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
+    model = adapters.read_model(arguments.model)
+    streams = listening.read_streams(arguments.inputs, inputs.given_array(arguments), arguments.model)
     if arguments.save_streams is not None:
         save_tables(arguments.save_streams, streams)
-    done = calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
+    done = operations.calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
     figures = dict(model.provenance.figures or {}) | {"calibration_hours": done.hours}
     provenance = replace(model.provenance, figures=figures)
-    save_model(arguments.out, replace(model, policies=done.policies, provenance=provenance))
+    adapters.save_model(arguments.out, replace(model, policies=done.policies, provenance=provenance))
     for warning in done.warnings:
         print(f"worldstate: warning: {warning}", file=sys.stderr)
     return _result(arguments, done)
 
 
-def _result(arguments: argparse.Namespace, done: "CueingCalibration") -> CommandResult:
+def _result(arguments: argparse.Namespace, done: "operations.CueingCalibration") -> output.CommandResult:
     summary: dict[str, object] = {
         "out": str(arguments.out),
         "hazard_free_hours": done.hours,
@@ -97,4 +89,4 @@ def _result(arguments: argparse.Namespace, done: "CueingCalibration") -> Command
             f"[{rates['onsets_low']:.3g}, {rates['onsets_high']:.3g}], "
             f"one is {1.0 / report.counted.hours:.3g}/h"
         )
-    return CommandResult(summary | detail, table=summary | lines)
+    return output.CommandResult(summary | detail, table=summary | lines)

@@ -25,20 +25,24 @@ sound, array.xml, camera results, truth.json, events.json (an entry a vehicle), 
 and tenth of a second: position, speed, in view, time to visible, loudness at the array) and stream.png.
 --traffic no-hazard is busy, but nothing comes out of a hidden arm: whatever warns there is wrong.
 --sounds come twelve times an hour each; a tenth of the vehicles has each signal of them.
+
+Examples
+--------
+  worldstate sim make --out sim --static 4 --seed 1
+  worldstate sim make --out sim --dynamic 10 --kind electric --jobs 2
+  worldstate sim make --out hours --minutes 60 --site SA1 --traffic busy --bandwidth 2000 --jobs 2
+  worldstate run sim/SA1/left/1_00_0000
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.progress import progress_bar
+from worldstate import ground, simulation
+from worldstate.cli.common import command, inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from worldstate.simulation.dataset.dataset import DatasetSettings
     from worldstate.simulation.stream.settings import StreamSettings
 
 JUNCTION = "junction"  # the scene where none is named
@@ -46,31 +50,21 @@ FIGURE_NAME = "stream.png"
 PER_HOUR = 12.0  # of every kind of --sounds in a stream that is no vehicle's
 SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds
 
-EXAMPLE = """\
-examples:
-  worldstate sim make --out sim --static 4 --seed 1
-  worldstate sim make --out sim --dynamic 10 --kind electric --jobs 2
-  worldstate sim make --out hours --minutes 60 --site SA1 --traffic busy --bandwidth 2000 --jobs 2
-  worldstate run sim/SA1/left/1_00_0000"""
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    from worldstate.simulation.scene.junction import PLACES
-    from worldstate.simulation.scene.kinds import KINDS
-    from worldstate.simulation.scene.presets import PRESETS
-    from worldstate.simulation.scene.settings import SOUNDS
+    from worldstate.simulation.stream.settings import TRAFFICS
 
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="D", help="folder of the data set")
     add("--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)")
     add("--dynamic", type=int, default=0, metavar="N", help="of a moving one (default: 0)")
-    add_choice(parser, "--scene", "what hides the vehicle", JUNCTION, *PLACES, "all")
-    add_choice(parser, "--kind", "vehicle", *KINDS)
-    add_choice(parser, "--preset", "how busy the street is", *PRESETS)
-    told = f"what else sounds, separated by commas: {', '.join(SOUNDS)}"
+    command.add_choice(parser, "--scene", "what hides the vehicle", JUNCTION, *simulation.PLACES, "all")
+    command.add_choice(parser, "--kind", "vehicle", *simulation.KINDS)
+    command.add_choice(parser, "--preset", "how busy the street is", *simulation.PRESETS)
+    told = f"what else sounds, separated by commas: {', '.join(simulation.SOUNDS)}"
     add("--sounds", type=_words, default=(), metavar="KINDS", help=told)
-    add_array_options(parser, "OVAD's")
+    inputs.add_array_options(parser, "OVAD's")
     add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
@@ -78,32 +72,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--bandwidth", type=float, metavar="HZ", help=told)
     add("--video", action="store_true", help="render the camera's video, too")
     add("--video-width", type=int, default=1936, metavar="PX", help="of its images (default: 1936)")
-    _add_stream_options(parser)
-
-
-def _add_stream_options(parser: argparse.ArgumentParser) -> None:
-    from worldstate.simulation.scene.junction import SITES
-    from worldstate.simulation.stream.settings import TRAFFICS
-
     add = parser.add_argument_group("a continuous stream").add_argument
     add("--minutes", type=float, metavar="M", help="its length")
     # Any word is taken: the library refuses a moving ego with its reason.
-    add("--site", default=SITES[0], help=f"{', '.join(SITES)} (default: {SITES[0]})")
+    sites = simulation.SITES
+    add("--site", default=sites[0], help=f"{', '.join(sites)} (default: {sites[0]})")
     add("--traffic", choices=[*TRAFFICS], default="calm", help="how much drives (default: calm)")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     if arguments.minutes is not None:
         return _run_stream(arguments)
-    from worldstate.simulation.dataset.dataset import write_dataset
 
     settings = _settings(arguments)
-    with progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
-        rows = write_dataset(
+    with progress.progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
+        rows = simulation.write_dataset(
             arguments.out,
             settings,
-            array=given_array(arguments),
+            array=inputs.given_array(arguments),
             jobs=arguments.jobs,
             progress=lambda row: bar.advance(),
         )
@@ -114,21 +101,21 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         **{name: getattr(arguments, name) for name in ("scene", "kind", "sounds", "preset", "seed")},
         "folders": [row.folder.as_posix() for row in rows],
     }
-    return CommandResult(summary)
+    return output.CommandResult(summary)
 
 
-def _run_stream(arguments: argparse.Namespace) -> CommandResult:
+def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.commissioning.stream_figure import write_stream_figure
     from worldstate.simulation.stream.writing import write_stream
 
     if arguments.static or arguments.dynamic or arguments.video or arguments.scene != JUNCTION:
         raise InvalidArgumentError("--minutes: expected without --static, --dynamic, --video and --scene")
     settings = _stream_settings(arguments)
-    with progress_bar("simulating", settings.duration_s) as bar:
+    with progress.progress_bar("simulating", settings.duration_s) as bar:
         stream = write_stream(
             arguments.out,
             settings,
-            array=given_array(arguments),
+            array=inputs.given_array(arguments),
             jobs=arguments.jobs,
             progress=bar.advance,
         )
@@ -142,22 +129,21 @@ def _run_stream(arguments: argparse.Namespace) -> CommandResult:
         "sample_rate_hz": settings.sample_rate_hz,
         **{name: getattr(arguments, name) for name in ("traffic", "preset", "seed")},
     }
-    return CommandResult(summary, lines=["", f"see {stream.folder / FIGURE_NAME}"])
+    return output.CommandResult(summary, lines=["", f"see {stream.folder / FIGURE_NAME}"])
 
 
 def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from dataclasses import replace
 
-    from worldstate.ground.checks import in_range
     from worldstate.simulation.dataset.dataset import BANDWIDTHS_HZ
-    from worldstate.simulation.scene.junction import site
-    from worldstate.simulation.scene.presets import preset
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
     from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
-    band = arguments.bandwidth
+    rate_hz, band = SAMPLE_RATE_HZ, arguments.bandwidth
+    if band is not None:
+        rate_hz = rate_for(ground.in_range("--bandwidth", band, *BANDWIDTHS_HZ))
     return StreamSettings(
-        site=site(arguments.site),
+        site=simulation.site(arguments.site),
         minutes=arguments.minutes,
         seed=arguments.seed,
         traffic=replace(
@@ -165,29 +151,22 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
             sounds=dict.fromkeys((kind for kind in arguments.sounds if kind not in SIGNALS), PER_HOUR),
             signals=dict.fromkeys((kind for kind in arguments.sounds if kind in SIGNALS), SIGNAL_SHARE),
         ),
-        preset=preset(arguments.preset),
-        sample_rate_hz=SAMPLE_RATE_HZ
-        if band is None
-        else rate_for(in_range("--bandwidth", band, *BANDWIDTHS_HZ)),
+        preset=simulation.preset(arguments.preset),
+        sample_rate_hz=rate_hz,
     )
 
 
-def _settings(arguments: argparse.Namespace) -> "DatasetSettings":
-    from worldstate.simulation.dataset.dataset import DatasetSettings
+def _settings(arguments: argparse.Namespace) -> "simulation.DatasetSettings":
 
     static = arguments.static
-    return DatasetSettings(
+    same = "seed", "scene", "kind", "video", "preset", "sounds"
+    return simulation.DatasetSettings(
         n_static=(0 if arguments.dynamic else 4) if static is None else static,
         n_dynamic=arguments.dynamic,
-        seed=arguments.seed,
-        scene=arguments.scene,
-        kind=arguments.kind,
         duration_s=arguments.duration,
-        video=arguments.video,
         video_width_px=arguments.video_width,
-        preset=arguments.preset,
-        sounds=arguments.sounds,
         bandwidth_hz=arguments.bandwidth,
+        **{name: getattr(arguments, name) for name in same},
     )
 
 

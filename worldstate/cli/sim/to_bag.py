@@ -2,19 +2,18 @@
 
 Write sound, array, detections and the speed of the ego, where it is known, as messages. It shows what a bag
 has to look like for `worldstate run BAG`, and which topics; the definitions are in the documentation.
+
+Examples
+--------
+  worldstate sim to-bag ovad_dataset/SA1/left/1_00_0002 street_bag
+  worldstate sim to-bag out/demo/recording/SB1/right/3_02_0000 street_bag --ros-storage sqlite3
 """
 
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.output import CommandResult
-
-EXAMPLE = """\
-examples:
-  worldstate sim to-bag ovad_dataset/SA1/left/1_00_0002 street_bag
-  worldstate sim to-bag out/demo/recording/SB1/right/3_02_0000 street_bag --ros-storage sqlite3"""
+from worldstate import adapters, ground
+from worldstate.cli.common import command, inputs, output, progress
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -24,29 +23,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("out", type=Path, metavar="BAG", help="folder to write, which must not exist")
     start = "time of the first sample, seconds since 1970 in a real bag (default: %(default)g)"
     add("--start", type=float, default=0.0, metavar="S", help=start)
-    add_choice(parser, "--ros-storage", "storage of the bag that is written", "mcap", "sqlite3")
-    add_array_options(parser)
+    command.add_choice(parser, "--ros-storage", "storage of the bag that is written", "mcap", "sqlite3")
+    inputs.add_array_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it wrote."""
-    from worldstate.adapters.datasets.array_choice import choose_array
-    from worldstate.adapters.datasets.ovad import Recording
+    from worldstate.adapters.datasets.ovad import choose_array
     from worldstate.adapters.ros.bag_writer import check_bag_target, odometry_of, write_bag
-    from worldstate.cli.common.progress import track
-    from worldstate.ground.checks import in_range
-    from worldstate.ground.values import nanoseconds
 
     check_bag_target(arguments.out)
-    start_ns = nanoseconds(in_range("--start", arguments.start, 0.0, 4e9))
-    recording = Recording.open(arguments.recording)
-    array, seen = choose_array(recording.path, given_array(arguments)), recording.read_detections()
+    start_ns = ground.nanoseconds(ground.in_range("--start", arguments.start, 0.0, 4e9))
+    recording = adapters.Recording.open(arguments.recording)
+    array, seen = choose_array(recording.path, inputs.given_array(arguments)), recording.read_detections()
     ego = odometry_of(recording)
     written = write_bag(
         arguments.out, recording.audio_path, array, seen, ego,
         start_ns=start_ns, storage=arguments.ros_storage,
     )  # fmt: skip
-    sound_s = list(track(written, f"writing {arguments.out.name}"))[-1]
+    sound_s = list(progress.track(written, f"writing {arguments.out.name}"))[-1]
     summary = {
         "bag": str(arguments.out),
         "sound_s": round(sound_s, 3),
@@ -54,4 +49,4 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "images": None if seen is None else len(seen),
         "odometry": ego is not None,
     }
-    return CommandResult(summary)
+    return output.CommandResult(summary)

@@ -7,35 +7,32 @@ standard deviation. For a standing ego.
 --out is JSON in the layout of ASAM OpenLABEL. --windows is a list of labelled seconds, which
 `model features --labels` and `model fit --labels` read: recordings of one's own become training data without
 marking by hand. It lies in the recording's folder or above it.
+
+Examples
+--------
+  worldstate street label street.wav --detections boxes.json --camera camera.json --out labels.json
+  worldstate street label ovad_dataset/SA1/left/1_00_0002 --out labels.json --windows ovad_dataset/labels.csv
+  worldstate model fit features.csv --labels ovad_dataset/labels.csv --out model.json
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.inputs import add_sound_options, sound_of
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import progress_bar
-from worldstate.cli.common.sensors import add_sensor_options, camera_source
+from worldstate import adapters
+from worldstate.cli.common import inputs, output, progress, sensors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from worldstate.adapters.source import Source
     from worldstate.operations.labelling.box_tracks import BoxTrack
     from worldstate.operations.labelling.pass_labels import PassLabel
-
-EXAMPLE = """\
-examples:
-  worldstate street label street.wav --detections boxes.json --camera camera.json --out labels.json
-  worldstate street label ovad_dataset/SA1/left/1_00_0002 --out labels.json --windows ovad_dataset/labels.csv
-  worldstate model fit features.csv --labels ovad_dataset/labels.csv --out model.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_sound_options(parser)
-    add_sensor_options(parser)
+    inputs.add_sound_options(parser)
+    sensors.add_sensor_options(parser)
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, required=True, metavar="JSON", help="trajectories and T0, OpenLABEL")
     add("--windows", type=Path, metavar="CSV", help="labelled seconds for `model fit --labels`")
@@ -44,7 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--environment", metavar="NAME", help=site)
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
@@ -54,11 +51,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.operations.labelling.street_figure import write_pass_figure
     from worldstate.operations.recordings.true_track import read_true_tracks
 
-    check_outputs(arguments, "out", "windows", figures=("figure",))
-    source, detections = camera_source(arguments, sound_of(arguments))
+    output.check_outputs(arguments, "out", "windows", figures=("figure",))
+    source, detections = sensors.camera_source(arguments, inputs.sound_of(arguments))
     file = None if arguments.windows is None else file_below(source.audio_path, arguments.windows)
     tracks = box_tracks(detections, source.camera, source.settings.boxes)
-    with progress_bar("smoothing", len(tracks)) as bar:
+    with progress.progress_bar("smoothing", len(tracks)) as bar:
         passes = label_passes(tracks, source.camera.position_m[0], on_pass=bar.advance)
     write_open_label(arguments.out, source.audio_path.name, passes)
     if arguments.figure is not None:
@@ -75,19 +72,19 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         f"{one.t0.time_s:9.2f} s +- {one.t0.std_s:.2f}  {one.arm:5}  {one.label}, {one.track.smoother}"
         for one in passes
     ]
-    return CommandResult(summary, lines=lines)
+    return output.CommandResult(summary, lines=lines)
 
 
 def _windows(
     arguments: argparse.Namespace,
-    source: "Source",
+    source: "adapters.Source",
     tracks: "Sequence[BoxTrack]",
     passes: "Sequence[PassLabel]",
     file: str,
 ) -> "list[tuple[object, ...]]":
     import numpy as np
 
-    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.operations.labelling.label_files import window_rows
 
     with open_sound(source.sound) as audio:

@@ -9,6 +9,13 @@ street that was learned before. `worldstate run --street` takes what --out write
 
 An edge that vehicles no longer come out of is learned anew after two or three of them; what was learned
 long ago is forgotten slowly.
+
+Examples
+--------
+  worldstate street learn monday.wav --array mics.csv --detections boxes.json --out street.json
+  worldstate street learn ovad_dataset/SB1/left/* --out street.json --figure street.png
+  worldstate street learn tuesday.wav --detections boxes.json --known street.json --days 1 --out street.json
+  worldstate run ovad_dataset/SB1/left/2_00_0005 --street street.json
 """
 
 import argparse
@@ -16,27 +23,21 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.output import CommandResult, check_outputs
-from worldstate.cli.common.progress import track
-from worldstate.cli.common.sensors import add_sensor_options, camera_source
+from worldstate import adapters, ground
+from worldstate.cli.common import output, progress, sensors
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.operations.labelling.street_passes import WatchedRecording
     from worldstate.smoothing.learned_street import LearnedArm, LearnedStreet
 
-EXAMPLE = """\
-examples:
-  worldstate street learn monday.wav --array mics.csv --detections boxes.json --out street.json
-  worldstate street learn ovad_dataset/SB1/left/* --out street.json --figure street.png
-  worldstate street learn tuesday.wav --detections boxes.json --known street.json --days 1 --out street.json
-  worldstate run ovad_dataset/SB1/left/2_00_0005 --street street.json"""
 # Drawn beside what all passes tell.
 STAGES = (1, 3, 10)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_sensor_options(parser)
+    sensors.add_sensor_options(parser)
     add = parser.add_argument
     add("input", type=Path, nargs="+", metavar="INPUT", help="recordings of one place, in order")
     add("--known", type=Path, metavar="JSON", help="a street that was learned before")
@@ -47,14 +48,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--sides", action=argparse.BooleanOptionalAction, default=True,
         help="learn what either arm sounds like, which takes listening to all of it (default: on)",
     )  # fmt: skip
-    output = parser.add_argument_group("output").add_argument
-    output("--out", type=Path, required=True, metavar="JSON", help="what was learned")
-    output(
-        "--figure", type=Path, metavar="PNG", help="draw it as seen from above, after 1, 3, 10, all passes"
-    )
+    add = parser.add_argument_group("output").add_argument
+    add("--out", type=Path, required=True, metavar="JSON", help="what was learned")
+    add("--figure", type=Path, metavar="PNG", help="draw it as seen from above, after 1, 3, 10, all passes")
 
 
-def run(arguments: argparse.Namespace) -> CommandResult:
+def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.operations.labelling.street_file import write_street
     from worldstate.operations.labelling.street_passes import streets_after
@@ -62,14 +61,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     _check(arguments)
     before = street = _known(arguments)
     stages: list[LearnedStreet] = []
-    for one in track(arguments.input, "learning", len(arguments.input)):
+    for one in progress.track(arguments.input, "learning", len(arguments.input)):
         *passed, street = streets_after(street, _seen(arguments, one))
         stages += passed
     write_street(arguments.out, street)
     if arguments.figure is not None:
         _draw(arguments, [before, *stages], street)
     found = {arm.direction: _figures(arm) for arm in street.arms}
-    return CommandResult(
+    return output.CommandResult(
         {
             "out": str(arguments.out),
             "n_passes": len(stages),
@@ -81,15 +80,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from worldstate.ground.checks import in_range
-    from worldstate.ground.errors import InvalidArgumentError
 
-    in_range("--days", arguments.days, 0.0, 1e5)
+    ground.in_range("--days", arguments.days, 0.0, 1e5)
     if arguments.detections and len(arguments.input) > 1:
         raise InvalidArgumentError("--detections: expected one INPUT with it, they are of one recording")
     # What is known may be written over: it is read before, and its passes are kept.
     apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})
-    check_outputs(apart, "out", figures=("figure",))
+    output.check_outputs(apart, "out", figures=("figure",))
 
 
 def _known(arguments: argparse.Namespace) -> "LearnedStreet":
@@ -106,12 +103,11 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     """Return the passes of a recording."""
     from dataclasses import replace
 
-    from worldstate.adapters.audio.open_sound import as_sound, open_sound
-    from worldstate.adapters.files.model_file import read_model
+    from worldstate.adapters.audio.sound_file import as_sound, open_sound
     from worldstate.operations.labelling.street_passes import heard_street, watched_recording
 
-    model = read_model(arguments.model)
-    source, detections = camera_source(arguments, as_sound((path,)))
+    model = adapters.read_model(arguments.model)
+    source, detections = sensors.camera_source(arguments, as_sound((path,)))
     with open_sound(source.sound) as audio:
         duration_s = audio.duration_s
     watched = watched_recording(detections, source.camera, source.settings.boxes, duration_s)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.source import Source
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.stream import FrontEnd

@@ -7,8 +7,7 @@ from zlib import crc32
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
-from worldstate.adapters.source import ListenSettings
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.serialisation import encode

@@ -6,10 +6,22 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.camera.box_linking import kept_and_parked, overlaps
-from worldstate.adapters.camera.camera_health import CameraHealth, learn_health
-from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, Family, degrade
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
+from worldstate.adapters.camera.box_linking import overlaps
+from worldstate.adapters.camera.camera_health import (
+    FAMILIES,
+    LEVELS,
+    CameraHealth,
+    Family,
+    degrade,
+    learn_health,
+)
+from worldstate.adapters.camera.detections import (
+    DetectionFilter,
+    DetectionFrame,
+    DetectionLog,
+    Detector,
+    kept_and_parked,
+)
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, Video

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.camera.box_linking import AzimuthBox, kept_and_parked, linked_boxes
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
+from worldstate.adapters.camera.box_linking import AzimuthBox, linked_boxes
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, kept_and_parked
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds

@@ -10,7 +10,7 @@ import numpy as np
 
 from worldstate.adapters.datasets.feature_extraction import FRONT, window_ends_s
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.adapters.files.atomic import atomic_path, write_text
+from worldstate.adapters.files.file_io import atomic_path, write_text
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.version import __version__

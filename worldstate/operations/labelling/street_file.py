@@ -5,8 +5,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.text_file import read_json, refused_as_file
+from worldstate.adapters.files.file_io import read_json, refused_as_file, write_text
 from worldstate.ground.serialisation import decode, encode
 from worldstate.smoothing.learned_street import LearnedStreet
 

@@ -15,8 +15,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import measure_steps
-from worldstate.adapters.source import Source
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import Source, open_source
 from worldstate.ground import NotUsable, OutOfDomainError, seconds
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_pass

@@ -12,7 +12,7 @@ import numpy as np
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden_sector, label_of, sector_of
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.file_io import atomic_path
 from worldstate.adapters.listener import Step
 from worldstate.adapters.source import Source
 from worldstate.frontend.settings import HOP_RATE_HZ, WINDOW_HOPS

@@ -3,6 +3,8 @@
 56 channels, 47,998 Hz, nfft 512, half overlap, BLAS pinned to one thread. Milliseconds are the median over
 rounds of the median (and 99th percentile) over hops. The sound is a broadband source and an engine line in
 noise as loud as the source. --files prints the files of the library that one hop of the whole chain executes.
+
+example: worldstate-lab bench
 """
 
 import argparse
@@ -20,7 +22,7 @@ from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[imp
 
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.listener import Listener
-from worldstate.adapters.source_files import open_source
+from worldstate.adapters.source import open_source
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
@@ -41,8 +43,6 @@ from worldstate_lab.benchmarks.hop_costs import (
     stage_times,
 )
 from worldstate_lab.benchmarks.tracker_costs import tracker_times
-
-EXAMPLE = "example: worldstate-lab bench"
 
 SECONDS = 6
 # Running seconds are full after ten hops, and caches warm.

@@ -4,6 +4,8 @@ Streams that were listened to (`worldstate model make` keeps them) are followed 
 degrees, p = 1, alpha = 2. Hidden are vehicles that come into view within five seconds, visible those in line
 of sight and in the image. Every method states both. The world-state does so itself; of a tracker, which
 models no occlusion, a track where the stream's boxes stand is visible.
+
+example: worldstate-lab bench gospa streams/S??-*.npz --seconds 120
 """
 
 import argparse
@@ -33,8 +35,6 @@ from worldstate_lab.methods.oc_sort import OcSort
 from worldstate_lab.metrics.track_measures import gospa_bearing
 from worldstate_lab.passes.followed_stream import stream_measurements
 from worldstate_lab.passes.stream_camera import stream_detections
-
-EXAMPLE = "example: worldstate-lab bench gospa streams/S??-*.npz --seconds 120"
 
 SILENCE, WORLD, BOXES, UNHEARING = "silence", "world-state", "boxes as they are", "world-state without sound"
 OC_SORT, GM_PHD, JPDA = "OC-SORT on the boxes", "GM-PHD (Stone Soup)", "JPDA (Stone Soup)"

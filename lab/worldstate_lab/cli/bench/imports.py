@@ -1,6 +1,8 @@
 """`worldstate-lab bench import`: how long the imports take.
 
 Each statement in a fresh interpreter, best of several: seconds of wall and of processor.
+
+example: worldstate-lab bench import
 """
 
 import argparse
@@ -8,8 +10,6 @@ import subprocess
 import sys
 
 from worldstate.cli.common.output import CommandResult
-
-EXAMPLE = "example: worldstate-lab bench import"
 
 STATEMENTS = (
     "import worldstate",

@@ -4,7 +4,7 @@ import math
 from dataclasses import asdict, replace
 from typing import Any
 
-from worldstate.adapters.camera.degradation import LEVELS
+from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate_lab.degradation.awareness import AwarenessRow
 from worldstate_lab.degradation.beta_curves import Band
 from worldstate_lab.degradation.conditions import FAMILIES, OFF

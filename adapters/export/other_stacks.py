@@ -1,23 +1,25 @@
-"""Entities at places as other stacks have them: Autoware's `PredictedObjects` and ASAM OSI `SensorData`.
+"""Entities as other stacks have them: Autoware's PredictedObjects, ASAM OSI's SensorData, tracks of ODAS.
 
 A place is as measured, or in the crossing lane where only the azimuth is known.
 """
 
+import json
 import math
+import socket
 import struct
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.file_io import atomic_path, line_writer
+from worldstate.ground import FloatArray, InvalidArgumentError, seconds
 from worldstate.ground.extras import check_extra, optional
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
 from worldstate.state import Entity, WorldState
 
 # Real vehicles of OVAD pass some 9 m ahead of the ego; another junction has another distance.
@@ -126,6 +128,13 @@ def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[
     return {"header": header, "objects": [_object(one) for one in lane_objects(state, crossing_m)]}
 
 
+@contextmanager
+def autoware_lines(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
+    """Lend a function that writes the messages of states, one a line."""
+    with line_writer(path) as write:
+        yield lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+
+
 def likeliest_label(one: LaneObject) -> int:
     """Return Autoware's number of the likeliest known class, 0 where none is known."""
     known = [said for said in one.entity.classification if LABELS.get(said.label, 0)]
@@ -206,9 +215,8 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
     header = data.moving_object_header
     header.cycle_counter = state.seq
     impaired = any(sensor.condition != "working" for sensor in state.sensors)
-    header.data_qualifier = (
-        header.DATA_QUALIFIER_AVAILABLE_REDUCED if impaired else header.DATA_QUALIFIER_AVAILABLE
-    )
+    available = "AVAILABLE_REDUCED" if impaired else "AVAILABLE"
+    header.data_qualifier = getattr(header, f"DATA_QUALIFIER_{available}")
     for one in lane_objects(state, crossing_m):
         _fill(data.moving_object.add(), one)
     return data
@@ -235,9 +243,8 @@ def _fill(moving: Any, one: LaneObject) -> None:
     header.existence_probability = entity.existence_probability
     header.age = seconds(entity.updated_ns - entity.created_ns)
     predicted = entity.status == "hidden" or not one.measured
-    header.measurement_state = (
-        header.MEASUREMENT_STATE_PREDICTED if predicted else header.MEASUREMENT_STATE_MEASURED
-    )
+    known = "PREDICTED" if predicted else "MEASURED"
+    header.measurement_state = getattr(header, f"MEASUREMENT_STATE_{known}")
     base, spread = moving.base, one.covariance.diagonal() ** 0.5
     base.position.x, base.position.y = one.position_m.tolist()
     base.velocity.x, base.velocity.y = one.velocity_mps.tolist()
@@ -251,13 +258,61 @@ def _fill(moving: Any, one: LaneObject) -> None:
     for said in entity.classification:
         number, candidate = LABELS.get(said.label, 0), moving.candidate.add()
         candidate.probability = said.probability
-        candidate.type = (
-            kinds.TYPE_PEDESTRIAN
-            if number == _PERSON
-            else kinds.TYPE_VEHICLE
-            if number
-            else kinds.TYPE_UNKNOWN
-        )
+        known = kinds.TYPE_VEHICLE if number else kinds.TYPE_UNKNOWN
+        candidate.type = kinds.TYPE_PEDESTRIAN if number == _PERSON else known
         if number in _VEHICLES:
-            name = _VEHICLES[number]
-            candidate.vehicle_classification.type = getattr(kinds.VehicleClassification, name)
+            vehicle = getattr(kinds.VehicleClassification, _VEHICLES[number])
+            candidate.vehicle_classification.type = vehicle
+
+
+# ODAS sends as many tracks each time, empty ones with id 0.
+_TRACKS = 4
+
+
+class OdasTracks:
+    """Snapshots as ODAS's JSON of tracked sources; entities are numbered as they come up.
+
+    Examples
+    --------
+    >>> OdasTracks().line(WorldState(0, 12))[:60]
+    '{"timeStamp": 12, "src": [{"id": 0, "tag": "", "x": 0.0, "y"'
+    """
+
+    def __init__(self) -> None:
+        # Of who is there now: a long run has more entities than memory should hold.
+        self._numbers: dict[str, int] = {}
+        self._next = count(1)
+
+    def line(self, state: WorldState) -> str:
+        """Return one line: the likeliest moving entities as directions, existence as activity."""
+        there = {one.id for one in state.entities}
+        self._numbers = {name: number for name, number in self._numbers.items() if name in there}
+        moving = [one for one in state.entities if one.moving]
+        likeliest = sorted(moving, key=lambda one: -one.existence_probability)[:_TRACKS]
+        tracks = [self._track(one) for one in likeliest]
+        empty = {"id": 0, "tag": "", "x": 0.0, "y": 0.0, "z": 0.0, "activity": 0.0}
+        return json.dumps({"timeStamp": state.seq, "src": tracks + [empty] * (_TRACKS - len(tracks))})
+
+    def _track(self, entity: Entity) -> dict[str, object]:
+        if entity.id not in self._numbers:
+            self._numbers[entity.id] = next(self._next)
+        x, y = round(math.cos(entity.azimuth_rad), 3), round(math.sin(entity.azimuth_rad), 3)
+        activity = round(entity.existence_probability, 3)
+        number = self._numbers[entity.id]
+        return {"id": number, "tag": "dynamic", "x": x, "y": y, "z": 0.0, "activity": activity}
+
+
+@contextmanager
+def odas_socket(address: str) -> Iterator[Callable[[WorldState], None]]:
+    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's line."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise InvalidArgumentError(f"--export odas: expected HOST:PORT, got {address}")
+    tracks = OdasTracks()
+    try:
+        connection = socket.create_connection((host, int(port)), timeout=10.0)
+    except OSError as error:
+        # It has no file name, by which the command would name it.
+        raise InvalidArgumentError(f"--export odas: expected a listener at {address} ({error})") from error
+    with connection:
+        yield lambda state: connection.sendall((tracks.line(state) + "\n").encode())

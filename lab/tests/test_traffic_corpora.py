@@ -6,8 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 import soundfile
-
-from worldstate.adapters.datasets.traffic_clips import (
+from worldstate_lab.signatures.traffic_clips import (
     BACKGROUND,
     CLIP_S,
     CLIPS_A_FILE,
@@ -17,6 +16,7 @@ from worldstate.adapters.datasets.traffic_clips import (
     melaudis,
     read_clip,
 )
+
 from worldstate.ground.errors import InputFileError
 
 CAR = "2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_1272258_M_D_CR"

@@ -1,13 +1,17 @@
-"""JSON Schema (draft 2020-12) of frozen dataclasses, as `serialisation.encode` writes them."""
+"""JSON Schema (draft 2020-12) of frozen dataclasses as `encode` writes them; `make schema` ships some."""
 
 import inspect
+import json
 import re
 import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
+from worldstate.adapters.export.scene import CompressedImage, SceneUpdate
 from worldstate.ground.serialisation import Check, Hint, Layout
+from worldstate.state import WorldState
 
 Schema: TypeAlias = dict[str, Any]
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -84,3 +88,17 @@ def _descriptions(cls: Any) -> dict[str, str]:
     """Return what the docstring of a class says of its fields."""
     entries = _ENTRY.findall(inspect.getdoc(cls) or "")
     return {name: " ".join(text.split()) for names, text in entries for name in names.split(", ")}
+
+
+# What ships in `worldstate/data`, by the name of its type in logs.
+SHIPPED: dict[str, type] = {
+    "snapshot": WorldState,
+    "foxglove.SceneUpdate": SceneUpdate,
+    "foxglove.CompressedImage": CompressedImage,
+}
+
+
+if __name__ == "__main__":
+    for name, kind in SHIPPED.items():
+        text = json.dumps(json_schema(kind), indent=1)
+        (Path("worldstate/data") / f"{name}.schema.json").write_text(text + "\n", encoding="utf-8")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.audio.sound_file import open_audio
-from worldstate.adapters.files.text_file import read_text
+from worldstate.adapters.files.file_io import read_text
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array
 

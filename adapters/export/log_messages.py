@@ -1,0 +1,273 @@
+"""What a viewer or a log is given of a hop, and where it goes: MCAP files, Rerun, Foxglove on a websocket."""
+
+import base64
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
+from worldstate.adapters.files.file_io import atomic_path
+from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
+from worldstate.ground.extras import check_extra, optional
+from worldstate.ground.serialisation import encode
+from worldstate.state.world_state import WorldState, snapshot_schema
+
+from .scene import (
+    CompressedImage,
+    Rgba,
+    SceneItem,
+    SceneLine,
+    SceneSolid,
+    SceneText,
+    SceneTime,
+    SceneUpdate,
+    Xyz,
+    scene_update,
+    srp_scene,
+)
+
+SNAPSHOT_TOPIC, SCENE_TOPIC = "/worldstate/snapshot", "/worldstate/scene"
+SRP_TOPIC, IMAGE_TOPIC = "/worldstate/srp", "/camera/image"
+# OVAD's images, 1936 pixels wide, are shown in a third of a screen: halved they take 77 kB in a log, not 245.
+_WIDEST_PX, _QUALITY = 1000, 80
+Told: TypeAlias = WorldState | SceneUpdate | CompressedImage
+# The name that a viewer knows each by.
+_SCHEMA_NAMES: dict[type, str] = {
+    WorldState: "worldstate.Snapshot",
+    SceneUpdate: "foxglove.SceneUpdate",
+    CompressedImage: "foxglove.CompressedImage",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LogMessage:
+    """One message, which viewers and logs are given as JSON text."""
+
+    topic: str
+    stamp_ns: int
+    value: Told
+
+    @property
+    def data(self) -> bytes:
+        """The text; of a snapshot as `WorldState.to_json` writes it."""
+        if isinstance(self.value, WorldState):
+            return self.value.to_json().encode()
+        written = encode(self.value)
+        return json.dumps(written, allow_nan=False, check_circular=False, separators=(",", ":")).encode()
+
+    @property
+    def schema_name(self) -> str:
+        """Name of the type of the value."""
+        return _SCHEMA_NAMES[type(self.value)]
+
+    @property
+    def schema(self) -> bytes:
+        """JSON Schema of the message."""
+        if isinstance(self.value, WorldState):
+            return json.dumps(snapshot_schema()).encode()
+        shipped = files("worldstate") / "data" / f"{self.schema_name}.schema.json"
+        return json.dumps(json.loads(shipped.read_text("utf-8"))).encode()
+
+
+LogSink: TypeAlias = Callable[[LogMessage], None]
+
+
+def state_messages(state: WorldState) -> Iterator[LogMessage]:
+    """Yield a snapshot as `WorldState.to_json` writes it, and the scene that it describes.
+
+    Examples
+    --------
+    >>> [(message.topic, message.schema_name) for message in state_messages(WorldState(0, 0))]
+    [('/worldstate/snapshot', 'worldstate.Snapshot'), ('/worldstate/scene', 'foxglove.SceneUpdate')]
+    """
+    yield LogMessage(SNAPSHOT_TOPIC, state.stamp_ns, state)
+    yield LogMessage(SCENE_TOPIC, state.stamp_ns, scene_update(state))
+
+
+def srp_message(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> LogMessage:
+    """Return the power of the sound over azimuth as a line about the array."""
+    return LogMessage(SRP_TOPIC, state.stamp_ns, srp_scene(state, azimuths_rad, srp))
+
+
+def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterator[LogMessage]]:
+    """Return what yields the last image before a stamp, asked in order of time, if it is a new one."""
+    path = recording / VIDEO_NAME
+    if not path.is_file():
+        return lambda stamp_ns: iter(())
+    cv2, video = opencv(), open_video(path)
+    frames = enumerate(video.frames())
+    ahead = next(frames, None)
+
+    def image_before(stamp_ns: int) -> Iterator[LogMessage]:
+        nonlocal ahead
+        shown = None
+        while ahead is not None and start_ns + nanoseconds(ahead[0] / video.frame_rate_hz) <= stamp_ns:
+            shown, ahead = ahead, next(frames, None)
+        if shown is not None:
+            step = -(-video.width_px // _WIDEST_PX)
+            size = video.width_px // step, video.height_px // step
+            small = cv2.resize(shown[1], size, interpolation=cv2.INTER_AREA)
+            _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            yield image_message(start_ns + nanoseconds(shown[0] / video.frame_rate_hz), jpeg.tobytes())
+
+    return image_before
+
+
+def image_message(stamp_ns: int, jpeg: bytes) -> LogMessage:
+    """Return an image of the camera."""
+    text = base64.b64encode(jpeg).decode("ascii")
+    return LogMessage(IMAGE_TOPIC, stamp_ns, CompressedImage(SceneTime.of_ns(stamp_ns), "camera", text))
+
+
+TIMELINE = "stream"
+
+
+@contextmanager
+def rerun_file(path: Path) -> Iterator[LogSink]:
+    """Lend a function that writes messages to a Rerun recording, which takes its name when the block ends."""
+    rr = optional("rerun")
+    with atomic_path(path) as temporary:
+        recording = rr.RecordingStream("worldstate")
+        recording.save(temporary)
+        recording.log("/", rr.ViewCoordinates.FLU, static=True)
+
+        def write(message: LogMessage) -> None:
+            recording.set_time(TIMELINE, duration=1e-9 * message.stamp_ns)
+            for place, drawn in _drawn(rr, message.topic, message.value):
+                recording.log(place, drawn)
+
+        try:
+            yield write
+        finally:
+            recording.disconnect()
+
+
+def _drawn(rr: ModuleType, topic: str, value: Told) -> Iterator[tuple[str, object]]:
+    """Yield what is drawn of a message, each with its place; what an earlier scene drew is removed."""
+    if isinstance(value, WorldState):
+        yield topic, rr.TextDocument(value.to_json(), media_type="application/json")
+    elif isinstance(value, CompressedImage):
+        yield topic, rr.EncodedImage(contents=base64.b64decode(value.data), media_type="image/jpeg")
+    else:
+        yield topic, rr.Clear(recursive=True)
+        for item in value.entities:
+            place = f"{topic}/{item.id.replace(' ', '/')}"
+            for part, shape in _shapes(rr, item):
+                yield f"{place}/{part}", shape
+            if item.metadata:
+                yield place, rr.AnyValues(**{pair.key: pair.value for pair in item.metadata})
+
+
+def _shapes(rr: ModuleType, item: SceneItem) -> Iterator[tuple[str, object]]:
+    for number, one in enumerate(item.triangles):
+        corners = _points(one.points)
+        triangles = np.arange(len(corners)).reshape(-1, 3)
+        color = _color(one.color)
+        mesh = rr.Mesh3D(vertex_positions=corners, triangle_indices=triangles, albedo_factor=color)
+        yield f"sector{number}", mesh
+    if item.lines:
+        strips, radii = zip(*((_points(one.points), 0.5 * one.thickness) for one in item.lines), strict=True)
+        yield "lines", rr.LineStrips3D(strips, radii=radii, colors=_colors(item.lines))
+    for arrow in item.arrows:
+        ahead = (arrow.shaft_length + arrow.head_length, 0.0, 0.0)
+        yield "arrow", rr.Arrows3D(vectors=[ahead], colors=[_color(arrow.color)])
+    if item.cubes:
+        centers, sizes = (
+            _points(one.pose.position for one in item.cubes),
+            _points(one.size for one in item.cubes),
+        )
+        yield "boxes", rr.Boxes3D(centers=centers, sizes=sizes, colors=_colors(item.cubes))
+    if item.texts:
+        places, labels = _points(one.pose.position for one in item.texts), [one.text for one in item.texts]
+        colors = _colors(item.texts)
+        yield "text", rr.Points3D(places, labels=labels, colors=colors, radii=0.1, show_labels=True)
+
+
+def _points(points: Iterable[Xyz]) -> FloatArray:
+    return np.array([(one.x, one.y, one.z) for one in points], dtype=np.float64).reshape(-1, 3)
+
+
+def _color(color: Rgba) -> tuple[int, int, int, int]:
+    red, green, blue, opaque = (round(255 * part) for part in (color.r, color.g, color.b, color.a))
+    return red, green, blue, opaque
+
+
+def _colors(shapes: Iterable[SceneLine | SceneSolid | SceneText]) -> list[tuple[int, int, int, int]]:
+    return [_color(one.color) for one in shapes]
+
+
+@contextmanager
+def mcap_file(path: Path) -> Iterator[LogSink]:
+    """Lend a function that writes messages to an MCAP file, which takes its name when the block ends."""
+    check_extra("mcap")
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        writer = optional("mcap.writer").Writer(file)
+        writer.start()
+        channels: dict[str, int] = {}
+
+        def write(message: LogMessage) -> None:
+            if message.topic not in channels:
+                schema = writer.register_schema(message.schema_name, "jsonschema", message.schema)
+                channels[message.topic] = writer.register_channel(message.topic, "json", schema)
+            writer.add_message(channels[message.topic], message.stamp_ns, message.data, message.stamp_ns)
+
+        yield write
+        writer.finish()
+
+
+def read_snapshot_lines(path: Path) -> Iterator[str]:
+    """Yield the snapshots of an MCAP file as the text that was written, in the order of their writing."""
+    make_reader, damaged = optional("mcap.reader").make_reader, optional("mcap.exceptions").McapError
+    with path.open("rb") as file:
+        try:
+            # By time of writing and not by stamp: a late measurement may have moved a stamp back.
+            for _, _, message in make_reader(file).iter_messages([SNAPSHOT_TOPIC], log_time_order=False):
+                yield message.data.decode()
+        except (damaged, UnicodeDecodeError) as error:
+            raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
+
+
+@contextmanager
+def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int]]:
+    """Lend a function that sends messages to connected viewers, and the port; 0 takes a free one.
+
+    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound;
+    not so where `paced` is False: microphones that run set the pace themselves.
+    """
+    foxglove = optional("foxglove")
+    # A context of its own: the global one keeps its channels for all servers of the process.
+    context = foxglove.Context()
+    try:
+        server = foxglove.start_server(name="worldstate", port=port, context=context)
+    except (RuntimeError, OverflowError) as error:
+        raise InvalidArgumentError(
+            f"--export foxglove: expected a free port, got {port} ({error})"
+        ) from error
+    channels: dict[str, Any] = {}
+    begun_s: float | None = None
+
+    def send(message: LogMessage) -> None:
+        nonlocal begun_s
+        stamp_s = seconds(message.stamp_ns)
+        begun_s = time.monotonic() - stamp_s if begun_s is None else begun_s
+        if paced:
+            time.sleep(max(begun_s + stamp_s - time.monotonic(), 0.0))
+        if message.topic not in channels:
+            schema = foxglove.Schema(name=message.schema_name, encoding="jsonschema", data=message.schema)
+            channels[message.topic] = foxglove.Channel(
+                message.topic, schema=schema, message_encoding="json", context=context
+            )
+        channels[message.topic].log(message.data, log_time=message.stamp_ns)
+
+    try:
+        yield send, server.port
+    finally:
+        server.stop()
