@@ -8,8 +8,8 @@ import numpy as np
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.direction.bearing import steered_power
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum, pair_sum_of
-from worldstate.frontend.direction.phat import steered_power
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, spanned
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor

@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.bearing import bearing_of, find_peaks
+from worldstate.frontend.direction.bearing import bearing_of, find_peaks, noise_prominence, normalised
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
-from worldstate.frontend.direction.phat import noise_prominence, normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
 from worldstate.frontend.hop_spectra import Hop, HopCutter
 from worldstate.frontend.levels import SILENCE

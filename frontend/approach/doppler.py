@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import OptimizeResult, least_squares
 
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
 from worldstate.ground import FloatArray, NotUsable
 
 from .engine_line import HarmonicTrack

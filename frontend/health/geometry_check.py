@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
-from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S, MicrophoneArray
 from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray, IndexArray
 from worldstate.ground.values import NotUsable
 

@@ -17,10 +17,11 @@ import numpy as np
 
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.adapters.source import Source
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import InvalidArgumentError, wrap_angle
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import vertex
 from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
 from worldstate.operations.recordings.bearing_track import track_bearings
 from worldstate.operations.recordings.hop_table import HopTable
@@ -219,9 +220,5 @@ def _best(total: FloatArray) -> tuple[float, float]:
 
 
 def _peak(grid: FloatArray, values: FloatArray, at: int) -> float:
-    if not 0 < at < len(grid) - 1:
-        return float(grid[at])
-    before, here, after = values[at - 1 : at + 2]
-    bend = before - 2.0 * here + after
-    shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    shift = vertex(*values[at - 1 : at + 2].tolist()) if 0 < at < len(grid) - 1 else 0.0
     return float(grid[at] + shift * (grid[1] - grid[0]))
