@@ -10,9 +10,8 @@ from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import SidePatterns, StreetHearing, StreetListener
-from worldstate.abduction.signature.domain_guard import DomainGuard
+from worldstate.abduction.signature.domain_guard import DomainGuard, ModelDomain
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, path_of
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.special import betaincinv
 
-from worldstate.abduction.absence import MissRateTable, isotonic_grid
+from worldstate.abduction.co_evidence import MissRateTable, isotonic_grid
 from worldstate.adapters.files.atomic import write_text
 from worldstate.adapters.files.text_file import read_record
 from worldstate.ground import InvalidArgumentError, finite_array

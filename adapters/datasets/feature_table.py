@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from worldstate.abduction.signature.model_domain import ModelDomain
+from worldstate.abduction.signature.domain_guard import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.files.atomic import atomic_path, write_text
 from worldstate.adapters.files.text_file import number, read_record, read_rows

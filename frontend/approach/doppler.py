@@ -258,7 +258,8 @@ def _rejected(
     def polynomial(degree: int) -> float:
         """Return the criterion of a polynomial."""
         H = legendre.legvander(unit, degree) / std[:, None]
-        return float(np.sum((y - H @ np.linalg.lstsq(H, y, rcond=None)[0]) ** 2)) + (degree + 1) * price
+        chi_squared = np.sum((y - H @ np.linalg.lstsq(H, y, rcond=None)[0]) ** 2)
+        return float(chi_squared + (degree + 1) * price)
 
     beaten = chi_squared + PARAMETERS * price + _LEAST_GAIN
     if polynomial(0) < beaten:

@@ -6,7 +6,7 @@ combined into the fundamental with its variance. Their reduced chi-squared is th
 near one if the partials are multiples of one fundamental.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -133,8 +133,8 @@ class HarmonicTrack:
     def usable(self) -> "HarmonicTrack":
         """Return the windows with a partial."""
         found = self.n_partials > 0
-        columns = [getattr(self, one.name)[found] for one in fields(self) if one.name != "windows"]
-        return HarmonicTrack(*columns, len(found))
+        columns = (one.name for one in fields(self) if one.name != "windows")
+        return replace(self, **{name: getattr(self, name)[found] for name in columns})
 
 
 @dataclass(frozen=True, slots=True)

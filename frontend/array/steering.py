@@ -38,8 +38,7 @@ class Steering:
     conjugate: Complex64Array
     # The same beams at the node directions from which the power in all others is interpolated, and how,
     # shape (nodes, directions); None if that does not save work.
-    nodes: "Steering | None" = None
-    spread: FloatArray | None = None
+    nodes: "tuple[Steering, FloatArray] | None" = None
 
     @classmethod
     def towards(
@@ -82,7 +81,7 @@ class Steering:
         .. math:: P(\theta) = \sum_k C_k(\theta)^T Q_k\, \overline{C_k(\theta)}
         """
         if self.nodes is not None:
-            return np.asarray(self.nodes.quadratic_form(matrices) @ self.spread)
+            return np.asarray(self.nodes[0].quadratic_form(matrices) @ self.nodes[1])
         products = matrices @ self.conjugate
         products *= self.weights
         return np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
@@ -93,7 +92,7 @@ class Steering:
         .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
         """
         if self.nodes is not None:
-            return np.asarray(self.nodes.power_within(vectors) @ self.spread)
+            return np.asarray(self.nodes[0].power_within(vectors) @ self.nodes[1])
         rows = vectors.transpose(0, 2, 1)
         inner = (rows if self.basis is None else rows @ self.basis) @ self.weights
         power = np.square(inner.real).sum(axis=1, dtype=np.float64) + np.square(inner.imag).sum(axis=1)
@@ -117,7 +116,7 @@ def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: byte
         return Steering(thin, single, single.conj())
     index, spread = found
     chosen = np.ascontiguousarray(weights[:, :, index], np.complex64)
-    return Steering(thin, single, single.conj(), Steering(thin, chosen, chosen.conj()), spread)
+    return Steering(thin, single, single.conj(), (Steering(thin, chosen, chosen.conj()), spread))
 
 
 def interpolation_nodes(vectors: Complex128Array) -> tuple[IndexArray, FloatArray] | None:

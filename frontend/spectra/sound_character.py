@@ -177,7 +177,7 @@ def _swings(levels: FloatArray) -> FloatArray:
     return np.array([high - middle, middle - low, pause, change[:_HIGH].mean(), change[_HIGH:].mean()])
 
 
-def _means(edges_hz: tuple[float, ...], hz: FloatArray) -> FloatArray:
+def _means(edges_hz: tuple[float, ...], hz: np.ndarray) -> FloatArray:
     """Means over the frequencies between edges, shape (bands, frequencies)."""
     inside = np.stack([(hz >= low) & (hz < high) for low, high in pairwise(edges_hz)])
     return np.asarray(inside / inside.sum(axis=1, keepdims=True))

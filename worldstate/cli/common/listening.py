@@ -137,7 +137,7 @@ def open_given(
     from worldstate.adapters.acoustic import Grounding
     from worldstate.adapters.files.context_file import read_context
     from worldstate.adapters.source_files import open_source
-    from worldstate.operations.labelling.street_file import read_street
+    from worldstate.operations.labelling.street_passes import read_street
     from worldstate.smoothing.learned_street import context_of
 
     arguments = given.arguments

@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.cli.common.progress import progress_bar
     from worldstate.ground.checks import in_range
     from worldstate.ground.values import seconds
-    from worldstate.operations.recordings.warning import WarningMeter
+    from worldstate.operations.recordings.recording_report import WarningMeter
 
     check_outputs(arguments, "out")
     crossing_m = in_range("--crossing", arguments.crossing, 1.0, 100.0)

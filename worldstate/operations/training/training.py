@@ -9,16 +9,16 @@ import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.cueing.risk_map import fit_platt
+from worldstate.abduction.signature.domain_guard import ModelDomain
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import RECIPES, SimulatedWindows, SiteEnsembleClassifier
-from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
 from worldstate.adapters.files.acoustic_domain import ego_motion_of
 from worldstate.adapters.files.model_file import Model, Provenance
 from worldstate.ground.extras import check_extra
 from worldstate.ground.typing import FloatArray, TextArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 
 from .folds import N_FOLDS, folds_by_recording, junction_folds, out_of_fold
 from .site_references import asked_while_listening, with_site_references
