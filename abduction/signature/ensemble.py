@@ -360,13 +360,12 @@ class EnsembleModel:
     def _split(self, X: ArrayLike) -> tuple[FloatArray, FloatArray]:
         n_features = self.n_features
         inputs = finite_array("X", X, (None, None))
-        if inputs.shape[1] not in (n_features, n_features * (1 + len(KINDS))):
-            raise InvalidArgumentError(
-                f"X: expected {n_features} features or {n_features * (1 + len(KINDS))} with a reference, "
-                f"got shape {inputs.shape}"
-            )
-        if inputs.shape[1] > n_features:
+        with_reference = n_features * (1 + len(KINDS))
+        if inputs.shape[1] == with_reference:
             return split_reference(inputs)
+        if inputs.shape[1] != n_features:
+            expected = f"{n_features} features or {with_reference} with a reference"
+            raise InvalidArgumentError(f"X: expected {expected}, got shape {inputs.shape}")
         return log_levels(inputs), np.broadcast_to(self.home.row, (len(inputs), self.home.row.size))
 
     def _log_posteriors(self, levels: FloatArray, reference: FloatArray) -> FloatArray:

@@ -114,7 +114,8 @@ class OrderCheck:
 
         .. math:: G_{ab} = \ln \frac{\sum_d \max(P_d^{(ab)}, 0)^2}{\sum_d \max(P_d, 0)^2}
         """
-        pairs = self._all or tuple({_pair(one) for one in proposed})
+        exchanges = ((one.channel, one.looks_like) for one in proposed if one.looks_like is not None)
+        pairs = self._all or tuple({(min(pair), max(pair)) for pair in exchanges})
         usual = log_sharpness(self._waves.agreement(coherence))
         gains = sharpness_gains(coherence, self._waves.beams, np.array(pairs, int).reshape(-1, 2))
         rival = log_sharpness_undelayed - usual
@@ -136,11 +137,6 @@ class OrderCheck:
             for gain, (a, b) in (found[-1:] if self._all else found)
             for one, other in ((a, b), (b, a))
         ]
-
-
-def _pair(fault: ChannelFault) -> Pair:
-    other = fault.channel if fault.looks_like is None else fault.looks_like
-    return min(fault.channel, other), max(fault.channel, other)
 
 
 def sharpness_gains(coherence: Complex64Array, beams: Complex64Array, pairs: IndexArray) -> FloatArray:
@@ -354,10 +350,9 @@ class DelayCheck:
         if len(values) < _MIN_DELAY_S:
             return []
         card = best_card(free @ np.median(values, axis=0), free, self._runs)
-        amount, root = abs(card.amount), float(np.sqrt(np.count_nonzero(card.channels)))
-        if amount < max(_DELAY_S, _LONE_DELAY_S / root) or amount * card.sensitivity < _DELAY_RMS_S * np.sqrt(
-            len(free)
-        ):
+        amount, length = abs(card.amount), abs(card.amount) * card.sensitivity
+        least_s = max(_DELAY_S, _LONE_DELAY_S / float(np.sqrt(np.count_nonzero(card.channels))))
+        if amount < least_s or length < _DELAY_RMS_S * np.sqrt(len(free)):
             return []
         paths = values @ card.channels / card.sensitivity**2
         # Standard deviation of a median.
@@ -494,12 +489,9 @@ class PositionFit:
         scores = position_scores(self._sum / np.float32(self._n_frames), self._weights)
         own = scores.diagonal()
         typical = float(np.median(own[self._usable])) if self._usable.any() else 0.0
-        found: list[ChannelFault] = []
-        if typical < _MIN_COHERENCE:
-            self.coherence = NotUsable(f"no coherent sound ({typical:.2f})")
-        else:
-            self.coherence = typical
-            found = self._find(scores, typical, active)
+        heard = typical >= _MIN_COHERENCE
+        self.coherence = typical if heard else NotUsable(f"no coherent sound ({typical:.2f})")
+        found = self._find(scores, typical, active) if heard else []
         self.faults, self._found = repeated(found, self._found)
 
     def _use(self, usable: BoolArray) -> None:
@@ -517,10 +509,8 @@ class PositionFit:
         noisy[[fault.channel for fault in swapped]] = False
         self._suspects = noisy | inverted
         self._suspects[[fault.channel for fault in swapped]] = True
-        share = own / typical
-        return (
-            swapped + faults_where(Fault.NOISY, noisy, share) + faults_where(Fault.INVERTED, inverted, share)
-        )
+        both = ((Fault.NOISY, noisy), (Fault.INVERTED, inverted))
+        return swapped + [one for kind, found in both for one in faults_where(kind, found, own / typical)]
 
 
 def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:

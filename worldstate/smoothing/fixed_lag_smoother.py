@@ -4,6 +4,7 @@ import math
 from bisect import bisect_left, insort
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -160,7 +161,7 @@ class FixedLagSmoother:
         self._entities: dict[str, _Entity] = {}
         self._origin_ns: int | None = None
         self._now_ns = 0
-        self._numbers = 0
+        self._numbers = count(1)
 
     @property
     def entities(self) -> tuple[str, ...]:
@@ -192,7 +193,8 @@ class FixedLagSmoother:
         if entity in self._entities:
             raise InvalidArgumentError(f"entity: expected a new one, got {entity!r:.40}")
         self._start(stamp_ns)
-        key = self._add_state(self._born(entity), stamp_ns, belief.mean)
+        one = self._entities[entity] = _Entity()
+        key = self._add_state(one, stamp_ns, belief.mean)
         self._graph.add(f.prior_factor(key, belief.mean, belief.covariance))
 
     def update(self, stamp_ns: int, observations: Mapping[str, Sequence[Observation]]) -> None:
@@ -259,17 +261,9 @@ class FixedLagSmoother:
     def _oldest_s(self) -> float:
         return self._time_s(self._now_ns) - self.settings.lag_s
 
-    def _number(self) -> int:
-        self._numbers += 1
-        return self._numbers
-
-    def _born(self, entity: str) -> _Entity:
-        one = self._entities[entity] = _Entity()
-        return one
-
     def _add_state(self, one: _Entity, stamp_ns: int, state: FloatArray) -> int:
         # Of an entity and a stamp: keys may not come again within the lag, and stamps are too long for one.
-        key = self._number()
+        key = next(self._numbers)
         one.keys[stamp_ns] = key
         insort(one.stamps_ns, stamp_ns)
         self._graph.add_variable(key, state, self._time_s(stamp_ns))
@@ -297,7 +291,7 @@ class FixedLagSmoother:
             raise InvalidArgumentError(
                 f"observations: expected {entity!r:.40} to begin with a bearing or position"
             )
-        one = self._born(entity)
+        one = self._entities[entity] = _Entity()
         state = np.array([toward, 0.0, 0.0, log_m])
         prior = np.array([state[0], 0.0, 0.0, math.log(chosen.range_m)])
         key = self._add_state(one, stamp_ns, state)
@@ -341,7 +335,7 @@ class FixedLagSmoother:
     def _height(self, one: _Entity, said: AngularHeight) -> int:
         """Return the key of an entity's height, which lives as long as its states."""
         if one.height_key is None:
-            one.height_key, start = self._number(), np.array([math.log(said.true_height_m)])
+            one.height_key, start = next(self._numbers), np.array([math.log(said.true_height_m)])
             self._graph.add_variable(one.height_key, start, self._time_s(self._now_ns))
             self._graph.add(f.prior_factor(one.height_key, start, np.array([[said.true_relative_std**2]])))
         return one.height_key

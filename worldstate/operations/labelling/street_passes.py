@@ -46,18 +46,14 @@ def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
     """Return what a labelled pass tells of its arm: edge, pace, and the sound before."""
     x, y, vx, vy = (float(np.interp(one.t0.time_s, one.track.time_s, row)) for row in one.track.states.T)
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
+    # A first box may show no edge of this arm.
+    outwards_rad = one.edge_rad if one.arm == "left" else -one.edge_rad
     return StreetPass(
         "left" if one.arm == "left" else "right",
-        seen_edge(one.arm, one.edge_rad),
+        one.edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None,
         pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None,
         sound,
     )
-
-
-def seen_edge(arm: str, edge_rad: float) -> float | None:
-    """Return the azimuth of the edge that a first box shows, None where it shows none of this arm."""
-    outwards_rad = edge_rad if arm == "left" else -edge_rad
-    return edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,5 +1,6 @@
 """Run one recording through the whole chain: how its advisories stood to line-of-sight entry, its health."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -11,7 +12,7 @@ from worldstate.adapters.source import Source
 from worldstate.adapters.state_log import states_writer
 from worldstate.ground.values import seconds
 from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, onset_outcome
-from worldstate.state import RiskCue, WorldState
+from worldstate.state import WorldState
 
 from .channel_report import HealthLog, RecordingHealth
 
@@ -56,47 +57,35 @@ class WarningMeter:
         self.first_ns, self.last_ns = self.first_ns if self.states else state.stamp_ns, state.stamp_ns
         self.states, self.peak_risk = self.states + 1, max(self.peak_risk, state.risk)
         raised = [cue for cue in state.cues if cue.advisory]
-        if raised and not self._raised:
-            self._onsets.append((seconds(state.stamp_ns), _strongest(raised).entity_id))
+        if raised:
+            now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk).entity_id
+            if not self._raised:
+                self._onsets.append((now_s, told))
+            if self.t0_s is not None and now_s < self.t0_s:
+                self._hidden_id = told or self._hidden_id
         self._raised = bool(raised)
-        if raised and self.t0_s is not None and seconds(state.stamp_ns) < self.t0_s:
-            self._hidden_id = _strongest(raised).entity_id or self._hidden_id
         if self._visible_id is None:
-            self._visible_id = _first_visible(state)
+            in_view = (one.id for one in state.entities if one.status == "visible" and one.moving)
+            self._visible_id = next(in_view, None)
 
     def summary(self) -> WarningSummary:
         """Return the figures of all states so far."""
         onsets_s = tuple(time_s for time_s, _ in self._onsets)
         found = None if self.t0_s is None else onset_outcome(onsets_s, self.t0_s)
-        counted = list(filter(self._speaks_of_vehicle, self._onsets))
         false = found.onsets_earlier if found else len(onsets_s) if self.hazard_free else None
-        first_s, hidden_id = next(iter(counted), (None, None))
+        after = None if self.t0_s is None else sum(time_s >= self.t0_s for time_s in onsets_s)
+        earliest_s = -math.inf if self.t0_s is None else self.t0_s - LONGEST_LEAD_S
+        first_s, hidden_id = next((one for one in self._onsets if one[0] >= earliest_s), (None, None))
         return WarningSummary(
             t0_s=self.t0_s,
             first_advisory_s=first_s,
             lead_time_s=(found.lead_s or None) if found else None,
             false_advisories_before=false,
-            advisories_after_t0=None
-            if self.t0_s is None
-            else sum(time_s >= self.t0_s for time_s in onsets_s),
+            advisories_after_t0=after,
             advisory_onsets_s=onsets_s,
             hidden_entity_id=self._hidden_id or hidden_id,
             visible_entity_id=self._visible_id,
         )
-
-    def _speaks_of_vehicle(self, onset: tuple[float, str | None]) -> bool:
-        return self.t0_s is None or onset[0] >= self.t0_s - LONGEST_LEAD_S
-
-
-def _strongest(cues: list[RiskCue]) -> RiskCue:
-    return max(cues, key=lambda cue: cue.risk)
-
-
-def _first_visible(state: WorldState) -> str | None:
-    for entity in state.entities:
-        if entity.status == "visible" and entity.moving:
-            return entity.id
-    return None
 
 
 @dataclass(frozen=True, slots=True)
