@@ -1,5 +1,5 @@
-from .absence import MissRateTable as MissRateTable
 from .co_evidence import Absent as Absent
+from .co_evidence import MissRateTable as MissRateTable
 from .co_evidence import Present as Present
 from .co_evidence import Unqueried as Unqueried
 from .cueing.calibration_error import ReliabilityCurve as ReliabilityCurve

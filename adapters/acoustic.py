@@ -35,10 +35,10 @@ from worldstate.abduction.signature.domain_guard import (
     DomainGuard,
     DomainVerdict,
     Foreign,
+    ModelDomain,
     WarningSignal,
     neutral,
 )
-from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.camera.vision_query import SeveralCameras
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray

@@ -11,9 +11,8 @@ from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import SidePatterns, StreetHearing, StreetListener
-from worldstate.abduction.signature.domain_guard import DomainGuard
+from worldstate.abduction.signature.domain_guard import DomainGuard, ModelDomain
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.sound_file import SoundInput, SoundStream, as_sound, path_of
 from worldstate.adapters.camera.camera_channel import video_degradation, watched

@@ -8,8 +8,8 @@ import numpy as np
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.direction.bearing import steered_power
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum, pair_sum_of
-from worldstate.frontend.direction.phat import steered_power
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, spanned
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
@@ -53,26 +53,18 @@ class HopCutter:
     def cut(self, block: Float32Array) -> Iterator[Hop]:
         """Take a block (n, M) and yield the hops that it completes; the iterator must be read to its end."""
         while len(block):
-            taken = min(len(block), self._length - self._filled)
-            whole = taken == self._length
-            if not whole:
-                self._buffer[self._filled : self._filled + taken] = block[:taken]
-            self._filled += taken
-            if self._filled == self._length:
-                samples = block[:taken] if whole else self._buffer[: self._length]
+            length = self._end - self._start
+            part, block = np.split(block, [length - self._filled])
+            # A whole hop is not copied.
+            samples = part if len(part) == length else self._buffer[:length]
+            if samples is not part:
+                samples[self._filled :][: len(part)] = part
+            self._filled += len(part)
+            if self._filled == length:
                 hop = Hop(self._index, self._end, samples)
-                self._advance()
+                self._index, self._filled = self._index + 1, 0
+                self._start, self._end = self._end, hop_end(self._index, self._rate_hz)
                 yield hop
-            block = block[taken:]
-
-    @property
-    def _length(self) -> int:
-        return self._end - self._start
-
-    def _advance(self) -> None:
-        self._index += 1
-        self._start, self._end = self._end, hop_end(self._index, self._rate_hz)
-        self._filled = 0
 
 
 Steered = tuple[Complex64Array, Steering]
@@ -135,7 +127,8 @@ class HopSpectra:
         self._n_frames = 0
         self._lost_tail = np.zeros(0, bool)
         self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not monitored")
-        self.monitor = self._monitor(array, sample_rate_hz, settings)
+        heard_hz = bin_frequencies_hz(self.feature_bins, sample_rate_hz, nfft)
+        self.monitor = ChannelMonitor(array, heard_hz) if settings.watch_channels else None
         self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
 
     def push(self, samples: Float32Array) -> HopSums:
@@ -200,14 +193,6 @@ class HopSpectra:
         if self.ego_noise is not None and len(whitened):
             power = self.ego_noise.levelled(power, len(whitened))
         return power, pairs * mask.pair_scale
-
-    def _monitor(
-        self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings
-    ) -> ChannelMonitor | None:
-        if not settings.watch_channels:
-            return None
-        frequencies = bin_frequencies_hz(self.feature_bins, sample_rate_hz, settings.nfft)
-        return ChannelMonitor(array, frequencies)
 
     def _ego_noise(
         self, array: MicrophoneArray, sample_rate_hz: float, bins: range, settings: FrontEndSettings

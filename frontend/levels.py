@@ -145,7 +145,7 @@ class NoiseMeter:
 
     def __init__(self) -> None:
         self.excess_db = 0.0
-        self._memory = np.zeros((_MINUTE_HOPS, BANDS + 1))
+        self._memory: deque[FloatArray] = deque(maxlen=_MINUTE_HOPS)
         self._n_hops = 0
         self._quiet: FloatArray = np.zeros(BANDS)
         self._usual_coherence = 0.0
@@ -161,9 +161,11 @@ class NoiseMeter:
     def push(self, levels: FloatArray, coherence: float) -> tuple[float, str | None]:
         """Take log-energies (bands,) and the coherence of a hop; return its share and what takes the rest."""
         level_db = levels * _DB
-        self._memory[self._n_hops % _MINUTE_HOPS] = *level_db, coherence
+        self._memory.append(np.append(level_db, coherence))
         if self._n_hops < _EVERY_HOPS or self._n_hops % _EVERY_HOPS == 0:
-            self._look_through()
+            heard, rank = np.array(self._memory), int(_QUIET_SHARE * (len(self._memory) - 1))
+            self._quiet = np.partition(heard[:, :BANDS], rank, axis=0)[rank]
+            self._usual_coherence = float(np.median(heard[:, BANDS]))
         self._n_hops += 1
         excess = level_db - self._quiet
         self.excess_db = float(excess.mean())
@@ -178,12 +180,6 @@ class NoiseMeter:
         is_low = excess[:quarter].mean() > excess[-quarter:].mean() + _WIND_DB
         is_wind = is_low and coherence < self._usual_coherence
         return min(shares), "wind" if is_wind else "noise far above this place's usual"
-
-    def _look_through(self) -> None:
-        heard = self._memory[: self._n_hops + 1]
-        rank = int(_QUIET_SHARE * (len(heard) - 1))
-        self._quiet = np.partition(heard[:, :BANDS], rank, axis=0)[rank]
-        self._usual_coherence = float(np.median(heard[:, BANDS]))
 
     def _rise_db(self, loudness_db: float) -> float:
         """Return how far the level is above that before a jump, 0 without one."""

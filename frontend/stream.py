@@ -10,10 +10,8 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.bearing import bearing_of, find_peaks
+from worldstate.frontend.direction.bearing import bearing_of, find_peaks, noise_prominence, normalised
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
-from worldstate.frontend.direction.phat import noise_prominence, normalised
-from worldstate.frontend.ego_noise.ego_noise import EgoNoise
 from worldstate.frontend.hop_spectra import Hop, HopCutter
 from worldstate.frontend.levels import SILENCE
 from worldstate.frontend.spectra.sound_character import SoundCharacter
@@ -40,6 +38,11 @@ _LEAST_OF_WINDOW = 0.4 - 1e-9
 _LEAST_OF_HALF = 0.3
 # The energy of less than half a hop scatters too much for a point of the looming fit.
 _LEAST_OF_HOP = 0.5
+
+
+def _n_frames(hops: list[HopSums]) -> int:
+    """Frames that sums of several hops are of, at least one."""
+    return max(sum(hop.n_frames for hop in hops), 1)
 
 
 def _full_scale(dtype: np.dtype[Any]) -> np.float32:
@@ -116,14 +119,16 @@ class FrontEnd:
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz)
         with one_blas_thread():
             self._spectra = HopSpectra(array, self.sample_rate_hz, settings)
-            self._least_prominence = self._noise_prominence()
+            frequencies = bin_frequencies_hz(self._spectra.srp_bins, self.sample_rate_hz, settings.nfft)
+            n_frames = BEARING_HOPS * 2.0 * self.sample_rate_hz / (HOP_RATE_HZ * settings.nfft)
+            self._least_prominence = noise_prominence(self._spectra.beams, array, frequencies, n_frames)
         self._noise = NoiseMeter() if settings.watch_channels else None
         self._levels: FloatArray = np.full(BANDS, np.log(SILENCE))
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
-        self._tone = self._tone_stage()
+        band_hz = settings.tone_band_hz
+        self._tone = None if band_hz is None else ToneStage(array, self.sample_rate_hz, band_hz)
         self._energy_floor = EnergyFloor()
         self._character = SoundCharacter(self.sample_rate_hz) if settings.character else None
-        self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
         self._hops: deque[HopSums] = deque(maxlen=WINDOW_HOPS)
 
     def process(self, block: ArrayLike) -> list[AcousticFrame]:
@@ -182,12 +187,9 @@ class FrontEnd:
         >>> front_end = FrontEnd(array, 8000, FrontEndSettings(ego_noise=EgoNoiseSettings()))
         >>> front_end.learn_ego_noise(1.0)
         """
-        self._ego_noise().weight = in_range("none_probability", none_probability, 0.0, 1.0)
-
-    def _ego_noise(self) -> EgoNoise:
         if self._spectra.ego_noise is None:
             raise InvalidArgumentError("settings.ego_noise: expected EgoNoiseSettings, got None")
-        return self._spectra.ego_noise
+        self._spectra.ego_noise.weight = in_range("none_probability", none_probability, 0.0, 1.0)
 
     def _checked(self, block: ArrayLike) -> Float32Array:
         try:
@@ -205,8 +207,7 @@ class FrontEnd:
         if energy <= _LOUDEST**2:
             return samples
         # Written so that NaN, for which every comparison is false, is refused.
-        loud = np.flatnonzero(~(np.abs(samples).max(axis=0) <= _LOUDEST)).tolist()
-        if loud:
+        if loud := np.flatnonzero(~(np.abs(samples).max(axis=0) <= _LOUDEST)).tolist():
             problem = f"expected finite numbers up to {_LOUDEST:g}, got others in channels {loud}"
             raise InvalidArgumentError(f"block: {problem}")
         return samples
@@ -219,7 +220,7 @@ class FrontEnd:
             if self._tone is not None:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
             if self._character is not None and not self._hops[-1].lost and self._hops[-1].n_frames:
-                self._character.push(hop.samples[:, self._middle])
+                self._character.push(hop.samples[:, self.array.nearest(self._keep)[0]])
             return self._frame(hop, levels) if hop.index >= WINDOW_HOPS else None
 
     def _unmasked(self, levels: FloatArray) -> FloatArray:
@@ -265,13 +266,6 @@ class FrontEnd:
             excess_db=0.0 if self._noise is None else self._noise.excess_db,
         )
 
-    def _noise_prominence(self) -> float:
-        """Return the peak-to-median ratio that noise reaches in the interval of a bearing."""
-        nfft, spectra = self.settings.nfft, self._spectra
-        frequencies = bin_frequencies_hz(spectra.srp_bins, self.sample_rate_hz, nfft)
-        n_frames = BEARING_HOPS * 2.0 * self.sample_rate_hz / (HOP_RATE_HZ * nfft)
-        return noise_prominence(spectra.beams, self.array, frequencies, n_frames)
-
     def _heard(self, n_hops: int) -> list[HopSums]:
         """Return the last hops of the window in which something was heard, the last ones of all if none."""
         heard = [hop for hop in self._hops if hop.n_frames]
@@ -287,22 +281,11 @@ class FrontEnd:
         """Microphones whose energy counts: those kept, or all where none is."""
         return self._keep if self._keep.any() else slice(None)
 
-    @property
-    def _middle(self) -> int:
-        """The usable microphone nearest to the centre."""
-        usable = self._nearest[self._keep[self._nearest]]
-        return int(usable[0] if len(usable) else self._nearest[0])
-
     def _srp(self, hops: list[HopSums]) -> FloatArray:
         """SRP-PHAT of hops, (A,): the maximum over elevations."""
-        total = np.sum([hop.power for hop in hops], axis=0)
-        n_frames = max(sum(hop.n_frames for hop in hops), 1)
-        power = normalised(total, n_frames, len(self._spectra.srp_bins), self.array.n_microphones)
+        total, n_bins = np.sum([hop.power for hop in hops], axis=0), len(self._spectra.srp_bins)
+        power = normalised(total, _n_frames(hops), n_bins, self.array.n_microphones)
         return np.asarray(power.reshape(-1, len(self._azimuths)).max(axis=0))
-
-    def _tone_stage(self) -> ToneStage | None:
-        band_hz = self.settings.tone_band_hz
-        return None if band_hz is None else ToneStage(self.array, self.sample_rate_hz, band_hz)
 
     def _age_s(self, hops: list[HopSums], end: int) -> float:
         weights = [max(hop.n_frames, 1) for hop in hops]
@@ -310,17 +293,14 @@ class FrontEnd:
         return (end - centre) / self.sample_rate_hz
 
     def _feature(self) -> FloatArray:
-        hops = list(self._hops)
-        length = len(hops) // FEATURE_SEGMENTS
-        halves = [hops[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
-        return np.concatenate([self._segment(half, hops) for half in halves])
+        hops, half = list(self._hops), WINDOW_HOPS // FEATURE_SEGMENTS
+        return np.concatenate([self._segment(hops[i:][:half], hops) for i in range(0, WINDOW_HOPS, half)])
 
     def _segment(self, half: list[HopSums], hops: list[HopSums]) -> FloatArray:
         """Return the feature of half a window; of the whole one where little was heard in the half."""
         n_bins, n_microphones = len(self._spectra.feature_bins), self.array.n_microphones
         used = half if sum(hop.share for hop in half) >= _LEAST_OF_HALF * len(half) else hops
-        n_frames = max(sum(hop.n_frames for hop in used), 1)
-        return segment_feature([hop.pairs for hop in used], n_frames, n_bins, n_microphones)
+        return segment_feature([hop.pairs for hop in used], _n_frames(used), n_bins, n_microphones)
 
     def _looming(self, end: int) -> Looming | NotUsable:
         hops = [hop for hop in self._hops if hop.heard.mean() >= _LEAST_OF_HOP]
@@ -334,4 +314,4 @@ class FrontEnd:
         low, high = LOOMING_BAND_HZ
         scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
         noise = self._energy_floor.read(float(energies.min()), scatter)
-        return looming(times, np.log(energies), scatter, noise.mean, noise.std)
+        return looming(times, np.log(energies), scatter, *noise)

@@ -144,21 +144,22 @@ class AdaptiveThreshold:
         onset = alarm and not self.alarm
         pending_s = 0.0 if onset and self.pending_s is None else self.pending_s
         empty = not alarm and none >= budget.empty_probability
+        # False alarms less those that the budget allows; None where an alarm was right or is not judged yet.
+        events: float | None = None
         if pending_s is None:
-            quiet_h = elapsed_s / SECONDS_PER_HOUR if empty else 0.0
-            return replace(self._shifted(budget, -budget.rate_per_hour * quiet_h), alarm=alarm)
-        if visible >= budget.seen_probability:
-            return replace(self, pending_s=None, alarm=alarm)
-        if empty:
-            return replace(self._shifted(budget, 1.0), pending_s=None, alarm=alarm)
-        age_s = pending_s + elapsed_s
-        if age_s >= budget.longest_alarm_s:
-            return replace(self._shifted(budget, 1.0), pending_s=0.0, alarm=alarm)
-        return replace(self, pending_s=age_s, alarm=alarm)
-
-    def _shifted(self, budget: AdaptiveBudget, events: float) -> "AdaptiveThreshold":
-        shift = self.shift_nats + budget.step_nats * events
-        return replace(self, shift_nats=min(max(shift, -budget.most_down_nats), budget.most_up_nats))
+            events = -budget.rate_per_hour * (elapsed_s / SECONDS_PER_HOUR if empty else 0.0)
+        elif visible >= budget.seen_probability:
+            pending_s = None
+        elif empty:
+            events, pending_s = 1.0, None
+        elif pending_s + elapsed_s >= budget.longest_alarm_s:
+            events, pending_s = 1.0, 0.0
+        else:
+            pending_s += elapsed_s
+        shift = self.shift_nats
+        if events is not None:
+            shift = min(max(shift + budget.step_nats * events, -budget.most_down_nats), budget.most_up_nats)
+        return AdaptiveThreshold(shift, pending_s, alarm)
 
 
 @dataclass(frozen=True, slots=True)

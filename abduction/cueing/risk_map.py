@@ -56,37 +56,25 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
 
 
 def _newton(decision: FloatArray, target: FloatArray, offset: float) -> tuple[float, float]:
-    point = np.array([0.0, offset])
-    loss = _loss(decision, target, point)
+    design, point = np.stack([decision, np.ones_like(decision)]), np.array([0.0, offset])
+
+    def loss(at: FloatArray) -> float:
+        exponent = at[0] * decision + at[1]
+        return float(np.sum(np.logaddexp(0.0, exponent) - (1.0 - target) * exponent))
+
     for _ in range(_ITERATIONS):
-        gradient, curvature = _derivatives(decision, target, point)
+        probability = sigmoid(decision, point[0], point[1])
+        gradient = design @ (target - probability)
         if np.abs(gradient).max() < _GRADIENT_TOLERANCE:
             break
-        step = -np.linalg.solve(curvature, gradient)
-        while np.abs(step).max() >= _SMALLEST_STEP:
-            if _loss(decision, target, point + step) < loss + 1e-4 * float(gradient @ step):
-                break
+        curvature = (design * (probability * (1.0 - probability))) @ design.T
+        step = -np.linalg.solve(curvature + _RIDGE * np.eye(2), gradient)
+        while loss(point + step) >= loss(point) + 1e-4 * float(gradient @ step):
             step = step / 2.0
-        else:
-            break
+            if np.abs(step).max() < _SMALLEST_STEP:
+                return float(point[0]), float(point[1])
         point = point + step
-        loss = _loss(decision, target, point)
     return float(point[0]), float(point[1])
-
-
-def _loss(decision: FloatArray, target: FloatArray, point: FloatArray) -> float:
-    exponent = point[0] * decision + point[1]
-    return float(np.sum(np.logaddexp(0.0, exponent) - (1.0 - target) * exponent))
-
-
-def _derivatives(
-    decision: FloatArray, target: FloatArray, point: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    probability = sigmoid(decision, point[0], point[1])
-    design = np.stack([decision, np.ones_like(decision)])
-    gradient = design @ (target - probability)
-    curvature = (design * (probability * (1.0 - probability))) @ design.T
-    return gradient, curvature + _RIDGE * np.eye(2)
 
 
 # Where isotonic regression stops losing to two numbers: see `fit_risk_map`.

@@ -56,14 +56,9 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
     True
     """
     budget = in_range("alpha", alpha, 0.0, 1.0, open_high=True)
-    streams = [finite_array("hazard_free", stream, (None,)) for stream in hazard_free]
-    held = [sustained_statistic(stream, sustain_hops) for stream in streams]
-    statistic: FloatArray = np.sort(np.concatenate(held) if held else np.empty(0))[::-1]
-    if not statistic.size:
-        raise InvalidArgumentError("hazard_free: expected at least one window")
-    # The next float above the first window that the budget cannot pay for; alpha < 1 leaves at least one.
-    allowed = int(np.floor(budget * statistic.size + 1e-9))
-    return float(max(np.nextafter(statistic[allowed], np.inf), np.finfo(np.float64).min))
+    losses = _losses(hazard_free, sustain_hops)
+    # Every window weighs the same, whichever recording it is of.
+    return _smallest_threshold(losses._replace(shares=np.ones(losses.held.size)), budget * losses.held.size)
 
 
 class _Losses(NamedTuple):

@@ -27,6 +27,7 @@ WHEEL_RADIUS_M = 0.3
 FIRINGS_PER_TURN = 2.0
 IDLE_HZ = 25.0
 REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 / 3.6, 20.0 / 3.6
+_KNOTS_M_S = np.linspace(-40.0, 40.0, 161)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +146,9 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
 
     with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
     """
-    speed = np.linspace(-40.0, 40.0, 161)
     per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
-    curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(speed)) for ratio in GEAR_RATIOS]
-    return Coupling("line_spacing_hz", _tuple(speed), tuple(map(_tuple, curves)), std_hz)
+    curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(_KNOTS_M_S)) for ratio in GEAR_RATIOS]
+    return _coupling("line_spacing_hz", curves, std_hz)
 
 
 def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
@@ -160,11 +160,10 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
     """
-    speed = np.linspace(-40.0, 40.0, 161)
-    at = np.maximum(np.abs(speed), LOWEST_SPEED_M_S)
+    at = np.maximum(np.abs(_KNOTS_M_S), LOWEST_SPEED_M_S)
     low = _octave_db(at, rolling=(85.7, 41.5), propulsion=(89.2, 7.2))
     high = _octave_db(at, rolling=(97.3, 32.5), propulsion=(84.2, 8.0))
-    return Coupling("tyre_shape_db", _tuple(speed), (_tuple(high - low),), std_db)
+    return _coupling("tyre_shape_db", [high - low], std_db)
 
 
 def doppler_trajectory(std: float = 0.01) -> Coupling:
@@ -181,9 +180,8 @@ def doppler_trajectory(std: float = 0.01) -> Coupling:
     >>> doppler_trajectory().expected([10.0]).round(3)
     array([[1.06]])
     """
-    speed = np.linspace(-40.0, 40.0, 161)
-    ratio = (SPEED_OF_SOUND_M_S + speed) / (SPEED_OF_SOUND_M_S - speed)
-    return Coupling("doppler_ratio", _tuple(speed), (_tuple(ratio),), std)
+    ratio = (SPEED_OF_SOUND_M_S + _KNOTS_M_S) / (SPEED_OF_SOUND_M_S - _KNOTS_M_S)
+    return _coupling("doppler_ratio", [ratio], std)
 
 
 def car() -> Descriptor:
@@ -223,8 +221,9 @@ def _octave_db(
     return np.asarray(10.0 * np.log10(10.0 ** (rolling_db / 10.0) + 10.0 ** (propulsion_db / 10.0)))
 
 
-def _tuple(values: FloatArray) -> tuple[float, ...]:
-    return tuple(values.tolist())
+def _coupling(observable: str, curves: Sequence[FloatArray], std: float) -> Coupling:
+    knots, *rows = (tuple(values.tolist()) for values in (_KNOTS_M_S, *curves))
+    return Coupling(observable, knots, tuple(rows), std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -457,10 +456,9 @@ def _log_couplings(
     total = np.zeros(_SPEEDS_M_S.size)
     for coupling in descriptor.couplings:
         seen = observation.signature.get(coupling.observable)
-        if seen is None or coupling.observable in settings.without:
-            continue
-        background = BACKGROUNDS[coupling.observable].log_density(seen.value)
-        total += coupling.log_likelihood(seen.value, seen.std, _SPEEDS_M_S) - background
+        if seen is not None and coupling.observable not in settings.without:
+            background = BACKGROUNDS[coupling.observable].log_density(seen.value)
+            total += coupling.log_likelihood(seen.value, seen.std, _SPEEDS_M_S) - background
     return total
 
 
@@ -468,9 +466,8 @@ def _log_approach(observation: GroundedObservation, settings: GroundedSettings) 
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
     if isinstance(speed, Observable) and "radial_speed_m_s" not in settings.without:
-        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - BACKGROUNDS["radial_speed_m_s"].log_density(
-            speed.value
-        )
+        background = BACKGROUNDS["radial_speed_m_s"].log_density(speed.value)
+        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - background
     if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in settings.without:
         background = BACKGROUNDS["inverse_tta_hz"].log_density(inverse_tta.value)
         ranges = _SPEED_CELL_M_S / _RANGES_M

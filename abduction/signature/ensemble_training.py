@@ -11,8 +11,17 @@ from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
-from .ensemble import PRIOR_S, EnsembleModel
-from .expert import SEGMENTS, SHAPE, SHAPE_CHANGE, Expert, expert_views, mirror_features, split_reference
+from .ensemble import (
+    PRIOR_S,
+    SEGMENTS,
+    SHAPE,
+    SHAPE_CHANGE,
+    EnsembleModel,
+    Expert,
+    expert_views,
+    mirror_features,
+    split_reference,
+)
 from .site_reference import KINDS, SiteReference
 from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, mirrored_classes
 

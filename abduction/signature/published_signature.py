@@ -18,7 +18,7 @@ from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.serialisation import ADDED, Layout
 
-from .model_domain import ModelDomain
+from .domain_guard import ModelDomain
 from .window_classes import (
     CLASSES,
     EXPLANATION_COLUMNS,

@@ -28,8 +28,8 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
 
+from .domain_guard import ModelDomain
 from .ensemble import EnsembleModel
-from .model_domain import ModelDomain
 from .site_reference import SiteReference, log_levels
 
 # Share of the difference in level that is carried over; all of the pattern is.
@@ -174,7 +174,7 @@ class SiteSignature:
 
     Examples
     --------
-    >>> from worldstate.abduction.signature.expert import Expert
+    >>> from worldstate.abduction.signature.ensemble import Expert
     >>> from worldstate.abduction.signature.site_reference import SiteReference
     >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
     >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))), np.zeros(6))

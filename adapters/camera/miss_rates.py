@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.special import betaincinv
 
-from worldstate.abduction.absence import MissRateTable, isotonic_grid
+from worldstate.abduction.co_evidence import MissRateTable, isotonic_grid
 from worldstate.adapters.files.file_io import read_record, write_json
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.serialisation import ADDED, Layout, encode

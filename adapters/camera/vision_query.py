@@ -7,8 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldstate.abduction.absence import MissRateTable, default_miss_rates
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.co_evidence import (
+    Absent,
+    CoEvidence,
+    MissRateTable,
+    Present,
+    Unqueried,
+    default_miss_rates,
+)
 from worldstate.ground import (
     InputFileError,
     InvalidArgumentError,

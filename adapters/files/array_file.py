@@ -13,8 +13,7 @@ import defusedxml.ElementTree as SafeElementTree
 import numpy as np
 from defusedxml.common import DefusedXmlException
 
-from worldstate.frontend.array.geometry import nearest_spacings_m
-from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, MicrophoneArray
+from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, MicrophoneArray, nearest_spacings_m
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 
 from .file_io import read_bytes, write_text

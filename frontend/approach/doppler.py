@@ -10,12 +10,13 @@ follows the range of that pass-by. In all other cases the result is `NotUsable`.
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import OptimizeResult, least_squares
 
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
 from worldstate.ground import FloatArray, NotUsable
 
 from .engine_line import HarmonicTrack
@@ -31,9 +32,8 @@ PARAMETERS = 4
 ROUGH_EVALUATIONS, EVALUATIONS, FINALISTS = 12, 300, 2
 
 
-@dataclass(frozen=True, slots=True)
-class PassBy:
-    r"""Parameters of a fitted pass-by with their covariance.
+def radial_speed_m_s(time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float) -> FloatArray:
+    r"""Return the radial speed at emission of the sound that arrives at `time_s`, positive while receding.
 
     At emission time tau a source of speed v, closest at range d when tau = tau_0, has
 
@@ -46,18 +46,6 @@ class PassBy:
 
     Source: P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section 11.2 (sound of a moving
     source).
-    """
-
-    values: FloatArray  # f_0 in Hz, v in m/s, tau_0 in seconds on the receiver's clock, d in metres
-    covariance: FloatArray  # Of these, from the information of the fit
-    chi_squared: float  # Sum of squared normalised residuals
-
-
-def radial_speed_m_s(time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float) -> FloatArray:
-    r"""Return the radial speed at emission of the sound that arrives at `time_s`, positive while receding.
-
-    .. math:: v_r = \frac{v^2 s}{\sqrt{d^2 + v^2 s^2}}, \qquad
-              s = \frac{c^2 T - \sqrt{d^2 (c^2 - v^2) + v^2 c^2 T^2}}{c^2 - v^2}, \quad T = t - \tau_0
 
     Examples
     --------
@@ -70,8 +58,10 @@ def radial_speed_m_s(time_s: FloatArray, speed_m_s: float, closest_s: float, ran
     return np.asarray(v**2 * emission / np.sqrt(d**2 + (v * emission) ** 2))
 
 
-def fit_pass_by(time_s: FloatArray, frequency_hz: FloatArray, std_hz: FloatArray) -> PassBy:
-    r"""Fit the four parameters by weighted least squares from several starting points.
+def fit_pass_by(
+    time_s: FloatArray, frequency_hz: FloatArray, std_hz: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    r"""Fit f_0, v, tau_0 and d from several starting points; return them, their covariance and chi-squared.
 
     .. math:: \chi^2 = \min_{f_0, v, \tau_0, d} \sum_k
               \frac{\big[f_0 / (1 + v_r(t_k) / c) - f_k\big]^2}{\sigma_k^2}, \qquad
@@ -93,12 +83,14 @@ def fit_pass_by(time_s: FloatArray, frequency_hz: FloatArray, std_hz: FloatArray
         inside = np.clip(start, low, high)
         return least_squares(residuals, inside, bounds=(low, high), x_scale=scale, max_nfev=evaluations)
 
-    rough = [fit(start, ROUGH_EVALUATIONS) for start in _starts(time_s, frequency_hz)]
+    middle = 0.5 * (frequency_hz.min() + frequency_hz.max())
+    starts = product((time_s[0] + place * duration for place in START_PLACES), START_SHAPES)
+    rough = [fit(np.array([middle, v, closest, d]), ROUGH_EVALUATIONS) for closest, (v, d) in starts]
     rough.sort(key=lambda found: float(found.cost))
     finals = [fit(found.x, EVALUATIONS) for found in rough[:FINALISTS]]
     best = min(finals, key=lambda found: float(found.cost))
     covariance = np.linalg.pinv(best.jac.T @ best.jac, rcond=1e-14)
-    return PassBy(best.x, covariance, 2.0 * float(best.cost))
+    return best.x, covariance, 2.0 * float(best.cost)
 
 
 def radial_speed_gradient(time_s: FloatArray, values: FloatArray) -> FloatArray:
@@ -121,16 +113,6 @@ def radial_speed_gradient(time_s: FloatArray, values: FloatArray) -> FloatArray:
         ahead, behind = (radial_speed_m_s(time_s, *(values + side)[1:]) for side in (step, -step))
         columns.append((ahead - behind) / (2 * step[k]))
     return np.stack(columns, axis=1)
-
-
-def _starts(time_s: FloatArray, frequency_hz: FloatArray) -> list[FloatArray]:
-    middle = 0.5 * (frequency_hz.min() + frequency_hz.max())
-    duration = float(np.ptp(time_s))
-    return [
-        np.array([middle, v, time_s[0] + place * duration, d])
-        for place in START_PLACES
-        for v, d in START_SHAPES
-    ]
 
 
 # A drifting engine: polynomials up to a cubic, which has as many parameters as the S-curve and so is a fair
@@ -242,9 +224,9 @@ def radial_speed(track: HarmonicTrack, *, min_partials: int = 1) -> RadialSpeed 
     if insufficient is not None:
         return insufficient
     std = np.sqrt(track.variance_hz2 + (_JITTER * frequency) ** 2)
-    fit = fit_pass_by(time, frequency, std)
-    speed = _read_out(time, fit)
-    rejected = _rejected(time, frequency, std, fit) or _wrong_level(track.level_db, speed)
+    values, covariance, chi_squared = fit_pass_by(time, frequency, std)
+    speed = _read_out(time, values, covariance, chi_squared)
+    rejected = _rejected(time, frequency, std, chi_squared) or _wrong_level(track.level_db, speed)
     if rejected is not None:
         return rejected
     typical = float(np.sqrt(np.median(speed.variance_m2_s2)))
@@ -266,27 +248,28 @@ def _insufficient(track: HarmonicTrack, min_partials: int) -> NotUsable | None:
     return None
 
 
-def _rejected(time: FloatArray, frequency: FloatArray, std: FloatArray, fit: PassBy) -> NotUsable | None:
+def _rejected(
+    time: FloatArray, frequency: FloatArray, std: FloatArray, chi_squared: float
+) -> NotUsable | None:
     """Return the reason for which the S-curve is rejected, if there is one."""
-    price = np.log(len(time))
-    curve = fit.chi_squared + PARAMETERS * price
-    at_rest = _polynomial_chi_squared(time, frequency, std, 0) + price
-    if at_rest < curve + _LEAST_GAIN:
+    price, y = np.log(len(time)), frequency / std
+    unit = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
+
+    def polynomial(degree: int) -> float:
+        """Return the criterion of a polynomial."""
+        H = legendre.legvander(unit, degree) / std[:, None]
+        chi_squared = np.sum((y - H @ np.linalg.lstsq(H, y, rcond=None)[0]) ** 2)
+        return float(chi_squared + (degree + 1) * price)
+
+    beaten = chi_squared + PARAMETERS * price + _LEAST_GAIN
+    if polynomial(0) < beaten:
         return NotUsable("the line does not move: its frequency at rest is unknown")
-    misfit = fit.chi_squared / (len(time) - PARAMETERS)
+    misfit = chi_squared / (len(time) - PARAMETERS)
     if misfit > _MOST_MISFIT:
         return NotUsable(f"the line wanders: reduced chi-squared {misfit:.1f} against a pass-by")
-    drift = min(_polynomial_chi_squared(time, frequency, std, k) + (k + 1) * price for k in DRIFT_DEGREES)
-    if drift < curve + _LEAST_GAIN:
+    if min(map(polynomial, DRIFT_DEGREES)) < beaten:
         return NotUsable("a drifting engine explains the line as well as a pass-by")
     return None
-
-
-def _polynomial_chi_squared(time: FloatArray, frequency: FloatArray, std: FloatArray, degree: int) -> float:
-    unit = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
-    H = legendre.legvander(unit, degree) / std[:, None]
-    y = frequency / std
-    return float(np.sum((y - H @ np.linalg.lstsq(H, y, rcond=None)[0]) ** 2))
 
 
 def _wrong_level(level_db: FloatArray, speed: RadialSpeed) -> NotUsable | None:
@@ -306,11 +289,13 @@ def _wrong_level(level_db: FloatArray, speed: RadialSpeed) -> NotUsable | None:
     )
 
 
-def _read_out(time: FloatArray, fit: PassBy) -> RadialSpeed:
-    f0, v, closest, d = (float(x) for x in fit.values)
-    misfit = fit.chi_squared / (len(time) - PARAMETERS)
-    gradient = radial_speed_gradient(time, fit.values)
-    variance = np.einsum("ki,ij,kj->k", gradient, fit.covariance, gradient) * max(misfit, 1.0)
+def _read_out(
+    time: FloatArray, values: FloatArray, covariance: FloatArray, chi_squared: float
+) -> RadialSpeed:
+    f0, v, closest, d = values.tolist()
+    misfit = chi_squared / (len(time) - PARAMETERS)
+    gradient = radial_speed_gradient(time, values)
+    variance = np.einsum("ki,ij,kj->k", gradient, covariance, gradient) * max(misfit, 1.0)
     return RadialSpeed(
         time_s=time,
         radial_speed_m_s=radial_speed_m_s(time, v, closest, d),

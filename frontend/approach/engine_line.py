@@ -6,7 +6,7 @@ combined into the fundamental with its variance. Their reduced chi-squared is th
 near one if the partials are multiples of one fundamental.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -117,15 +117,24 @@ _LEAST_SNR = 15.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fundamental:
-    """Fundamental of K windows, combined from their partials."""
+class HarmonicTrack:
+    """Fundamental over time; windows without a usable partial are left out."""
 
-    # Fundamental and its variance, increased where the partials disagree; undefined without partials.
-    frequency_hz: FloatArray
+    time_s: FloatArray  # Centre of each window from the first sample, on the receiver's clock
+    frequency_hz: FloatArray  # Fundamental
+    # Of the fundamental, from the SNR of its partials, increased where they disagree
     variance_hz2: FloatArray
     n_partials: IndexArray  # Number of partials used
-    misfit: FloatArray  # Reduced chi-squared of the partials; 0 with fewer than two
-    power: FloatArray  # Sum of the partials's powers above the floor, in the units of the spectrum
+    # Reduced chi-squared of harmonic consistency; 0 with a single partial, which has no check.
+    misfit: FloatArray
+    level_db: FloatArray  # Power of all partials, 10 log10, relative to samples of unit mean square
+    windows: int  # Number of windows analysed, K of them usable
+
+    def usable(self) -> "HarmonicTrack":
+        """Return the windows with a partial."""
+        found = self.n_partials > 0
+        columns = (one.name for one in fields(self) if one.name != "windows")
+        return replace(self, **{name: getattr(self, name)[found] for name in columns})
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +156,7 @@ class Windows:
     Source: the variance is the first-order perturbation of the windowed maximum of Rife and Boorstyn 1974.
     """
 
+    time_s: FloatArray  # Of their centres
     frames: FloatArray  # Samples, not windowed
     shape: FloatArray  # The window
     floor: FloatArray  # Noise power of the windowed, zero-padded spectra
@@ -158,8 +168,10 @@ class Windows:
         return np.asarray(np.arange(len(self.shape)) - 0.5 * (len(self.shape) - 1), dtype=np.float64)
 
 
-def measure_fundamental(windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray) -> Fundamental:
-    r"""Refine a track of the fundamental by all its partials.
+def measure_fundamental(
+    windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray
+) -> HarmonicTrack:
+    r"""Refine a track of the fundamental by all its partials; of windows without any it says nothing.
 
     .. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
               \mathrm{var}(\hat f) = \frac{\max(\chi^2, 1)}{\sum_h h^2 / \sigma_h^2}
@@ -177,7 +189,19 @@ def measure_fundamental(windows: Windows, fundamental_hz: FloatArray, slope_hz_s
         demodulated *= back
         measured.append(_partial(windows, demodulated, h * fundamental_hz))
     frequency, variance, power = (np.stack(part, axis=1) for part in zip(*measured, strict=True))
-    return _combined(frequency, variance, power, partials)
+    # All partials into one fundamental per window, by their inverse variances.
+    weight = 1.0 / variance
+    count = np.count_nonzero(weight, axis=1)
+    information = np.maximum((weight * partials**2).sum(axis=1), np.finfo(float).tiny)
+    fundamental = (weight * partials * frequency).sum(axis=1) / information
+    squares = (weight * (frequency - np.outer(fundamental, partials)) ** 2).sum(axis=1)
+    misfit = np.where(count > 1, squares / np.maximum(count - 1, 1), 0.0)
+    # A tone of amplitude A peaks at (A sum(w) / 2)^2 and has mean square A^2 / 2.
+    mean_square = 2.0 * power.sum(axis=1) / windows.shape.sum() ** 2
+    with np.errstate(divide="ignore"):
+        level_db = 10.0 * np.log10(mean_square)
+    variance = np.maximum(misfit, 1.0) / information
+    return HarmonicTrack(windows.time_s, fundamental, variance, count, misfit, level_db, len(count))
 
 
 def _partial(
@@ -190,8 +214,7 @@ def _partial(
     shift, peak = _newton_shift(demodulated, n)
     floor = _floor_at(windows, expected_hz)
     snr = peak / floor
-    use = (snr >= _LEAST_SNR) & (np.abs(shift) < 2 * np.pi * REACH / len(n))
-    use &= expected_hz <= BAND_HIGH_HZ
+    use = (snr >= _LEAST_SNR) & (np.abs(shift) < 2 * np.pi * REACH / len(n)) & (expected_hz <= BAND_HIGH_HZ)
     variance = _line_variance(windows.shape, n) / np.maximum(snr, 1.0) * turns**2
     return expected_hz + shift * turns, np.where(use, variance, np.inf), np.where(use, peak - floor, 0.0)
 
@@ -219,39 +242,10 @@ def _line_variance(window: FloatArray, n: FloatArray) -> float:
     return float(0.5 * window.sum() ** 2 / np.sum(window**2) * spread)
 
 
-def _combined(
-    frequency: FloatArray, variance: FloatArray, power: FloatArray, partials: IndexArray
-) -> Fundamental:
-    """Combine all partials, (K, H), into one fundamental per window by their inverse variances."""
-    weight = 1.0 / variance
-    count = np.count_nonzero(weight, axis=1)
-    information = np.maximum((weight * partials**2).sum(axis=1), np.finfo(float).tiny)
-    fundamental = (weight * partials * frequency).sum(axis=1) / information
-    squares = (weight * (frequency - np.outer(fundamental, partials)) ** 2).sum(axis=1)
-    misfit = np.where(count > 1, squares / np.maximum(count - 1, 1), 0.0)
-    return Fundamental(fundamental, np.maximum(misfit, 1.0) / information, count, misfit, power.sum(axis=1))
-
-
 # Each pass measures along the track and the slope of the one before.
 PASSES = 3
 # Longest signal at one call: an hour at 48 kHz is 1.7e8 samples.
 MAX_SAMPLES = 200_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class HarmonicTrack:
-    """Fundamental over time; windows without a usable partial are left out."""
-
-    time_s: FloatArray  # Centre of each window from the first sample, on the receiver's clock
-    frequency_hz: FloatArray  # Fundamental
-    variance_hz2: (
-        FloatArray  # Of the fundamental, from the SNR of its partials, increased where they disagree
-    )
-    n_partials: IndexArray  # Number of partials used
-    # Reduced chi-squared of harmonic consistency; 0 with a single partial, which has no check.
-    misfit: FloatArray
-    level_db: FloatArray  # Power of all partials, 10 log10, relative to samples of unit mean square
-    windows: int  # Number of windows analysed, K of them usable
 
 
 def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrack:
@@ -296,7 +290,15 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
     >>> bool(np.abs(track.frequency_hz - 60.5).max() < 0.3)
     True
     """
-    x, rate = _decimated(*_checked(samples, sample_rate_hz))
+    x = finite_array("samples", samples, (None,))
+    rate = in_range("sample_rate_hz", sample_rate_hz, 3.0 * BAND_HIGH_HZ, np.inf)
+    shortest = int(np.ceil(WINDOW_S * rate)) + 1
+    if not shortest <= len(x) <= MAX_SAMPLES:
+        raise InvalidArgumentError(f"samples: expected {shortest} .. {MAX_SAMPLES} samples, got {len(x)}")
+    # With zero phase, to at least three times the highest partial.
+    factor = int(rate // (3.0 * BAND_HIGH_HZ))
+    if factor > 1:
+        x, rate = signal.decimate(x, factor, ftype="fir", zero_phase=True), rate / factor
     size, step = round(WINDOW_S * rate), STEP_S * rate
     starts = np.round(np.arange(0, len(x) - size + 1, step)).astype(np.intp)
     frames = x[starts[:, None] + np.arange(size)]
@@ -304,43 +306,11 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
     power, floor = spectrum_and_floor(frames * shape, rate)
     fundamental = best_path(power / floor, rate / (ZERO_PADDING * size))
     time = np.asarray((starts + 0.5 * (size - 1)) / rate, dtype=np.float64)
-    windows = Windows(frames, shape, floor, rate)
+    windows = Windows(time, frames, shape, floor, rate)
     for _ in range(PASSES):
         found = measure_fundamental(windows, fundamental, _slope(time, fundamental))
         fundamental = np.where(found.n_partials > 0, found.frequency_hz, fundamental)
-    return _track(time, found, shape)
-
-
-def _checked(samples: ArrayLike, sample_rate_hz: float) -> tuple[FloatArray, float]:
-    x = finite_array("samples", samples, (None,))
-    rate = in_range("sample_rate_hz", sample_rate_hz, 3.0 * BAND_HIGH_HZ, np.inf)
-    shortest = int(np.ceil(WINDOW_S * rate)) + 1
-    if not shortest <= len(x) <= MAX_SAMPLES:
-        raise InvalidArgumentError(f"samples: expected {shortest} .. {MAX_SAMPLES} samples, got {len(x)}")
-    return x, rate
-
-
-def _decimated(x: FloatArray, rate: float) -> tuple[FloatArray, float]:
-    """Decimate with zero phase to at least three times the highest partial."""
-    factor = int(rate // (3.0 * BAND_HIGH_HZ))
-    if factor <= 1:
-        return x, rate
-    return np.asarray(signal.decimate(x, factor, ftype="fir", zero_phase=True)), rate / factor
-
-
-def _track(time: FloatArray, found: Fundamental, shape: FloatArray) -> HarmonicTrack:
-    used = found.n_partials > 0
-    # A tone of amplitude A peaks at (A sum(w) / 2)^2 and has mean square A^2 / 2.
-    mean_square = 2.0 * found.power[used] / shape.sum() ** 2
-    return HarmonicTrack(
-        time_s=time[used],
-        frequency_hz=found.frequency_hz[used],
-        variance_hz2=found.variance_hz2[used],
-        n_partials=found.n_partials[used],
-        misfit=found.misfit[used],
-        level_db=10.0 * np.log10(mean_square),
-        windows=len(used),
-    )
+    return found.usable()
 
 
 def _slope(time: FloatArray, frequency: FloatArray) -> FloatArray:

@@ -151,17 +151,13 @@ def looming(
         return NotUsable("energy scatters by more than 3 dB about the fit")
     if source.level**-2 < _LEAST_RATIO * noise_energy * scale:
         return NotUsable(f"the source has less than {_LEAST_RATIO} times the energy of the noise")
-    return _read(exponential, source, floor_std, noise_energy_std * scale)
-
-
-def _read(exponential: "_Line", source: "_Source", floor: float, noise_std: float) -> Looming | NotUsable:
-    scatter = max(source.scatter, floor)
+    scatter, noise_std = max(source.scatter, floor_std), noise_energy_std * scale
     covariance = scatter**2 * source.covariance + noise_std**2 * np.outer(source.by_noise, source.by_noise)
     if source.level < _MIN_RANGE_SIGMA * np.sqrt(covariance[0, 0]):
         return NotUsable("range reaches zero within the error of the window")
     rate = -source.slope / source.level
     gradient = np.array([-rate, -1.0]) / source.level
-    log_std = max(exponential.scatter, floor)
+    log_std = max(exponential.scatter, floor_std)
     return Looming(
         inverse_tta_hz=rate,
         std_hz=float(np.sqrt(gradient @ covariance @ gradient)),
@@ -237,14 +233,6 @@ _Z10, _Z30 = -1.2816, -0.5244
 _UNKNOWN_SHARE = 0.25
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseEnergy:
-    """Mean energy of the noise and its standard deviation, in the unit of the energies."""
-
-    mean: float
-    std: float
-
-
 class EnergyFloor:
     r"""Running level of the noise that is there without an approaching source.
 
@@ -262,13 +250,13 @@ class EnergyFloor:
         if energy > 0.0:
             self._log_energies.append(math.log(energy))
 
-    def read(self, lowest: float, least_log_std: float) -> NoiseEnergy:
-        """Return the noise; of a stream that has just begun only that it is below the lowest energy."""
+    def read(self, lowest: float, least_log_std: float) -> tuple[float, float]:
+        """Return mean and deviation; of a stream that has just begun only that it is below the lowest."""
         count = len(self._log_energies)
         if count < _FEWEST_HOPS:
-            return NoiseEnergy(0.0, _UNKNOWN_SHARE * lowest)
+            return 0.0, _UNKNOWN_SHARE * lowest
         tenth, third = count // 10, 3 * count // 10
         ordered = np.partition(np.fromiter(self._log_energies, np.float64, count), (tenth, third))
         spread = max(float(ordered[third] - ordered[tenth]) / (_Z30 - _Z10), least_log_std)
         mean = math.exp(float(ordered[third]) - _Z30 * spread)
-        return NoiseEnergy(mean, spread * mean)
+        return mean, spread * mean

@@ -17,9 +17,11 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
 from worldstate.frontend.spectra.decimator import Decimator
+from worldstate.frontend.spectra.stft import power
 from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, ComplexArray, Float32Array, FloatArray
+from worldstate.ground.values import vertex
 
 # Three parameters are fitted; with fewer samples the residual gives no estimate of the noise.
 FEWEST_SAMPLES = 8
@@ -117,7 +119,14 @@ def estimate_tone(samples: ArrayLike, sample_rate_hz: float) -> Tone:
     omegas = 2 * np.pi / size * np.arange(size // 2 + 1)
     inside = (omegas >= bounds[0]) & (omegas <= bounds[1])
     coarse = omegas[inside][np.argmax(np.abs(scipy.fft.rfft(y, size))[inside])]
-    return _tone(y, *climb(y, float(coarse), bounds), rate)
+    omega, amplitude, residual = climb(y, float(coarse), bounds)
+    # Three parameters are fitted.
+    power = float(residual @ residual) / (len(y) - 3)
+    snr = abs(amplitude) ** 2 / max(2.0 * power, np.finfo(float).tiny)
+    snr = min(max(snr, np.finfo(float).tiny), 1e300)
+    std = float(np.sqrt(tone_crb_hz2(snr, len(y), rate)))
+    phase = float(np.angle(amplitude) - omega * 0.5 * (len(y) - 1))
+    return Tone(omega * rate / (2 * np.pi), abs(amplitude), wrap_angle(phase), snr, std)
 
 
 def climb(
@@ -126,13 +135,14 @@ def climb(
     bounds: tuple[float, float],
     tolerance: float = 1e-7,
     steps: int = STEPS,
-) -> tuple[float, complex]:
-    r"""Fit one tone by Gauss-Newton from a coarse peak, unchecked; steps are held within the main lobe.
+) -> tuple[float, complex, FloatArray]:
+    r"""Fit one tone by Gauss-Newton from a coarse peak, unchecked: frequency, amplitude, what is left of y.
 
     .. math:: \omega \leftarrow \omega + \frac{\mathrm{Re}\, g^H r}{g^H g}, \qquad
               r = P^\perp y, \quad g = P^\perp \frac{\partial H}{\partial \omega} \hat a, \quad \hat a = H^+ y
 
-    with P the projection off the columns of H, as in `estimate_tone` (variable projection).
+    with P the projection off the columns of H, as in `estimate_tone` (variable projection). Steps are held
+    within the main lobe.
 
     Shapes: y (n,).
     """
@@ -144,7 +154,8 @@ def climb(
         moved, omega = abs(target - omega), target
         if moved < tolerance * reach:
             break
-    return omega, complex(*fit)
+    amplitude = complex(*fit)
+    return omega, amplitude, y - (amplitude * tone_wave(omega, len(y))).real
 
 
 def tone_wave(omega: float, count: int) -> ComplexArray:
@@ -166,7 +177,8 @@ def tone_wave(omega: float, count: int) -> ComplexArray:
 def _step(y: FloatArray, omega: float, n: FloatArray) -> tuple[float, FloatArray]:
     """Least-squares step in frequency, the amplitude being refitted along with it (variable projection)."""
     # Everything is a product of few rows: the tone's H, its derivative by omega, and y.
-    rows = _rows(y, omega, n)
+    wave = tone_wave(omega, len(y))
+    rows = np.stack([wave.real, -wave.imag, -wave.imag * n, wave.real * -n, y])
     gram = rows @ rows.T
     # A row of zeros, the sine of 0 Hz, gets no amplitude.
     inner = gram[:2, :2].copy()
@@ -178,30 +190,6 @@ def _step(y: FloatArray, omega: float, n: FloatArray) -> tuple[float, FloatArray
     image = free @ gram
     size = float(image @ free)
     return float(image @ rest) / size if size > 0.0 else 0.0, np.asarray(fit)
-
-
-def _rows(y: FloatArray, omega: float, n: FloatArray) -> FloatArray:
-    """Columns of H, their derivatives by omega, and y, (5, n)."""
-    wave = tone_wave(omega, len(y))
-    rows = np.empty((5, len(y)))
-    rows[0] = wave.real
-    np.negative(wave.imag, out=rows[1])
-    np.multiply(rows[1], n, out=rows[2])
-    np.multiply(wave.real, -n, out=rows[3])
-    rows[4] = y
-    return rows
-
-
-def _tone(y: FloatArray, omega: float, amplitude: complex, rate: float) -> Tone:
-    count, size = len(y), abs(amplitude)
-    residual = y - (amplitude * tone_wave(omega, count)).real
-    # Three parameters are fitted.
-    power = float(residual @ residual) / (count - 3)
-    snr = size**2 / max(2.0 * power, np.finfo(float).tiny)
-    snr = min(max(snr, np.finfo(float).tiny), 1e300)
-    std = float(np.sqrt(tone_crb_hz2(snr, count, rate)))
-    phase = float(np.angle(amplitude) - omega * 0.5 * (count - 1))
-    return Tone(omega * rate / (2 * np.pi), size, wrap_angle(phase), snr, std)
 
 
 # Firing frequencies of road vehicles, idling motorcycle single to a car at high revolutions.
@@ -267,8 +255,8 @@ class ToneStage:
         low, high = band_hz
         in_range("tone_band_hz: lower end", low, _FEWEST_PERIODS / _WINDOW_S, high, open_high=True)
         in_range("tone_band_hz: upper end", high, low, 0.5 * sample_rate_hz, open_high=True)
-        self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
-        self._weights, self._keep = self._mean_of(np.ones(array.n_microphones, bool))
+        self._array = array
+        self._set_microphones(np.ones(array.n_microphones, bool))
         self._decimator = Decimator(sample_rate_hz, high)
         self._rate = self._decimator.rate_hz
         self._n_out = 0
@@ -283,7 +271,7 @@ class ToneStage:
         """
         # C are the usable microphones nearest to the centre.
         if not np.array_equal(mask.keep, self._keep):
-            self._weights, self._keep = self._mean_of(mask.keep)
+            self._set_microphones(mask.keep)
         new = self._decimator.push(samples @ self._weights)
         self._n_out += len(new)
         self._band_samples = np.concatenate([self._band_samples, new])[len(new) :]
@@ -304,24 +292,20 @@ class ToneStage:
         sound = self._band_samples - self._spectrum.offset(self._band_samples)
         power = self._spectrum.power(sound)
         begin, band = self._spectrum.peak(power), self._spectrum.omega_range
-        omega, amplitude = climb(sound, begin, band, _TOLERANCE, _STEPS)
-        rest = sound - (amplitude * tone_wave(omega, len(sound))).real
+        omega, amplitude, rest = climb(sound, begin, band, _TOLERANCE, _STEPS)
         around, beside = self._spectrum.floor_near(power, omega), self._spectrum.beside(rest, omega)
         snr = 0.5 * abs(amplitude) ** 2 / max(around, beside)
         if not 0.5 * snr * len(sound) > _EVIDENT:
             return NotUsable("no tone above the noise")
         noise = around + _WANDER * max(beside - _CHANCE * around, 0.0)
         std = float(np.sqrt(tone_crb_hz2(0.5 * abs(amplitude) ** 2 / noise, len(sound), self._rate)))
-        frequency = omega * self._rate / (2.0 * np.pi)
-        return ToneReading(frequency, std, snr)
+        return ToneReading(omega * self._rate / (2.0 * np.pi), std, snr)
 
-    def _mean_of(self, keep: BoolArray) -> tuple[Float32Array, BoolArray]:
-        """Return weights of the usable microphones nearest to the centre, and their mask."""
-        usable = self._nearest[keep[self._nearest]] if keep.any() else self._nearest
-        chosen = usable[:_MOST_CHANNELS]
-        weights = np.zeros(len(keep), np.float32)
-        weights[chosen] = 1.0 / len(chosen)
-        return weights, keep.copy()
+    def _set_microphones(self, keep: BoolArray) -> None:
+        """Average the usable microphones nearest to the centre."""
+        chosen = self._array.nearest(keep)[:_MOST_CHANNELS]
+        self._keep, self._weights = keep.copy(), np.zeros(len(keep), np.float32)
+        self._weights[chosen] = 1.0 / len(chosen)
 
 
 def _window(n_samples: float, decimator: Decimator) -> int:
@@ -351,8 +335,7 @@ class _Spectrum:
         return float(self._window @ sound) / float(self._window.sum())
 
     def power(self, sound: FloatArray) -> FloatArray:
-        spectrum = scipy.fft.rfft(sound * self._window, self._size)
-        return np.asarray(np.square(spectrum.real) + np.square(spectrum.imag))
+        return power(scipy.fft.rfft(sound * self._window, self._size))
 
     def peak(self, power: FloatArray) -> float:
         """Return the frequency (rad per sample) of the highest power over its block median."""
@@ -364,7 +347,7 @@ class _Spectrum:
         ratio = inside / np.repeat(floor, width)[np.minimum(np.arange(len(inside)), n_blocks * width - 1)]
         index = self._band.start + int(np.argmax(ratio))
         near = np.log(power[index - 1 : index + 2] + _least(power))
-        return self._step * (index + _vertex(float(near[0]), float(near[1]), float(near[2])))
+        return self._step * (index + min(max(vertex(*near.tolist()), -0.5), 0.5))
 
     def floor_near(self, power: FloatArray, omega: float) -> float:
         """Return the mean square of white noise that would have the median power around a line."""
@@ -379,12 +362,6 @@ class _Spectrum:
         """Return the mean power beside a line that was taken out, as far as its own lobes reach."""
         centre, reach = round(omega / self._step), _PADDING * _RING[0]
         return float(self.power(rest)[max(centre - reach, 1) : centre + reach + 1].mean())
-
-
-def _vertex(left: float, middle: float, right: float) -> float:
-    """Vertex of a parabola through three points, in steps from the second, at most half a step."""
-    bend = left - 2.0 * middle + right
-    return min(max(0.5 * (left - right) / bend, -0.5), 0.5) if bend < 0.0 else 0.0
 
 
 def _least(power: FloatArray) -> float:

@@ -1,14 +1,27 @@
-"""The microphone array: positions, delays, steering vectors, the channels in use, and two roof arrays."""
+"""The microphone array: positions, delays, steering vectors, the channels in use, and two roof arrays.
+
+Axes are those of `base_link`: x forward, y left, z up.
+"""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground import InvalidArgumentError, finite_array
-from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray
+from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray, IndexArray
 
-from .geometry import SPEED_OF_SOUND_M_S, Ambiguity, ambiguity, direction_vectors, nearest_spacings_m
+SPEED_OF_SOUND_M_S = 343.0
+"""Speed of sound in dry air at 20 degrees Celsius."""
+
+Ambiguity = Literal["cone", "front-back", "up-down", "mirror", "none"]
+
+# Extent along a principal axis, relative to the largest, below which an array is flat: a millimetre in a
+# metre, the accuracy of mounting.
+_FLAT = 1e-3
+# Direction cosine, 10 degrees, above which a normal points along an axis of the vehicle.
+_ALONG_AXIS = 0.985
 
 # Covariances grow with the square: 40 bins of 1024 channels take 0.3 GB.
 MAX_MICROPHONES = 1024
@@ -20,6 +33,35 @@ _COLUMNS, _ROWS = 8, 7
 _WIDTH_M, _HEIGHT_M = 0.78, 0.65
 _JITTER = 0.57
 _COLUMN_POWER = 1.013
+
+
+def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> FloatArray:
+    r"""Return unit vectors towards far-field sources, shape (..., 3).
+
+    .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
+    """
+    azimuth, elevation = np.broadcast_arrays(
+        np.asarray(azimuths_rad, dtype=np.float64), np.asarray(elevations_rad, dtype=np.float64)
+    )
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+def nearest_spacings_m(positions_m: FloatArray) -> FloatArray:
+    r"""Return the distance from every microphone to its nearest neighbour, metres.
+
+    .. math:: d_m = \min_{j \ne m} \|p_m - p_j\|
+
+    Shapes: positions_m (M, 3).
+
+    Examples
+    --------
+    >>> nearest_spacings_m(np.array([[0, 0, 0], [0, 0.1, 0], [0, 0.3, 0]])).round(3)
+    array([0.1, 0.1, 0.2])
+    """
+    distance = np.linalg.norm(positions_m[:, None] - positions_m[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    return np.asarray(distance.min(axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,10 +124,15 @@ class MicrophoneArray:
         """Positions relative to their mean, shape (M, 3), metres."""
         return np.asarray(self.positions_m - self.positions_m.mean(axis=0))
 
+    def nearest(self, keep: BoolArray | None = None) -> IndexArray:
+        """Channels from the centre outwards: those kept (M,), or all where none is."""
+        order = np.argsort(np.linalg.norm(self.centred_m, axis=1), kind="stable")
+        return order if keep is None or not keep.any() else order[keep[order]]
+
     @property
     def middle(self) -> int:
         """Channel nearest to the centre."""
-        return int(np.linalg.norm(self.centred_m, axis=1).argmin())
+        return int(self.nearest()[0])
 
     @property
     def aperture_m(self) -> FloatArray:
@@ -126,8 +173,32 @@ class MicrophoneArray:
 
     @property
     def ambiguity(self) -> Ambiguity:
-        """Kind of directions that the array cannot distinguish: see `geometry.ambiguity`."""
-        return ambiguity(self.positions_m)
+        r"""Directions that an array of this shape cannot distinguish, whatever the algorithm.
+
+        With the singular values :math:`s_1 \ge s_2 \ge s_3` of the centred positions and n the direction of
+        the last, an array is linear for :math:`s_2 < 10^{-3} s_1` and else planar for
+        :math:`s_3 < 10^{-3} s_1`, across the road for :math:`|n_x| > 0.985` and flat for
+        :math:`|n_z| > 0.985`.
+
+        Examples
+        --------
+        >>> MicrophoneArray([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]]).ambiguity
+        'front-back'
+        """
+        # A linear array measures the angle to its axis only (`cone`). A planar one does not distinguish a
+        # direction from its mirror image in the array plane: `front-back` if the plane is across the road,
+        # `up-down` if it is horizontal, `mirror` if it is tilted or faces sideways. A three-dimensional array
+        # has no mirror direction.
+        spread, axes = np.linalg.svd(self.centred_m, full_matrices=True)[1:]
+        thickness = np.pad(spread, (0, 3 - len(spread)))
+        if thickness[1] < _FLAT * thickness[0]:
+            return "cone"
+        if thickness[2] >= _FLAT * thickness[0]:
+            return "none"
+        normal = np.abs(axes[2])
+        if normal[0] > _ALONG_AXIS:
+            return "front-back"
+        return "up-down" if normal[2] > _ALONG_AXIS else "mirror"
 
     def delays_s(self, azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> FloatArray:
         r"""Return the far-field arrival time at every microphone relative to the origin, seconds.

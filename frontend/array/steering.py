@@ -36,9 +36,9 @@ class Steering:
     basis: Complex64Array | None
     weights: Complex64Array  # shape (bins, r or M, directions): C and its conjugate
     conjugate: Complex64Array
-    # The same beams at the node directions from which the power in all others is interpolated; None if that
-    # does not save work.
-    nodes: "NodeBeams | None" = None
+    # The same beams at the node directions from which the power in all others is interpolated, and how,
+    # shape (nodes, directions); None if that does not save work.
+    nodes: "tuple[Steering, FloatArray] | None" = None
 
     @classmethod
     def towards(
@@ -80,22 +80,23 @@ class Steering:
 
         .. math:: P(\theta) = \sum_k C_k(\theta)^T Q_k\, \overline{C_k(\theta)}
         """
-        beams = self if self.nodes is None else self.nodes
-        products = matrices @ beams.conjugate
-        products *= beams.weights
-        total = np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
-        return total if self.nodes is None else total @ self.nodes.spread
+        if self.nodes is not None:
+            return np.asarray(self.nodes[0].quadratic_form(matrices) @ self.nodes[1])
+        products = matrices @ self.conjugate
+        products *= self.weights
+        return np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
 
     def power_within(self, vectors: Complex64Array) -> FloatArray:
         r"""Return the power of steering vectors within orthonormal columns (bins, M, k): (bins, directions).
 
         .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
         """
-        beams = self if self.nodes is None else self.nodes
+        if self.nodes is not None:
+            return np.asarray(self.nodes[0].power_within(vectors) @ self.nodes[1])
         rows = vectors.transpose(0, 2, 1)
-        inner = (rows if self.basis is None else rows @ self.basis) @ beams.weights
+        inner = (rows if self.basis is None else rows @ self.basis) @ self.weights
         power = np.square(inner.real).sum(axis=1, dtype=np.float64) + np.square(inner.imag).sum(axis=1)
-        return np.asarray(power if self.nodes is None else power @ self.nodes.spread)
+        return np.asarray(power)
 
 
 # Every stream of an array needs the same two sets of beams, and they are nine tenths of the 50 ms that a
@@ -110,26 +111,12 @@ def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: byte
     thin = None if basis is None else np.ascontiguousarray(basis, np.complex64)
     weights = weights if basis is None else basis.conj().transpose(0, 2, 1) @ weights
     single = weights.astype(np.complex64)
-    return Steering(thin, single, single.conj(), NodeBeams.of(weights))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NodeBeams:
-    """Beams at the few directions from which the power in all others is interpolated."""
-
-    weights: Complex64Array  # shape (bins, r or M, N): C at the nodes, and its conjugate
-    conjugate: Complex64Array
-    spread: FloatArray  # shape (N, directions): From the power at the nodes to that in all directions
-
-    @classmethod
-    def of(cls, weights: Complex128Array) -> "NodeBeams | None":
-        r"""Choose nodes for weights (bins, r or M, directions); None if that saves no work."""
-        nodes = interpolation_nodes(weights)
-        if nodes is None:
-            return None
-        index, spread = nodes
-        chosen = np.ascontiguousarray(weights[:, :, index], np.complex64)
-        return cls(chosen, chosen.conj(), spread)
+    found = interpolation_nodes(weights)
+    if found is None:
+        return Steering(thin, single, single.conj())
+    index, spread = found
+    chosen = np.ascontiguousarray(weights[:, :, index], np.complex64)
+    return Steering(thin, single, single.conj(), (Steering(thin, chosen, chosen.conj()), spread))
 
 
 def interpolation_nodes(vectors: Complex128Array) -> tuple[IndexArray, FloatArray] | None:

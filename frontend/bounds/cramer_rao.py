@@ -7,7 +7,7 @@ power ratios, not decibels.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S, direction_vectors
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S, direction_vectors
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 
 

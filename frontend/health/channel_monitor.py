@@ -1,5 +1,7 @@
 """Monitor the channels of a stream, hop by hop: levels, clipping, activity, dropouts, geometry."""
 
+from collections import deque
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
@@ -46,22 +48,13 @@ class ClippingCounter:
         self._n_samples += len(samples)
         self.newest_share = 0.0
         span = highest - lowest
-        self._side(0, np.float32(1.0), samples, highest, span)
-        self._side(1, np.float32(-1.0), samples, -lowest, span)
-
-    def _side(
-        self,
-        side: int,
-        sign: np.float32,
-        samples: Float32Array,
-        top: Float32Array,
-        span: Float32Array,
-    ) -> None:
-        extreme, at, below = self._extreme[side], self._at[side], self._below[side]
-        reached = np.flatnonzero((top == extreme) & (span > 0.0))
-        higher = top > extreme
-        extreme[higher], at[higher], below[higher] = top[higher], 0, 0
-        if len(reached):
+        for side, (sign, top) in enumerate(((np.float32(1.0), highest), (np.float32(-1.0), -lowest))):
+            extreme, at, below = self._extreme[side], self._at[side], self._below[side]
+            reached = np.flatnonzero((top == extreme) & (span > 0.0))
+            higher = top > extreme
+            extreme[higher], at[higher], below[higher] = top[higher], 0, 0
+            if not len(reached):
+                continue
             values = sign * samples[:, reached]
             is_at = values == extreme[reached]
             n_at = is_at.sum(axis=0)
@@ -112,10 +105,9 @@ class ChannelLevels:
     """
 
     def __init__(self, n_channels: int) -> None:
-        self._hops = np.zeros((_LEVEL_HOPS, n_channels))
-        self._latest = np.zeros(n_channels)
+        self._hops: deque[FloatArray] = deque(maxlen=_LEVEL_HOPS)
+        self._latest: FloatArray = np.zeros(n_channels)
         self._count = np.zeros(n_channels, np.int64)
-        self._n_hops = 0
 
     def push(self, powers: FloatArray, good: BoolArray) -> None:
         """Take the mean power of one hop per bin and channel, (K, M), and the channels that sound, (M,)."""
@@ -124,8 +116,7 @@ class ChannelLevels:
             level -= np.median(level[:, good], axis=1, keepdims=True)
             # A hop in which a channel breaks off says nothing of its level.
             self._latest = np.where(good, level.mean(axis=0), self._latest)
-        self._hops[self._n_hops % _LEVEL_HOPS] = self._latest
-        self._n_hops += 1
+        self._hops.append(self._latest)
         self._count += good
 
     def faults(self) -> list[ChannelFault]:
@@ -136,12 +127,9 @@ class ChannelLevels:
 
         A channel with gusts has no gain.
         """
-        n = min(self._n_hops, _LEVEL_HOPS)
-        if n < _FEWEST_HOPS:
+        if len(self._hops) < _FEWEST_HOPS:
             return []
-        newest = self._n_hops % _LEVEL_HOPS if self._n_hops >= _LEVEL_HOPS else 0
-        ordered = np.roll(self._hops, -newest, axis=0)[:n]
-        smooth = np.median(sliding_window_view(ordered, _SMOOTHED, axis=0), axis=2)
+        smooth = np.median(sliding_window_view(np.array(self._hops), _SMOOTHED, axis=0), axis=2)
         low, high = np.quantile(smooth, (_QUIET, 1.0 - _QUIET), axis=0)
         level = np.clip(0.0, low, high)
         usable = self._count >= _FEWEST_HOPS // 2
@@ -164,8 +152,7 @@ class ChannelActivity:
     # A single bad hop is masked and not reported: a slammed door is no fault.
 
     def __init__(self, n_channels: int) -> None:
-        self._bad = np.zeros((_ACTIVITY_HOPS, n_channels), bool)
-        self._n_hops = 0
+        self._bad: deque[BoolArray] = deque(maxlen=_ACTIVITY_HOPS)
         self._n_silent = 0
         self._dead = self._intermittent = np.zeros(n_channels, bool)
         self._share = np.zeros(n_channels)
@@ -174,33 +161,26 @@ class ChannelActivity:
         """Take one flag per channel, shape (M,), and return it."""
         if self._n_silent >= _SILENCE_HOPS:
             # What all of them lost is no fault of any.
-            self._bad[:] = False
+            self._bad.extend([np.zeros_like(bad)] * len(self._bad))
         self._n_silent = 0
         return self._remember(bad)
 
     def all_silent(self) -> BoolArray:
         """Take a hop in which all channels are silent; return flags that are set after one second of this."""
         self._n_silent += 1
-        silent = np.full(self._bad.shape[1], self._n_silent >= _SILENCE_HOPS)
+        silent = np.full(len(self._share), self._n_silent >= _SILENCE_HOPS)
         return self._remember(silent) if silent.any() else silent
 
     def _remember(self, bad: BoolArray) -> BoolArray:
-        self._bad[self._n_hops % _ACTIVITY_HOPS] = bad
-        self._n_hops += 1
+        self._bad.append(bad)
         if bad.any() or self._share.any():
-            self._classify(bad)
+            ordered = np.array(self._bad)
+            count = ordered.sum(axis=0)
+            stretches = (ordered[1:] & ~ordered[:-1]).sum(axis=0) + ordered[0]
+            self._dead = (count >= 2) & bad & (stretches == 1)
+            self._intermittent = (count >= 2) & ~self._dead
+            self._share = count / len(ordered)
         return bad
-
-    def _classify(self, bad: BoolArray) -> None:
-        n = min(self._n_hops, _ACTIVITY_HOPS)
-        newest = self._n_hops % _ACTIVITY_HOPS
-        ordered = self._bad[:n] if n < _ACTIVITY_HOPS else np.roll(self._bad, -newest, axis=0)
-        count = ordered.sum(axis=0)
-        stretches = (ordered[1:] & ~ordered[:-1]).sum(axis=0) + ordered[0]
-        repeated = count >= 2
-        self._dead = repeated & bad & (stretches == 1)
-        self._intermittent = repeated & ~self._dead
-        self._share = count / n
 
     @property
     def suspects(self) -> BoolArray:
@@ -212,8 +192,6 @@ class ChannelActivity:
 
         .. math:: q_m = \frac1n \sum_{i=1}^{n} b_{i,m}, \qquad n \le 50
         """
-        if not self._share.any():
-            return []
         dead = faults_where(Fault.DEAD, self._dead, self._share)
         return dead + faults_where(Fault.INTERMITTENT, self._intermittent, self._share)
 

@@ -121,33 +121,22 @@ class StillRuns:
         .. math:: L = \max\big(16,\; \ln 10^{-12} / \ln q\big)
         """
         # L is the length that constant samples by chance, a share q of all, reach once in 1e12.
-        self.runs = []
-        if not (still.any() or self._length):
-            self._has_changed = True
-            self._n_moving += len(still)
-            return []
-        moving = np.flatnonzero(~still)
-        first = end - len(still)
-        if not len(moving):
-            self._length += len(still)
-            if self._length >= self._shortest(moving):
-                self.runs = [(end - self._length - 1, end)]
-            return []
-        edges = np.concatenate([[-1 - self._length], moving])
+        first, moving = end - len(still), np.flatnonzero(~still)
+        # The last run goes on.
+        edges = np.concatenate([[-1 - self._length], moving, [len(still)]])
         lengths = np.diff(edges) - 1
-        shortest = self._shortest(lengths)
-        found = np.flatnonzero(lengths >= shortest)
-        self.runs = [(int(first + edges[i]), int(first + edges[i] + lengths[i] + 1)) for i in found]
-        dropouts = [Dropout("still", int(first + edges[i]), int(lengths[i]) + 1) for i in found]
+        long = np.flatnonzero(lengths >= self._shortest(lengths[:-1]))
+        self.runs = [(int(first + edges[i]), int(first + edges[i] + lengths[i] + 1)) for i in long]
+        self._length = int(lengths[-1])
+        ended = [
+            Dropout("still", begin, stop - begin)
+            for begin, stop in self.runs
+            if stop < end or not self._length
+        ]
         if not self._has_changed:
-            dropouts = [
-                dropout for dropout in dropouts if dropout.sample > 0 and dropout.sample >= first + moving[0]
-            ]
-        self._has_changed = True
-        self._length = int(len(still) - 1 - moving[-1])
-        if self._length >= shortest:
-            self.runs.append((end - self._length - 1, end))
-        return dropouts
+            ended = [one for one in ended if one.sample > 0 and one.sample >= first + moving[0]]
+        self._has_changed |= bool(len(moving))
+        return ended
 
     def _shortest(self, lengths: IndexArray) -> float:
         """Shortest run that is not explained by the share of constant samples met so far."""

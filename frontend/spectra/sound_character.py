@@ -16,6 +16,7 @@ from scipy.fft import next_fast_len, rfft
 from worldstate.ground import FloatArray, IntArray, NotUsable, in_range
 
 from .decimator import Decimator
+from .stft import power
 
 HOPS_A_SECOND = 10
 EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)
@@ -88,13 +89,12 @@ class _Bands:
         self._window = np.hanning(length + 1)[:-1] / np.sqrt(length)
         self._size = next_fast_len(length, real=True)
         hz = np.fft.rfftfreq(self._size, 1.0 / rate_hz)
-        inside = np.stack([(hz >= low) & (hz < high) for low, high in _pairs(EDGES_HZ)], axis=1)
         # A mean: at another rate three bins or four lie within the same band.
-        self._means = inside / inside.sum(axis=0)
+        self._means = np.ascontiguousarray(_means(EDGES_HZ, hz).T)
 
     def levels(self, frames: FloatArray) -> FloatArray:
         """Log-levels, shape (frames, bands)."""
-        return np.asarray(np.log(_power(rfft(frames * self._window, self._size)) @ self._means + _LEAST))
+        return np.asarray(np.log(power(rfft(frames * self._window, self._size)) @ self._means + _LEAST))
 
 
 class _Lines:
@@ -125,8 +125,9 @@ class _Lines:
     def push(self, sound: FloatArray) -> None:
         """Take the sound that ends now, at least one frame of it."""
         frame = sound[-len(self._window) :]
-        level = np.log(_power(rfft(frame * self._window)[self._band]) + _LEAST)
-        excess = level - self._floor(level)
+        level = np.log(power(rfft(frame * self._window)[self._band]) + _LEAST)
+        sums = np.concatenate([[0.0], np.cumsum(level)])
+        excess = level - (sums[self._right] - sums[self._left]) / (self._right - self._left)
         self._excess += _FORGET_LINES * (excess - self._excess)
         self._ratio += _FORGET_LINES * (np.exp(excess) - self._ratio)
         self._peaks += _FORGET_PEAKS * (np.maximum.reduceat(excess, self._starts) - self._peaks)
@@ -141,23 +142,16 @@ class _Lines:
         spreads = [math.sqrt(max(comb_square - comb**2, 0.0)), math.sqrt(max(pitch_square - pitch**2, 0.0))]
         return np.concatenate([steady, tonal, self._peaks, [comb, spreads[0], pitch, spreads[1], holds]])
 
-    def _floor(self, level: FloatArray) -> FloatArray:
-        sums = np.concatenate([[0.0], np.cumsum(level)])
-        return np.asarray((sums[self._right] - sums[self._left]) / (self._right - self._left))
-
     def _moment(self, excess: FloatArray) -> FloatArray:
         comb, strongest = self._combed(excess), int(excess.argmax())
         height, pitch = float(excess[strongest]), float(self._log_hz[strongest])
-        weight = math.exp(min(height, _HEIGHTS[1]))
-        return np.array(
-            [comb, comb * comb, weight, weight * pitch, weight * pitch * pitch, height > _HEIGHTS[0]]
-        )
+        weight, stands_out = math.exp(min(height, _HEIGHTS[1])), height > _HEIGHTS[0]
+        return np.array([comb, comb * comb, weight, weight * pitch, weight * pitch * pitch, stands_out])
 
     def _combed(self, excess: FloatArray) -> float:
         """Log of the highest line of the spectrum of the spectrum, over its mean."""
-        clipped = np.clip(excess, *_EXCESS) * self._taper
-        power = _power(rfft(clipped, self._comb_size))
-        return 0.5 * float(np.log((power[self._combs].max() + _LEAST) / (power.mean() + _LEAST)))
+        spectrum = power(rfft(np.clip(excess, *_EXCESS) * self._taper, self._comb_size))
+        return 0.5 * float(np.log((spectrum[self._combs].max() + _LEAST) / (spectrum.mean() + _LEAST)))
 
 
 def _modulation(levels: FloatArray) -> FloatArray:
@@ -167,8 +161,8 @@ def _modulation(levels: FloatArray) -> FloatArray:
               c_r = \ln \frac{\sum_{f \in r} |\sum_b E_b(f)|^2}{\sum_{f \in r} \sum_b |E_b(f)|^2}
     """
     spectrum = rfft((levels - levels.mean(axis=0)).T * _TAPER)
-    low, high = _power(spectrum[:_HIGH]).mean(axis=0), _power(spectrum[_HIGH:]).mean(axis=0)
-    all_bands = _power(spectrum[_HIGH:].sum(axis=0)) / (len(spectrum) - _HIGH)
+    low, high = power(spectrum[:_HIGH]).mean(axis=0), power(spectrum[_HIGH:]).mean(axis=0)
+    all_bands = power(spectrum[_HIGH:].sum(axis=0)) / (len(spectrum) - _HIGH)
     shared = np.log((_TOGETHER @ all_bands + _LEAST) / (_TOGETHER @ high + _LEAST))
     return np.concatenate([np.log(_RATES @ low + _STILL), np.log(_RATES @ high + _STILL), shared])
 
@@ -183,20 +177,14 @@ def _swings(levels: FloatArray) -> FloatArray:
     return np.array([high - middle, middle - low, pause, change[:_HIGH].mean(), change[_HIGH:].mean()])
 
 
-def _power(spectrum: np.ndarray) -> FloatArray:
-    return np.asarray(np.square(spectrum.real) + np.square(spectrum.imag))
-
-
-def _pairs(edges: tuple[float, ...]) -> list[tuple[float, float]]:
-    return list(pairwise(edges))
-
-
-def _groups(edges: tuple[float, ...]) -> FloatArray:
-    """Means over the rates of modulation between edges, shape (groups, rates)."""
-    hz = np.fft.rfftfreq(_MEMORY, 1.0 / (_FRAMES * HOPS_A_SECOND))
-    inside = np.stack([(hz >= low) & (hz < high) for low, high in _pairs(edges)])
+def _means(edges_hz: tuple[float, ...], hz: np.ndarray) -> FloatArray:
+    """Means over the frequencies between edges, shape (bands, frequencies)."""
+    inside = np.stack([(hz >= low) & (hz < high) for low, high in pairwise(edges_hz)])
     return np.asarray(inside / inside.sum(axis=1, keepdims=True))
 
 
 _TAPER = np.hanning(_MEMORY + 2)[1:-1] / np.sqrt(0.375 * _MEMORY)
-_RATES, _TOGETHER = _groups(_RATES_HZ), _groups(_TOGETHER_HZ)
+_RATES, _TOGETHER = (
+    _means(edges_hz, np.fft.rfftfreq(_MEMORY, 1.0 / (_FRAMES * HOPS_A_SECOND)))
+    for edges_hz in (_RATES_HZ, _TOGETHER_HZ)
+)

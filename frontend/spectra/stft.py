@@ -3,13 +3,13 @@
 import numpy as np
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import Complex64Array, Float32Array, IntArray
+from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, IntArray
 
 # Smallest power of a bin that is not silence: far below 24-bit quantisation, far above float32 underflow.
 _POWER_FLOOR = np.float32(1e-30)
 
 
-def power(spectra: Complex64Array) -> Float32Array:
+def power(spectra: ComplexArray) -> np.ndarray:
     """Squared magnitude ``|X|^2 = (Re X)^2 + (Im X)^2``, without a square root, same shape.
 
     Examples
@@ -31,7 +31,7 @@ def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Compl
     weights = np.maximum(squared, _POWER_FLOOR)
     np.sqrt(weights, out=weights)
     np.reciprocal(weights, out=weights)
-    return np.asarray(spectra * weights)
+    return spectra * weights
 
 
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:

@@ -49,8 +49,7 @@ from worldstate_lab.evaluation.report.degradation_section import (
 from worldstate_lab.trials.attempts import Failed, attempted
 from worldstate_lab.trials.pass_cache import PassCache
 
-from worldstate.abduction.absence import default_miss_rates
-from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.co_evidence import Absent, default_miss_rates
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.camera.camera_channel import watched
 from worldstate.adapters.camera.camera_health import degrade, learn_health

@@ -13,7 +13,7 @@ from worldstate_lab.features.published_classifier import PublishedClassifier, mi
 
 from worldstate.abduction.co_evidence import Absent, Unqueried
 from worldstate.abduction.posterior import abduce, statistic
-from worldstate.abduction.signature.expert import mirror_features
+from worldstate.abduction.signature.ensemble import mirror_features
 from worldstate.abduction.signature.published_signature import PAIRS, SignatureModel, couple
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.files.model_file import read_model

@@ -35,7 +35,7 @@ from worldstate_lab.streets.window_measures import (
     spread_values,
 )
 
-from worldstate.abduction.signature.expert import mirror_features
+from worldstate.abduction.signature.ensemble import mirror_features
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature

@@ -37,7 +37,7 @@ from worldstate_lab.trials.takes import Take, TakeList
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 from worldstate.operations.recordings.hop_table import HopTable
 
 HOSTILE = '<script src="http://x/y.js">a|b</script> `*_\n| "q" & [t](http://x)'

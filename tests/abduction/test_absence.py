@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from worldstate.abduction.absence import MissRateTable, default_miss_rates
+from worldstate.abduction.co_evidence import MissRateTable, default_miss_rates
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
 from worldstate.ground.serialisation import decode, encode
 

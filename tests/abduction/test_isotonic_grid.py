@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import LinearConstraint, minimize
 from sklearn.isotonic import IsotonicRegression
 
-from worldstate.abduction.absence import isotonic_grid
+from worldstate.abduction.co_evidence import isotonic_grid
 from worldstate.ground.errors import InvalidArgumentError
 
 shapes = st.tuples(st.integers(1, 5), st.integers(1, 5))

@@ -9,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import log_softmax
 
-from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.ensemble import (
+    VIEWS,
+    EnsembleModel,
+    expert_views,
+    mirror_features,
+    shape_features,
+)
 from worldstate.abduction.signature.ensemble_training import (
     OTHER_SIDE,
     RECIPES,
@@ -17,7 +23,6 @@ from worldstate.abduction.signature.ensemble_training import (
     SimulatedWindows,
     SiteEnsembleClassifier,
 )
-from worldstate.abduction.signature.expert import VIEWS, expert_views, mirror_features, shape_features
 from worldstate.abduction.signature.site_reference import SiteReference, log_levels, site_reference
 from worldstate.abduction.signature.window_classes import CLASSES, WINDOW_CLASSES, mirrored_classes
 from worldstate.adapters.datasets.feature_table import FeatureTable

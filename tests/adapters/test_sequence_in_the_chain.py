@@ -17,8 +17,7 @@ from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
 from worldstate.abduction.sequence.sequence_model import SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import neutral
-from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.expert import Expert
+from worldstate.abduction.signature.ensemble import EnsembleModel, Expert
 from worldstate.abduction.signature.site_reference import SiteReference
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
 from worldstate.adapters.acoustic import LEVEL_BAND_HZ

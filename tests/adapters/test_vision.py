@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.abduction.absence import MissRateTable
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, MissRateTable, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery

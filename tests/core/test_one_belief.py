@@ -357,8 +357,8 @@ def passing(excess_db: float) -> list[WorldState]:
         boxes = (Sighting(0.04 * (10 - number), 0.02, "car", 0.9),) if there else ()
         world = world.update(
             Measurement(
-                number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=Look("camera", number * 10**8, answer),
-                sequence=empty, heard=Heard(excess_db=excess_db),
+                number * 10**8, quiet, answer, SILENT, SILENT, boxes,
+                look=Look("camera", number * 10**8, answer), sequence=empty, heard=Heard(excess_db=excess_db),
             )
         )  # fmt: skip
         found.append(world.state)

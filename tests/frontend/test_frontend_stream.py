@@ -16,7 +16,7 @@ from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.phat import srp_phat
+from worldstate.frontend.direction.bearing import srp_phat
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.levels import BANDS, NoiseMeter
 from worldstate.frontend.settings import ELEVATIONS_RAD, FrontEndSettings

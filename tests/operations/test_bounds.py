@@ -25,8 +25,7 @@ from worldstate.frontend.bounds.cramer_rao import (
     radial_speed_crb_m2_s2,
     tone_crb_hz2,
 )
-from worldstate.frontend.direction.bearing import find_peaks
-from worldstate.frontend.direction.phat import srp_phat
+from worldstate.frontend.direction.bearing import find_peaks, srp_phat
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError
 

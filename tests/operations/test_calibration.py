@@ -18,7 +18,7 @@ from worldstate.abduction.cueing.calibration_error import (
 )
 from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt, fit_sigmoid
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 
 samples = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=2, max_size=80).filter(
     lambda sample: len({label for _, label in sample}) == 2

@@ -11,11 +11,12 @@ from passing_boxes import CAMERA, EDGE_RAD, LANE_M, passing
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, SchemaVersionError
-from worldstate.operations.labelling.street_file import read_street, write_street
 from worldstate.operations.labelling.street_passes import (
     HeardStreet,
+    read_street,
     streets_after,
     watched_recording,
+    write_street,
 )
 from worldstate.smoothing.learned_street import LearnedStreet, context_of
 from worldstate.state.context import Rates

@@ -1,7 +1,7 @@
 """Lead time and hand-over, read off a stream of states."""
 
 from worldstate.ground.values import nanoseconds
-from worldstate.operations.recordings.warning import WarningMeter
+from worldstate.operations.recordings.recording_report import WarningMeter
 from worldstate.state import Advisory, Context, Entity, RiskCue, WorldState
 from worldstate.state.context import Priors
 

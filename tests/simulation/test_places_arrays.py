@@ -12,7 +12,7 @@ from worldstate.adapters.files.array_file import read_array
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.phat import srp_phat
+from worldstate.frontend.direction.bearing import srp_phat
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import SimulationSettings, place, preset, simulate_recording
 

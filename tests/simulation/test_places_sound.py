@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.phat import srp_phat
+from worldstate.frontend.direction.bearing import srp_phat
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.occluders import OccludingBody
 from worldstate.simulation.scene.vehicle import EgoMotion, along

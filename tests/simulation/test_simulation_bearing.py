@@ -8,8 +8,8 @@ from worldstate_lab.streets.simulated_windows import NFFT, RATE_HZ, simulated_wi
 
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.bearing import srp_phat
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
-from worldstate.frontend.direction.phat import srp_phat
 from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz
 from worldstate.simulation import SITES, SimulationSettings, Site, preset, simulate_recording, site
 

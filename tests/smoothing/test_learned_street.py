@@ -7,10 +7,12 @@ import pytest
 
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.smoothing.learned_edge import LearnedEdge, Moments, NormalPrior
 from worldstate.smoothing.learned_street import (
     DAY_S,
+    LearnedEdge,
     LearnedStreet,
+    Moments,
+    NormalPrior,
     StreetPass,
     context_of,
     forgotten,

@@ -236,7 +236,7 @@ def _listen(
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
     from worldstate.adapters.state_log import states_writer
-    from worldstate.operations.recordings.warning import WarningMeter
+    from worldstate.operations.recordings.recording_report import WarningMeter
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice = _loss_notices()

@@ -31,10 +31,10 @@ from worldstate.operations.metrics.approach_table import (
     ApproachTable,
     Figures,
     StreamApproach,
+    auroc,
     mean_of,
     rising_edges,
 )
-from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HOP_S
 
 from .heard_stream import ROW_S, HeardStream

@@ -33,8 +33,8 @@ def update_windows(memory: Memory, measurement: Measurement, model: FilterModel)
 
 
 # P(a vehicle that comes into view within three seconds adds a decibel or more to 300 Hz to 2 kHz), by how far
-# the sound lies above the place's usual, dB, while another is in view or has left it within two seconds: 6,066
-# hops of 28 learned junctions. With none in view it is .8 from 3 dB on.
+# the sound lies above the place's usual, dB, while another is in view or has left it within two seconds; with
+# none in view it is .8 from 3 dB on. 6,066 hops of 28 learned junctions.
 _EXCESS_DB, _NOTICED = (4.5, 7.5, 10.5, 13.5, 17.5, 22.0), (0.5, 0.36, 0.33, 0.25, 0.15, 0.06)
 _JUST_LEFT_NS = 2_000_000_000  # What has left the view is as loud as it was for so long
 _SAID = 0.75  # Above, a vehicle in view is not likely enough to be a reason

@@ -86,6 +86,18 @@ def wrap_angle(angle_rad: AngleT) -> AngleT:
     return float(wrapped) if np.ndim(angle_rad) == 0 else wrapped  # type: ignore[return-value]
 
 
+def vertex(left: float, middle: float, right: float) -> float:
+    """Place of the highest point of a parabola through three points, in steps from the second; 0 without one.
+
+    Examples
+    --------
+    >>> vertex(0.0, 1.0, 0.5), vertex(1.0, 0.0, 1.0)
+    (0.16666666666666666, 0.0)
+    """
+    bend = left - 2.0 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+
+
 def seconds(stamp_ns: int) -> float:
     """Convert integer nanoseconds to seconds.
 

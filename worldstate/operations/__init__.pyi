@@ -5,7 +5,7 @@ from .calibration.cueing_calibration import CueingSettings as CueingSettings
 from .calibration.cueing_calibration import calibrate_cueing as calibrate_cueing
 from .detectors.miss_rate_measurement import AbsenceSettings as AbsenceSettings
 from .detectors.miss_rate_measurement import measure_absence as measure_absence
-from .metrics.roc import auroc as auroc
+from .metrics.approach_table import auroc as auroc
 from .recordings.hop_table import HopTable as HopTable
 from .recordings.recording_report import RecordingReport as RecordingReport
 from .recordings.recording_report import run_recording as run_recording

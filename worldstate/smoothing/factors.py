@@ -15,8 +15,7 @@ from worldstate.belief.kinematics.cartesian import constant_velocity
 from worldstate.ground import FloatArray, InvalidArgumentError, wrap_angle
 from worldstate.measurement import Approach, Bearing, Position
 
-from .geometry import azimuth, cartesian, closing_rate, log_range
-from .observations import AngularHeight, Range, SmoothingSettings
+from .observations import AngularHeight, Range, SmoothingSettings, azimuth, cartesian, closing_rate, log_range
 
 # gtsam itself has no types that mypy could read without 25,000 lines of stubs.
 Factor: TypeAlias = Any
@@ -96,12 +95,11 @@ class Node:
 
 
 @lru_cache(maxsize=256)
-def noise_of(std: float | tuple[float, ...], huber_k: float | None = None) -> NoiseModel:
-    """Return independent deviations, with a Huber loss where one is asked for."""
+def noise_of(std: float, huber_k: float) -> NoiseModel:
+    """Return a deviation with a Huber loss."""
     import gtsam
 
-    plain = gtsam.noiseModel.Diagonal.Sigmas(np.atleast_1d(np.asarray(std, np.float64)))
-    return plain if huber_k is None else _robust(plain, huber_k)
+    return _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([std])), huber_k)
 
 
 def _robust(plain: NoiseModel, huber_k: float) -> NoiseModel:
@@ -150,27 +148,21 @@ def _flow(step_s: float) -> FloatArray:
 
 def bearing_factor(node: Node, one: Bearing, settings: SmoothingSettings) -> Factor:
     """Return a measured azimuth."""
-    if node.offset_s == 0.0:
-        # Of the turns that mean the same, that nearest to the estimate.
-        near = node.state[0] + wrap_angle(one.azimuth_rad - float(node.state[0]))
-        return _component(node, 0, near, one.std_rad, settings.robust_k)
-    return _scalar(node, azimuth, one.azimuth_rad, one.std_rad, settings, angle=True)
+    # Of the turns that mean the same, that nearest to the estimate.
+    near = node.state[0] + wrap_angle(one.azimuth_rad - float(node.state[0]))
+    return _scalar(node, (0, near), azimuth, one.azimuth_rad, one.std_rad, settings, angle=True)
 
 
 def approach_factor(node: Node, one: Approach, settings: SmoothingSettings) -> Factor:
     """Return a measured approach rate."""
-    if node.offset_s == 0.0:
-        return _component(node, 2, -one.inverse_tta_hz, one.std_hz, settings.robust_k)
-    return _scalar(node, closing_rate, one.inverse_tta_hz, one.std_hz, settings)
+    return _scalar(node, (2, -one.inverse_tta_hz), closing_rate, one.inverse_tta_hz, one.std_hz, settings)
 
 
 def range_factor(node: Node, one: Range, settings: SmoothingSettings) -> Factor:
     """Return a measured distance, as its logarithm, which is a component of the state."""
     # As exp(log r) a sharp range on a wide prior threw the visible phase off by 1.7 m in place of .35 m.
-    value, std = math.log(one.range_m), one.std_m / one.range_m
-    if node.offset_s == 0.0:
-        return _component(node, 3, value, std, settings.robust_k)
-    return _scalar(node, log_range, value, std, settings)
+    value = math.log(one.range_m)
+    return _scalar(node, (3, value), log_range, value, one.std_m / one.range_m, settings)
 
 
 def position_factor(node: Node, one: Position) -> Factor:
@@ -201,18 +193,9 @@ def height_factor(node: Node, height_key: int, one: AngularHeight, settings: Smo
     return vector_factor([node.key, height_key], noise, error, [node.state, start])
 
 
-def _component(node: Node, row: int, value: float, std: float, huber_k: float) -> Factor:
-    """Return a measurement of one component: a prior of gtsam's own, at a tenth of a Python factor's cost."""
-    import gtsam
-
-    measured, precision = np.zeros(4), np.zeros(4)
-    measured[row], precision[row] = value, 1.0 / std**2
-    noise = _robust(gtsam.noiseModel.Diagonal.Precisions(precision), huber_k)
-    return gtsam.PriorFactorVector(node.key, measured, noise)
-
-
 def _scalar(
     node: Node,
+    component: tuple[int, float],
     read: Callable[[FloatArray], tuple[float, FloatArray]],
     value: float,
     std: float,
@@ -220,7 +203,15 @@ def _scalar(
     *,
     angle: bool = False,
 ) -> Factor:
-    """Return a measurement of one number of an entity's place."""
+    """Return a measurement of one number of an entity's place, at its own time a component of the state."""
+    if node.offset_s == 0.0:
+        import gtsam
+
+        # A prior of gtsam's own costs a tenth of a Python factor.
+        measured, precision = np.zeros(4), np.zeros(4)
+        measured[component[0]], precision[component[0]] = component[1], 1.0 / std**2
+        noise = _robust(gtsam.noiseModel.Diagonal.Precisions(precision), settings.robust_k)
+        return gtsam.PriorFactorVector(node.key, measured, noise)
 
     def error(state: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
         place, by_state = node.placed(state)

@@ -4,6 +4,8 @@ import math
 from bisect import bisect_left, insort
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +15,99 @@ from worldstate.measurement import Approach, Bearing, Position
 from worldstate.smoothing import factors as f
 
 from .factors import Factor
-from .geometry import moved
-from .graph import FactorGraph
-from .observations import AngularHeight, Observation, Range, SmoothedTrack, SmoothingSettings
+from .observations import AngularHeight, Observation, Range, SmoothedTrack, SmoothingSettings, moved
+
+
+def _parameters() -> Any:
+    import gtsam
+
+    parameters = gtsam.ISAM2Params()
+    # Otherwise every factor that was ever marginalised keeps its slot: 4432 after 1500 steps, not 44.
+    parameters.findUnusedFactorSlots = True
+    # Squared by Cholesky, a range that is not measured is indeterminate.
+    parameters.setFactorization("QR")
+    return parameters
+
+
+class FactorGraph:
+    """gtsam's incremental fixed-lag smoother, with the factors and values that wait for its next update."""
+
+    def __init__(self, settings: SmoothingSettings) -> None:
+        import gtsam
+
+        parameters = _parameters()
+        parameters.relinearizeSkip = settings.relinearize_every
+        self._smoother: Any = gtsam.IncrementalFixedLagSmoother(settings.lag_s, parameters)
+        self._every, self._updates = settings.relinearize_every, 0
+        self._near: dict[int, FloatArray] = {}
+        self._clear()
+
+    def _clear(self) -> None:
+        self._factors: list[Factor] = []
+        self._values: dict[int, FloatArray] = {}
+        self._times: dict[int, float] = {}
+
+    def add(self, factor: Factor) -> None:
+        """Add a factor at the next update."""
+        self._factors.append(factor)
+
+    def add_variable(self, key: int, value: FloatArray, time_s: float) -> None:
+        """Add a variable at the next update."""
+        self._values[key], self._times[key] = value, time_s
+
+    def keep(self, key: int, time_s: float) -> None:
+        """Keep a variable for another lag."""
+        self._times[key] = time_s
+
+    def update(self) -> None:
+        """Take in what has been added."""
+        import gtsam
+
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for factor in self._factors:
+            graph.push_back(factor)
+        for key, value in self._values.items():
+            values.insert(key, value)
+        self._updates += 1
+        self._smoother.update(graph, values, self._times)
+        # One estimate costs as much as all, a quarter of an update: in between, what variables began with is
+        # near enough to begin the next ones with.
+        self._near = {} if self._updates % self._every == 0 else self._near | self._values
+        self._clear()
+
+    def value(self, key: int) -> FloatArray:
+        """Return an estimate of a variable, no older than the last relinearisation."""
+        if key in self._values:
+            return self._values[key]
+        if key not in self._near:
+            self._near[key] = self._smoother.calculateEstimateVector(key)
+        return self._near[key]
+
+    @property
+    def n_factor_slots(self) -> int:
+        """How many factors the graph has room for, used or not."""
+        return int(self._smoother.getFactors().size())
+
+    def refined(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of variables, all that lies within the lag relinearised to the end."""
+        import gtsam
+
+        graph, slots = gtsam.NonlinearFactorGraph(), self._smoother.getFactors()
+        for i in range(slots.size()):
+            if slots.exists(i):
+                graph.push_back(slots.at(i))
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        parameters.setRelativeErrorTol(1e-12)
+        parameters.setAbsoluteErrorTol(1e-12)
+        parameters.setMaxIterations(30)
+        start = self._smoother.getLinearizationPoint()
+        values = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+        # gtsam's `Marginals` know Cholesky only from Python, which finds them indeterminate.
+        solved = gtsam.ISAM2(_parameters())
+        solved.update(graph, values)
+        return np.array([*map(values.atVector, keys)]), np.array([*map(solved.marginalCovariance, keys)])
+
 
 # Of (theta, theta_dot, rho) of an entity of which nothing is known: anywhere, passing or closing at
 # up to the rates of a vehicle some ten metres away.
@@ -69,7 +161,7 @@ class FixedLagSmoother:
         self._entities: dict[str, _Entity] = {}
         self._origin_ns: int | None = None
         self._now_ns = 0
-        self._numbers = 0
+        self._numbers = count(1)
 
     @property
     def entities(self) -> tuple[str, ...]:
@@ -101,7 +193,8 @@ class FixedLagSmoother:
         if entity in self._entities:
             raise InvalidArgumentError(f"entity: expected a new one, got {entity!r:.40}")
         self._start(stamp_ns)
-        key = self._add_state(self._born(entity), stamp_ns, belief.mean)
+        one = self._entities[entity] = _Entity()
+        key = self._add_state(one, stamp_ns, belief.mean)
         self._graph.add(f.prior_factor(key, belief.mean, belief.covariance))
 
     def update(self, stamp_ns: int, observations: Mapping[str, Sequence[Observation]]) -> None:
@@ -168,17 +261,9 @@ class FixedLagSmoother:
     def _oldest_s(self) -> float:
         return self._time_s(self._now_ns) - self.settings.lag_s
 
-    def _number(self) -> int:
-        self._numbers += 1
-        return self._numbers
-
-    def _born(self, entity: str) -> _Entity:
-        one = self._entities[entity] = _Entity()
-        return one
-
     def _add_state(self, one: _Entity, stamp_ns: int, state: FloatArray) -> int:
         # Of an entity and a stamp: keys may not come again within the lag, and stamps are too long for one.
-        key = self._number()
+        key = next(self._numbers)
         one.keys[stamp_ns] = key
         insort(one.stamps_ns, stamp_ns)
         self._graph.add_variable(key, state, self._time_s(stamp_ns))
@@ -206,7 +291,7 @@ class FixedLagSmoother:
             raise InvalidArgumentError(
                 f"observations: expected {entity!r:.40} to begin with a bearing or position"
             )
-        one = self._born(entity)
+        one = self._entities[entity] = _Entity()
         state = np.array([toward, 0.0, 0.0, log_m])
         prior = np.array([state[0], 0.0, 0.0, math.log(chosen.range_m)])
         key = self._add_state(one, stamp_ns, state)
@@ -250,7 +335,7 @@ class FixedLagSmoother:
     def _height(self, one: _Entity, said: AngularHeight) -> int:
         """Return the key of an entity's height, which lives as long as its states."""
         if one.height_key is None:
-            one.height_key, start = self._number(), np.array([math.log(said.true_height_m)])
+            one.height_key, start = next(self._numbers), np.array([math.log(said.true_height_m)])
             self._graph.add_variable(one.height_key, start, self._time_s(self._now_ns))
             self._graph.add(f.prior_factor(one.height_key, start, np.array([[said.true_relative_std**2]])))
         return one.height_key

@@ -19,8 +19,7 @@ from worldstate.ground import FloatArray, seconds
 from worldstate.ground.extras import optional
 from worldstate.measurement.measurement import Bearing
 
-from .geometry import cartesian
-from .observations import AngularHeight, Observation, SmoothedTrack
+from .observations import AngularHeight, Observation, SmoothedTrack, cartesian
 
 # m^2/s^3; hidden places of 259 simulated passes are off by 1.87 m with it, and by 1.34 m with robust losses.
 _ACCELERATION_PSD = 1.0

@@ -35,8 +35,7 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.metrics.approach_table import ApproachTable, onset_outcome, rising_edges
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import ApproachTable, auroc, onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS
 from worldstate_lab.metrics.intervals import calibration_error_sampling, deal_folds

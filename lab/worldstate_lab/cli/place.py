@@ -34,7 +34,7 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.phat import srp_phat
+from worldstate.frontend.direction.bearing import srp_phat
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray

@@ -58,7 +58,7 @@ from worldstate.cli.model.fit import add_table_options, read_beside
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.absence import MissRateTable, default_miss_rates
+from worldstate.abduction.co_evidence import MissRateTable, default_miss_rates
 from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.camera_health import DegradationLog

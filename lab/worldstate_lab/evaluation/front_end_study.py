@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.ground.typing import FloatArray, IndexArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate_lab.metrics.bearing_gating import gated_median_deg
 from worldstate_lab.metrics.intervals import Interval, middle, pooled_draws, stratified_draws

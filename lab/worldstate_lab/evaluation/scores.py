@@ -9,8 +9,7 @@ from worldstate.abduction.cueing.calibration_error import BINS
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval
-from worldstate.operations.metrics.roc import rank_wins
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rank_wins
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
 from worldstate_lab.evaluation import reduction
 from worldstate_lab.evaluation.figures import FIGURES

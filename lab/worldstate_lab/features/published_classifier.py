@@ -12,8 +12,8 @@ from sklearn import config_context
 from sklearn.svm import SVC
 
 from worldstate.abduction.cueing.risk_map import fit_sigmoid
+from worldstate.abduction.signature.ensemble import mirror_features
 from worldstate.abduction.signature.ensemble_training import checked_labels, standardisation
-from worldstate.abduction.signature.expert import mirror_features
 from worldstate.abduction.signature.published_signature import PAIRS, SignatureModel
 from worldstate.abduction.signature.window_classes import CLASSES, LEFT, RIGHT
 from worldstate.ground.checks import finite_array

@@ -9,8 +9,7 @@ from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
-from worldstate.operations.metrics.approach_table import onset_outcome, rising_edges
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc, onset_outcome, rising_edges
 from worldstate_lab.metrics.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate_lab.trials.classification import SIDE_COLUMNS, posteriors
 from worldstate_lab.trials.trial import LEFT, RIGHT, Decide, Decisions, Trial

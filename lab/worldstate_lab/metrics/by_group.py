@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 
 
 def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 from worldstate_lab.metrics.by_group import auroc_by_group
 from worldstate_lab.metrics.intervals import FOLDS, Interval, middle, pooled_draws
 

@@ -13,14 +13,13 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.abduction.signature.ensemble import explain
+from worldstate.abduction.signature.ensemble import explain, mirror_features
 from worldstate.abduction.signature.ensemble_training import standardisation
-from worldstate.abduction.signature.expert import mirror_features
 from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 from worldstate.operations.training.folds import folds_by_recording
 from worldstate_lab.features.published_classifier import PublishedClassifier
 from worldstate_lab.metrics.intervals import Interval, middle, recording_draws

@@ -4,7 +4,7 @@ import numpy as np
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 
 DESCRIPTORS = ("level", "peak", "width_deg", "prominence", "change")
 MEASURES = (*DESCRIPTORS, "position_deg")

@@ -106,7 +106,7 @@ def heard(energies: np.ndarray) -> Looming | NotUsable:
     for energy in energies:
         running.push(float(energy))
     noise = running.read(float(energies[-10:].min()), SCATTER)
-    return looming(TIMES_S, np.log(energies[-10:]), SCATTER, noise.mean, noise.std)
+    return looming(TIMES_S, np.log(energies[-10:]), SCATTER, *noise)
 
 
 @pytest.mark.parametrize("tta_s", [1.0, 2.0, 3.0])

@@ -50,7 +50,7 @@ def test_too_coarse_a_grid_has_no_nodes() -> None:
 
 def test_the_roof_needs_few_and_its_power_is_that_of_every_beam() -> None:
     assert BEAMS.nodes is not None
-    assert BEAMS.nodes.weights.shape[2] <= 32
+    assert BEAMS.nodes[0].weights.shape[2] <= 32
     spectra = heard(np.random.default_rng(0), [20.0], 3.0)
     direct = np.square(np.abs(np.einsum("kmd,tkm->tkd", RESPONSE.conj(), spectra))).sum(axis=(0, 1))
     ours = BEAMS.quadratic_form(BEAMS.covariance(spectra))

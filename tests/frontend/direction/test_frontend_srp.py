@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.bearing import find_peaks
-from worldstate.frontend.direction.phat import srp_phat
+from worldstate.frontend.direction.bearing import find_peaks, srp_phat
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 
 AZIMUTHS = np.radians(np.arange(-90.0, 91.0))

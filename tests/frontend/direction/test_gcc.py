@@ -8,7 +8,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import ShortTimeFFT
 
 from worldstate.frontend.bounds.cramer_rao import delay_crb_s2
-from worldstate.frontend.direction.phat import all_pairs, gcc_delays
+from worldstate.frontend.direction.gcc_phat import all_pairs, gcc_delays
 from worldstate.ground.errors import InvalidArgumentError
 
 FREQUENCIES = np.arange(300.0, 1800.0, 50.0)

@@ -13,8 +13,8 @@ from sklearn.metrics import roc_auc_score
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.bearing import steered_power
 from worldstate.frontend.direction.music import Subspace, music_spectrum
-from worldstate.frontend.direction.phat import steered_power
 from worldstate.frontend.ego_noise import ego_noise as whitening
 from worldstate.frontend.ego_noise.ego_noise import (
     EgoNoise,

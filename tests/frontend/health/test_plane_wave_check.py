@@ -19,8 +19,7 @@ from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.health.channel_health import ArrayHealth, ChannelFault
-from worldstate.frontend.health.geometry_check import best_card, runs, untilted
-from worldstate.frontend.health.plane_waves import sharpness_gains
+from worldstate.frontend.health.geometry_check import best_card, runs, sharpness_gains, untilted
 from worldstate.frontend.stream import FrontEnd
 from worldstate.operations.recordings.channel_report import HealthLog
 from worldstate.simulation import draw_settings, simulate_recording, site

@@ -128,7 +128,7 @@ def open_given(
     from dataclasses import replace
 
     from worldstate.adapters.files.context_file import read_context
-    from worldstate.operations.labelling.street_file import read_street
+    from worldstate.operations.labelling.street_passes import read_street
     from worldstate.smoothing.learned_street import context_of
 
     arguments = given.arguments

@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.state_log import read_log, states_writer
-    from worldstate.operations.recordings.warning import WarningMeter
+    from worldstate.operations.recordings.recording_report import WarningMeter
 
     output.check_outputs(arguments, "out")
     crossing_m = ground.in_range("--crossing", arguments.crossing, 1.0, 100.0)

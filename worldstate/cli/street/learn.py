@@ -55,8 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.operations.labelling.street_file import write_street
-    from worldstate.operations.labelling.street_passes import streets_after
+    from worldstate.operations.labelling.street_passes import streets_after, write_street
 
     _check(arguments)
     before = street = _known(arguments)
@@ -92,7 +91,7 @@ def _check(arguments: argparse.Namespace) -> None:
 def _known(arguments: argparse.Namespace) -> "LearnedStreet":
     from dataclasses import replace
 
-    from worldstate.operations.labelling.street_file import read_street
+    from worldstate.operations.labelling.street_passes import read_street
     from worldstate.smoothing.learned_street import DAY_S, LearnedStreet, forgotten
 
     street = LearnedStreet() if arguments.known is None else read_street(arguments.known)

@@ -17,10 +17,11 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.source import Source
-from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import InvalidArgumentError, wrap_angle
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import vertex
 from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
 from worldstate.operations.recordings.bearing_track import track_bearings
 from worldstate.operations.recordings.hop_table import HopTable
@@ -28,6 +29,10 @@ from worldstate.operations.recordings.hop_table import HopTable
 # What is looked for: clocks that were started by hand, brackets that were put on by eye.
 LARGEST_OFFSET_S, LARGEST_YAW_DEG = 1.0, 15.0
 _OFFSET_STEP_S, _YAW_STEP_DEG = 0.01, 0.25
+_OFFSETS_S, _YAWS_DEG = (
+    step * np.arange(-round(largest / step), round(largest / step) + 1)
+    for largest, step in ((LARGEST_OFFSET_S, _OFFSET_STEP_S), (LARGEST_YAW_DEG, _YAW_STEP_DEG))
+)
 # Error of a bearing of a vehicle in view: the published median of 3.4 degrees, and what a box adds.
 _STD_RAD = np.radians(4.0)
 # Share of bearings that are of something else: at busy junctions every second one.
@@ -135,7 +140,8 @@ def align(passes: Sequence[HeardPass]) -> Alignment:
     counts = np.stack([np.bincount(draw, minlength=len(passes)) for draw in draws])
     drawn = np.array([_best(np.tensordot(count, support, 1)) for count in counts])
     low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
-    errors = np.concatenate([_errors(one, offset_s, yaw_deg, only_seen=True) for one in passes])
+    seen = (_errors(one, offset_s, yaw_deg)[_weights(one, offset_s) > 0.0] for one in passes)
+    errors = np.concatenate(list(seen))
     own = np.abs(errors) < _own_within()
     return Alignment(
         offset_s=offset_s,
@@ -168,29 +174,17 @@ def _check_inside(offset_s: float, yaw_deg: float) -> None:
         raise InvalidArgumentError(f"passes: expected an alignment {within}, {got}: correct it by hand first")
 
 
-def _grid() -> tuple[FloatArray, FloatArray]:
-    n_offsets, n_yaws = round(LARGEST_OFFSET_S / _OFFSET_STEP_S), round(LARGEST_YAW_DEG / _YAW_STEP_DEG)
-    offsets_s = _OFFSET_STEP_S * np.arange(-n_offsets, n_offsets + 1)
-    yaws_deg = _YAW_STEP_DEG * np.arange(-n_yaws, n_yaws + 1)
-    return offsets_s.astype(np.float64), yaws_deg.astype(np.float64)
-
-
 def _support(one: HeardPass) -> FloatArray:
     """Return L of one pass on the grid, shape (offsets, yaws)."""
-    offsets_s, yaws_deg = _grid()
-    rows = []
-    for offset_s in offsets_s:
-        errors_rad = _errors(one, offset_s, 0.0)[:, None] - np.radians(yaws_deg)
-        rows.append(_weights(one, offset_s) @ _gain(errors_rad))
+    yaws_rad = np.radians(_YAWS_DEG)
+    rows = [_weights(one, at_s) @ _gain(_errors(one, at_s, 0.0)[:, None] - yaws_rad) for at_s in _OFFSETS_S]
     return np.stack(rows)
 
 
-def _errors(one: HeardPass, offset_s: float, yaw_deg: float, *, only_seen: bool = False) -> FloatArray:
-    """Return bearing minus box, radians, where asked for only of those at whose time the box was seen."""
-    seen = _weights(one, offset_s) > 0.0
+def _errors(one: HeardPass, offset_s: float, yaw_deg: float) -> FloatArray:
+    """Return bearing minus box, radians."""
     box_rad = np.interp(one.sound_time_s - offset_s, one.box_time_s, one.box_rad)
-    errors_rad = wrap_angle(one.sound_rad - box_rad - np.radians(yaw_deg))
-    return np.asarray(errors_rad)[seen] if only_seen else np.asarray(errors_rad)
+    return np.asarray(wrap_angle(one.sound_rad - box_rad - np.radians(yaw_deg)))
 
 
 def _weights(one: HeardPass, offset_s: float) -> FloatArray:
@@ -213,15 +207,10 @@ def _own_within() -> float:
 
 def _best(total: FloatArray) -> tuple[float, float]:
     """Return offset and yaw of the largest value, between the points of the grid by parabolas."""
-    offsets_s, yaws_deg = _grid()
     row, column = np.unravel_index(int(total.argmax()), total.shape)
-    return _peak(offsets_s, total[:, column], int(row)), _peak(yaws_deg, total[row], int(column))
+    return _peak(_OFFSETS_S, total[:, column], int(row)), _peak(_YAWS_DEG, total[row], int(column))
 
 
-def _peak(grid: FloatArray, values: FloatArray, at: int) -> float:
-    if not 0 < at < len(grid) - 1:
-        return float(grid[at])
-    before, here, after = values[at - 1 : at + 2]
-    bend = before - 2.0 * here + after
-    shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+def _peak(grid: np.ndarray, values: FloatArray, at: int) -> float:
+    shift = vertex(*values[at - 1 : at + 2].tolist()) if 0 < at < len(grid) - 1 else 0.0
     return float(grid[at] + shift * (grid[1] - grid[0]))

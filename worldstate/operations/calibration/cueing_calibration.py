@@ -1,7 +1,7 @@
 """Thresholds and risk maps from whole recordings: what `worldstate model threshold` does."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -218,7 +218,7 @@ def calibrate_cueing(
         raise InvalidArgumentError("recordings: expected at least one without a hazard")
     approaches = [stream for stream in streams if stream.before_sight().any()]
     budgets, policies = _by_miss_rate(free, approaches, reference_prior, kept, chosen)
-    calm = _statistics(free, reference_prior, 0.0)
+    calm = [statistic_at(stream, reference_prior, 0.0) for stream in free]
     blocks = sum(len(cut(stream, chosen.block_hops)) for stream in calm)
     tau = correlation_time_hops(calm)
     fitted = "isotonic" if isinstance(policies[0].risk_map, IsotonicMap) else "platt"
@@ -243,11 +243,10 @@ def _by_miss_rate(
     settings: CueingSettings,
 ) -> tuple[list[BudgetReport], list[CueingPolicy]]:
     """Return a report and a policy for every miss rate and budget."""
-    budgets: list[BudgetReport] = []
-    policies: list[CueingPolicy] = []
+    budgets, policies = list[BudgetReport](), list[CueingPolicy]()
     for beta in sorted(MISS_RATES):
-        calm, scored = _statistics(free, prior, beta), _statistics(approaches, prior, beta)
-        hazards = [s[stream.before_sight()] for s, stream in zip(scored, approaches, strict=True)]
+        calm = [statistic_at(stream, prior, beta) for stream in free]
+        hazards = [statistic_at(one, prior, beta)[one.before_sight()] for one in approaches]
         nearest = min(kept.policies, key=lambda policy: abs(policy.miss_rate - beta))
         risk = _risk_map(calm, hazards) if hazards else nearest.risk_map
         adaptive = _adaptive(hazards, settings)
@@ -288,10 +287,6 @@ def statistic_at(stream: HopTable, prior: Sequence[float], miss_rate: float) -> 
     return np.asarray(np.exp(-np.logaddexp(0.0, others - hidden)))
 
 
-def _statistics(streams: Sequence[HopTable], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
-    return [statistic_at(stream, prior, beta) for stream in streams]
-
-
 def _counted(calm: Sequence[FloatArray], gamma: float, settings: CueingSettings) -> ApproachTable:
     return ApproachTable([], [sustained_statistic(one, settings.sustain_hops) >= gamma for one in calm])
 
@@ -324,10 +319,8 @@ def _adaptive(hazards: list[FloatArray], settings: CueingSettings) -> AdaptiveBu
     if settings.keep_per_hour is None:
         return None
     peaks = [sustained_statistic(scores, settings.sustain_hops).max() for scores in hazards]
-    reached = float(np.median(peaks)) if peaks else -np.inf
-    if not 0.0 < reached < 1.0:
-        return AdaptiveBudget(settings.keep_per_hour)
-    return AdaptiveBudget(settings.keep_per_hour, highest=reached)
+    budget, reached = AdaptiveBudget(settings.keep_per_hour), float(np.median(peaks)) if peaks else -np.inf
+    return replace(budget, highest=reached) if 0.0 < reached < 1.0 else budget
 
 
 def _warnings(
@@ -336,9 +329,9 @@ def _warnings(
     conformal = settings.method == "conformal"
     if few := caution(blocks, f"pieces of {settings.block_s:g} s"):
         yield few
-    for alpha in settings.alphas:
+    for alpha in settings.alphas if conformal else ():
         need = recordings_needed(alpha, settings.confidence)
-        if conformal and blocks < need:
+        if blocks < need:
             yield (
                 f"alpha {alpha:g}: the guarantee needs {need} pieces of {settings.block_s:g} s "
                 f"({need * settings.block_s / 3600.0:.2g} h), got {blocks}; the threshold lies above all "

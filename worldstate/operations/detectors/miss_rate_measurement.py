@@ -1,6 +1,6 @@
 """Miss rates of a camera's detector, measured by re-detection on degraded frames, and their figure."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -208,7 +208,8 @@ class AbsenceTally:
             return
         families = slice(None) if level == 0 else self._settings.families.index(family)
         there = reference.frames[number]
-        boxes = there.boxes_px[_counted(reference, number, self._settings)]
+        kept, still = kept_and_parked(reference, number, self._settings.keep)
+        boxes = there.boxes_px[kept[~still] if self._settings.moving_only else kept]
         hit = overlaps(boxes, found.boxes_px) >= MIN_OVERLAP
         bins = self._bins(boxes)
         n_bins = len(self.edges_deg) - 1
@@ -216,9 +217,9 @@ class AbsenceTally:
         self._misses[families, :, level] += np.bincount(bins, ~hit.any(axis=1), n_bins)
         false = ~(overlaps(found.boxes_px, there.boxes_px) >= MIN_OVERLAP).any(axis=1)
         false &= ~_inside(found.boxes_px, there.boxes_px)
-        sectors, clutter = self._empty_sectors(there.boxes_px, found.boxes_px[false])
-        self._sectors[families, level] += sectors
-        self._clutter[families, level] += clutter
+        touched = self._empty_sectors(there.boxes_px, found.boxes_px[false])
+        self._sectors[families, level] += len(touched)
+        self._clutter[families, level] += sum(touched)
 
     def counts(self) -> dict[str, FamilyCounts]:
         """Return the counts so far by family."""
@@ -235,22 +236,16 @@ class AbsenceTally:
         found = np.searchsorted(self.edges_deg, off_axis_deg, side="right") - 1
         return np.asarray(np.clip(found, 0, len(self.edges_deg) - 2))
 
-    def _empty_sectors(self, there_px: FloatArray, false_px: FloatArray) -> tuple[int, int]:
-        """Count the sectors without a reference object, and those of them that a false detection touches."""
-        objects, false = _azimuths(self._camera, there_px), _azimuths(self._camera, false_px)
-        right, left = self._camera.view_rad
-        half, sectors, clutter = _HALF_WIDTH_RAD, 0, 0
-        for centre in np.arange(right + half, left - half + 1e-9, _SECTOR_STEP_RAD):
-            sector = Sector(float(centre), half)
-            if not any(sector.touches(azimuth, width) for azimuth, width in objects):
-                sectors += 1
-                clutter += any(sector.touches(azimuth, width) for azimuth, width in false)
-        return sectors, clutter
+    def _empty_sectors(self, there_px: FloatArray, false_px: FloatArray) -> list[bool]:
+        """Return of every sector without a reference object whether a false detection touches it."""
+        half, (right, left) = _HALF_WIDTH_RAD, self._camera.view_rad
+        centres = np.arange(right + half, left - half + 1e-9, _SECTOR_STEP_RAD)
+        sectors = [Sector(float(centre), half) for centre in centres]
+        return [self._touched(one, false_px) for one in sectors if not self._touched(one, there_px)]
 
-
-def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> IntArray:
-    kept, still = kept_and_parked(reference, number, settings.keep)
-    return kept[~still] if settings.moving_only else kept
+    def _touched(self, sector: Sector, boxes_px: FloatArray) -> bool:
+        seen = (self._camera.sighting(box, "", 1.0) for box in boxes_px)
+        return any(sector.touches(one.azimuth_rad, one.width_rad) for one in seen)
 
 
 def _inside(boxes_px: FloatArray, others_px: FloatArray) -> BoolArray:
@@ -260,20 +255,14 @@ def _inside(boxes_px: FloatArray, others_px: FloatArray) -> BoolArray:
     return np.asarray(np.any(np.all(held, axis=2), axis=1))
 
 
-def _azimuths(camera: PinholeCamera, boxes_px: FloatArray) -> Collection[tuple[float, float]]:
-    seen = [camera.sighting(box, "", 1.0) for box in boxes_px]
-    return [(sighting.azimuth_rad, sighting.width_rad) for sighting in seen]
-
-
 def _health(scenes: Sequence[LabelledVideo], rng: np.random.Generator) -> CameraHealth | None:
     """Learn from frames spread over the videos; None where none of them shows anything sharp."""
     frames = []
     for scene in scenes[:_HEALTH_FRAMES]:
         wanted = max(_HEALTH_FRAMES // len(scenes), 1)
         step = max(len(scene.reference) // (wanted + 1), 1)
-        for number, frame in enumerate(scene.video.frames()):
-            if number and number % step == 0 and number // step <= wanted:
-                frames.append(frame)
+        every = enumerate(scene.video.frames())
+        frames += [image for i, image in every if i and i % step == 0 and i // step <= wanted]
     try:
         return learn_health(frames, rng)
     except InvalidArgumentError:

@@ -101,7 +101,6 @@ def _moving_boxes(
 
 
 def _track(boxes: list[AzimuthBox]) -> BoxTrack:
-    columns = [[getattr(box, name) for box in boxes] for name in ("time_s", "left_rad", "right_rad")]
-    time_s, left_rad, right_rad = map(np.array, columns)
-    label = Counter(box.label for box in boxes).most_common(1)[0][0]
-    return BoxTrack(time_s, left_rad, right_rad, np.array([box.height_rad for box in boxes]), label)
+    names = ("time_s", "left_rad", "right_rad", "height_rad")
+    columns = {name: np.array([getattr(box, name) for box in boxes]) for name in names}
+    return BoxTrack(**columns, label=Counter(box.label for box in boxes).most_common(1)[0][0])

@@ -38,16 +38,12 @@ def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
                 "text": [{"name": "arm", "val": one.arm}],
             },
         }
-        for time_s, state, spread in zip(
-            one.track.time_s, one.track.states, one.track.covariance, strict=True
-        ):
-            frame = frames.setdefault(
-                str(round(time_s * FRAME_RATE_HZ)),
-                {"frame_properties": {"timestamp": round(float(time_s), 3)}, "objects": {}},
-            )
-            frame["objects"][str(number)] = {
-                "object_data": _placed(state, spread, bool(time_s >= one.t0.time_s))
-            }
+        track = one.track
+        for time_s, state, spread in zip(track.time_s, track.states, track.covariance, strict=True):
+            empty = {"frame_properties": {"timestamp": round(float(time_s), 3)}, "objects": {}}
+            frame = frames.setdefault(str(round(time_s * FRAME_RATE_HZ)), empty)
+            placed = _placed(state, spread, bool(time_s >= one.t0.time_s))
+            frame["objects"][str(number)] = {"object_data": placed}
     return {
         "openlabel": {
             "metadata": {
@@ -75,6 +71,12 @@ def window_rows(
     Shapes: in_view (n,), of the times, time_s (n,).
     """
     rows: list[tuple[object, ...]] = []
+
+    def add(label: str, number: str, unit: str, end_s: float, *entry: object) -> None:
+        """Add a window; of those without a vehicle the number is a time."""
+        recording = f"{file}:{number}{unit}"
+        rows.append((f"{number}{label}", label, environment, recording, file, round(end_s, 2), *entry))
+
     sure = [one for one in passes if one.t0.std_s <= SUREST_STD_S]
     # One recording a pass: what is split must not share a vehicle.
     for number, one in enumerate(sure):
@@ -85,7 +87,7 @@ def window_rows(
             if label == FRONT and not in_view[np.abs(time_s - end_s) < 0.5].any():
                 continue
             frame, std_s = round(one.t0.time_s * FRAME_RATE_HZ), round(one.t0.std_s, 3)
-            rows.append((*_window(label, environment, file, str(number), "", end_s), frame, std_s))
+            add(label, str(number), "", end_s, frame, std_s)
     entries = np.array([one.t0.time_s for one in passes])
     last = -np.inf
     for end_s in time_s.tolist():
@@ -93,16 +95,9 @@ def window_rows(
         # A vehicle about to be seen may be heard already, even where no pass was made of it.
         busy = in_view[(time_s > end_s - 1.0 - GONE_S) & (time_s <= end_s + CALM_S)].any()
         if end_s - last >= NONE_EVERY_S and end_s <= time_s[-1] - CALM_S and not (coming or busy):
-            rows.append((*_window("none", environment, file, f"{end_s:.0f}", "s", end_s), "", ""))
+            add("none", f"{end_s:.0f}", "s", end_s, "", "")
             last = end_s
     return rows
-
-
-def _window(
-    label: str, environment: str, file: str, number: str, unit: str, end_s: float
-) -> tuple[object, ...]:
-    """Return what all windows have in their row; of those without a vehicle the number is a time."""
-    return f"{number}{label}", label, environment, f"{file}:{number}{unit}", file, round(end_s, 2)
 
 
 def file_below(sound: Path, labels: Path) -> str:

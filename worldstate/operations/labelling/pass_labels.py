@@ -83,12 +83,6 @@ def label_passes(
     return found
 
 
-def start_of(arm: str) -> MotionBelief:
-    """Return what is believed of a vehicle some seconds before it comes into view."""
-    side = 1 if arm == "left" else -1
-    return MotionBelief.around((side * _START_RAD, -side * 0.1, -0.15, math.log(_START_M)), _START_STD)
-
-
 def _edge(tracks: Sequence[BoxTrack], arm: str) -> tuple[float, float]:
     """Return azimuth and deviation of an arm's edge: the median of where its vehicles came out."""
     seen = np.array([one.edge_rad for one in tracks if one.arm == arm])
@@ -104,17 +98,16 @@ def _edge(tracks: Sequence[BoxTrack], arm: str) -> tuple[float, float]:
 
 
 def _smoothed(
-    name: str,
-    one: BoxTrack,
-    edges: dict[str, tuple[float, float]],
-    camera_ahead_m: float,
+    name: str, one: BoxTrack, edges: dict[str, tuple[float, float]], camera_ahead_m: float
 ) -> PassLabel | None:
     observed = _observations(one, camera_ahead_m)
     stamped = {nanoseconds(at * HOP_S): observed[at] for at in sorted(observed)}
-    arm = one.arm or ""
+    arm, side = one.arm or "", 1 if one.arm == "left" else -1
+    # What is believed of a vehicle some seconds before it comes into view.
+    start = MotionBelief.around((side * _START_RAD, -side * 0.1, -0.15, math.log(_START_M)), _START_STD)
     smooth = _graph_track if has_extra("gtsam") else rts_track
-    track = smooth(name, start_of(arm), stamped)
-    t0 = track.first_sight(1 if arm == "left" else -1, *edges[arm])
+    track = smooth(name, start, stamped)
+    t0 = track.first_sight(side, *edges[arm])
     return None if t0 is None else PassLabel(arm, one.label, t0, track, one.edge_rad)
 
 

@@ -1,9 +1,13 @@
 """What the passes of a recording tell of its street, and what was heard of it meanwhile."""
 
+import json
 import logging
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +17,12 @@ from worldstate.abduction.sequence.street_sides import PassSound, arrival_patter
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
+from worldstate.adapters.files.file_io import read_json, refused_as_file, write_text
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import Source, open_source
 from worldstate.ground import NotUsable, OutOfDomainError, seconds
+from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_pass
 
@@ -38,18 +44,14 @@ def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
     """Return what a labelled pass tells of its arm: edge, pace, and the sound before."""
     x, y, vx, vy = (float(np.interp(one.t0.time_s, one.track.time_s, row)) for row in one.track.states.T)
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
+    # A first box may show no edge of this arm.
+    outwards_rad = one.edge_rad if one.arm == "left" else -one.edge_rad
     return StreetPass(
         "left" if one.arm == "left" else "right",
-        seen_edge(one.arm, one.edge_rad),
+        one.edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None,
         pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None,
         sound,
     )
-
-
-def seen_edge(arm: str, edge_rad: float) -> float | None:
-    """Return the azimuth of the edge that a first box shows, None where it shows none of this arm."""
-    outwards_rad = edge_rad if arm == "left" else -edge_rad
-    return edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,3 +128,29 @@ def heard_street(source: Source, model: Model) -> HeardStreet | None:
         return None
     time_s, features, groups = map(np.array, zip(*read, strict=True))
     return HeardStreet(time_s, arrival_pattern(features), somebody_comes(groups), heard_with(model.domain))
+
+
+def write_street(path: str | Path, street: LearnedStreet) -> None:
+    """Write a street to exactly this path, whole or not at all."""
+    write_text(path, json.dumps(encode(street), allow_nan=False) + "\n")
+
+
+def read_street(path: str | Path) -> LearnedStreet:
+    """Read what `write_street` wrote.
+
+    Files of worldstate 0.2 also hold rates of reveal and departure, which brought nothing: a warning says
+    that they are left out.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing, no JSON, or a value is missing or out of range.
+    SchemaVersionError
+        If it is of another major version, or no street.
+    """
+    with refused_as_file(path):
+        told: Any = read_json(path, "a learned street file")
+        street = decode(LearnedStreet, told, "learned street")
+    if any("reveals" in arm for arm in told["arms"]):
+        warnings.warn(f"{path}: its rates of reveal and departure are no longer used", stacklevel=2)
+    return street

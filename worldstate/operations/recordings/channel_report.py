@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -184,23 +184,15 @@ class HealthLog:
         if isinstance(health, NotUsable):
             return
         n_new = health.n_dropouts - (self._latest.n_dropouts if self._latest else 0)
-        self._dropouts.extend(
-            health.dropouts[-n_new:] if n_new and len(self._dropouts) < _LISTED_DROPOUTS else ()
-        )
+        if n_new and len(self._dropouts) < _LISTED_DROPOUTS:
+            self._dropouts.extend(health.dropouts[-n_new:])
         self._latest = health
         for fault in health.faults:
             key = fault.channel, fault.fault
-            before = self._seen.get(key)
+            before = self._seen.get(key) or ChannelVerdict(*key, 0.0, seconds(frame.stamp_ns), fault.value)
             # Shares are hops until the summary divides them.
-            self._seen[key] = ChannelVerdict(
-                channel=fault.channel,
-                fault=fault.fault,
-                share=1.0 + (before.share if before else 0.0),
-                first_s=before.first_s if before else seconds(frame.stamp_ns),
-                value=fault.value,
-                looks_like=fault.looks_like,
-                std=fault.std,
-            )
+            newest: dict[str, Any] = {"value": fault.value, "looks_like": fault.looks_like, "std": fault.std}
+            self._seen[key] = replace(before, share=1.0 + before.share, **newest)
 
     def summary(self) -> RecordingHealth:
         """Return the verdicts so far."""

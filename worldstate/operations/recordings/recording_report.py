@@ -1,8 +1,9 @@
 """Run one recording through the whole chain: how its advisories stood to line-of-sight entry, its health."""
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from worldstate.adapters.files.checkpoint_file import Checkpoint
@@ -10,9 +11,81 @@ from worldstate.adapters.listener import Step, listen_steps
 from worldstate.adapters.source import Source
 from worldstate.adapters.state_log import states_writer
 from worldstate.ground.values import seconds
+from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, onset_outcome
+from worldstate.state import WorldState
 
 from .channel_report import HealthLog, RecordingHealth
-from .warning import WarningMeter, WarningSummary
+
+
+@dataclass(frozen=True, slots=True)
+class WarningSummary:
+    """How the advisory stood to line-of-sight entry in one recording."""
+
+    # Line-of-sight entry, seconds from the start; None where unknown or nothing approaches.
+    t0_s: float | None
+    # First onset not earlier than 5 s before `t0_s`; without a `t0_s` the first onset of all.
+    first_advisory_s: float | None
+    lead_time_s: float | None  # `t0_s - first_advisory_s` where that onset came before line-of-sight entry
+    # Onsets more than 5 s before `t0_s`, every onset of a hazard-free recording; None where neither is known.
+    false_advisories_before: int | None
+    # Onsets at or after `t0_s`: of a vehicle that can be seen, or that has just left the view. None without.
+    advisories_after_t0: int | None
+    advisory_onsets_s: tuple[float, ...]  # All rising edges of the advisory
+    # The entity that the last advisory before `t0_s` spoke of; without a `t0_s`, or where none led, that of
+    # the first advisory counted.
+    hidden_entity_id: str | None
+    visible_entity_id: str | None  # The first moving entity that came into view
+
+
+@dataclass(slots=True)
+class WarningMeter:
+    """Counts states and advisories while they go by, and keeps none of them."""
+
+    t0_s: float | None  # Line-of-sight entry on the clock of the states, seconds
+    hazard_free: bool = False  # Whether the recording is known to hold no vehicle
+    states: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    peak_risk: float = 0.0
+    _onsets: list[tuple[float, str | None]] = field(default_factory=list)
+    _raised: bool = False
+    _hidden_id: str | None = None
+    _visible_id: str | None = None
+
+    def update(self, state: WorldState) -> None:
+        """Take in the next state of the recording."""
+        self.first_ns, self.last_ns = self.first_ns if self.states else state.stamp_ns, state.stamp_ns
+        self.states, self.peak_risk = self.states + 1, max(self.peak_risk, state.risk)
+        raised = [cue for cue in state.cues if cue.advisory]
+        if raised:
+            now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk).entity_id
+            if not self._raised:
+                self._onsets.append((now_s, told))
+            if self.t0_s is not None and now_s < self.t0_s:
+                self._hidden_id = told or self._hidden_id
+        self._raised = bool(raised)
+        if self._visible_id is None:
+            in_view = (one.id for one in state.entities if one.status == "visible" and one.moving)
+            self._visible_id = next(in_view, None)
+
+    def summary(self) -> WarningSummary:
+        """Return the figures of all states so far."""
+        onsets_s = tuple(time_s for time_s, _ in self._onsets)
+        found = None if self.t0_s is None else onset_outcome(onsets_s, self.t0_s)
+        false = found.onsets_earlier if found else len(onsets_s) if self.hazard_free else None
+        after = None if self.t0_s is None else sum(time_s >= self.t0_s for time_s in onsets_s)
+        earliest_s = -math.inf if self.t0_s is None else self.t0_s - LONGEST_LEAD_S
+        first_s, hidden_id = next((one for one in self._onsets if one[0] >= earliest_s), (None, None))
+        return WarningSummary(
+            t0_s=self.t0_s,
+            first_advisory_s=first_s,
+            lead_time_s=(found.lead_s or None) if found else None,
+            false_advisories_before=false,
+            advisories_after_t0=after,
+            advisory_onsets_s=onsets_s,
+            hidden_entity_id=self._hidden_id or hidden_id,
+            visible_entity_id=self._visible_id,
+        )
 
 
 @dataclass(frozen=True, slots=True)

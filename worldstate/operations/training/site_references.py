@@ -33,19 +33,11 @@ def with_site_references(table: FeatureTable) -> FeatureTable:
 
 def simulated_beside(tables: Sequence[FeatureTable]) -> SimulatedWindows:
     """Return simulated windows as the ensemble learns them: those of a table compared with its own."""
-    parts = [with_site_references(table) for table in tables]
-    return SimulatedWindows.joined(
-        [
-            SimulatedWindows(
-                part.features,
-                part.labels,
-                part.environments,
-                np.full(len(part), SIMULATED_WEIGHT),
-                np.full(len(part), OTHER_SIDE),
-            )
-            for part in parts
-        ]
-    )
+    parts = []
+    for part in map(with_site_references, tables):
+        weights, other_side = (np.full(len(part), value) for value in (SIMULATED_WEIGHT, OTHER_SIDE))
+        parts.append(SimulatedWindows(part.features, part.labels, part.environments, weights, other_side))
+    return SimulatedWindows.joined(parts)
 
 
 def asked_while_listening(

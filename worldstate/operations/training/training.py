@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
+from itertools import product
 
 import numpy as np
 
@@ -11,14 +12,13 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPoli
 from worldstate.abduction.cueing.risk_map import fit_platt
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import RECIPES, SimulatedWindows, SiteEnsembleClassifier
-from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
 from worldstate.adapters.files.acoustic_domain import ego_motion_of
 from worldstate.adapters.files.model_file import Model, Provenance
 from worldstate.ground.extras import check_extra
 from worldstate.ground.typing import FloatArray, TextArray
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.approach_table import auroc
 
 from .folds import N_FOLDS, folds_by_recording, junction_folds, out_of_fold
 from .site_references import asked_while_listening, with_site_references
@@ -122,7 +122,9 @@ def train_model(
     rng, inputs = np.random.default_rng(settings.seed), with_site_references(table)
     fit = partial(fit_ensemble, simulated=simulated)
     levels = _out_of_fold_levels(inputs, fit, settings.repeats, rng, on_step)
-    signature = replace(fit(inputs), domain=_domain(table))
+    # The ego's motion is that of the windows that are left in the table.
+    motion, domain = ego_motion_of(np.unique(table.environments).tolist()), table.domain
+    signature = replace(fit(inputs), domain=None if domain is None else replace(domain, ego_motion=motion))
     on_step()
     provenance = Provenance(
         dataset=dataset,
@@ -175,29 +177,13 @@ def _out_of_fold_levels(
     return [[posteriors(junction_folds(inputs))], passes]
 
 
-def _domain(table: FeatureTable) -> ModelDomain | None:
-    """Return the domain of the table, with the ego's motion of the windows that are left in it."""
-    if table.domain is None:
-        return None
-    return replace(table.domain, ego_motion=ego_motion_of(np.unique(table.environments).tolist()))
-
-
 def _policies(
     table: FeatureTable, signature: EnsembleModel, levels: list[list[FloatArray]], settings: TrainingSettings
 ) -> CueingPolicies:
-    policies = []
-    for miss_rate in sorted(MISS_RATES):
-        for alpha in ALPHAS:
-            learned = between([_calibrated(table, one, alpha, miss_rate) for one in levels])
-            policy = CueingPolicy(
-                gamma=learned.gamma,
-                sustain_hops=settings.sustain_hops,
-                alpha=alpha,
-                reference_prior=signature.reference_prior,
-                risk_map=learned.risk_map,
-                miss_rate=miss_rate,
-            )
-            policies.append(policy)
+    hops, prior, policies = settings.sustain_hops, signature.reference_prior, list[CueingPolicy]()
+    for miss_rate, alpha in product(sorted(MISS_RATES), ALPHAS):
+        learned = between([_calibrated(table, one, alpha, miss_rate) for one in levels])
+        policies.append(CueingPolicy(learned.gamma, hops, alpha, prior, learned.risk_map, miss_rate))
     return CueingPolicies(tuple(policies))
 
 

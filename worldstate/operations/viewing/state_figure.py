@@ -195,9 +195,8 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     for row, side in enumerate(_sides(states)):
         on = [any(c.direction == side and c.advisory for c in state.cues) for state in states]
         draw_bars(axes, _times(states), on, row, _SIDE_COLORS[row])
-    looks = {
-        (one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched
-    }  # a look stands in every snapshot until the next one
+    # A look stands in every snapshot until the next one.
+    looks = {(one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched}
     for sensor in sorted({sensor for sensor, _, _ in looks}):
         row = len(names)
         for found, color in ((True, BLUE), (False, "0.75")):
@@ -205,13 +204,11 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
             axes.plot(at_s, [row] * len(at_s), "|", color=color, ms=9 if found else 4)
         names.append(f"{sensor} (blue: found)")
     foreign = [isinstance(state.domain, Foreign) for state in states]
-    if any(foreign):
-        draw_bars(axes, _times(states), foreign, len(names), "0.6", height=0.6)
-        names.append("foreign sound")
     deaf = [any(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]
-    if any(deaf):
-        draw_bars(axes, _times(states), deaf, len(names), "0.3", height=0.6)
-        names.append("could not be heard")
+    for on, color, name in ((foreign, "0.6", "foreign sound"), (deaf, "0.3", "could not be heard")):
+        if any(on):
+            draw_bars(axes, _times(states), on, len(names), color, height=0.6)
+            names.append(name)
     name_rows(axes, names)
 
 
@@ -343,9 +340,8 @@ def _draw_entity(axes: "Axes", entity: Entity) -> None:
         axes.plot(-entity.position_m[1], entity.position_m[0], "s", color=color, ms=9)
     if density >= _TOLD:
         x, y = _at(entity.azimuth_rad, SECTOR_M + 5.0)
-        axes.text(
-            min(max(x, -31.0), 31.0), y, label_of(entity), color=color, fontsize=9, ha="center", va="bottom"
-        )
+        style = {"color": color, "fontsize": 9, "ha": "center", "va": "bottom"}
+        axes.text(min(max(x, -31.0), 31.0), y, label_of(entity), style)
 
 
 def _draw_legend(axes: "Axes") -> None:
