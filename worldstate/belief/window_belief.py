@@ -204,6 +204,15 @@ class WindowBelief:
     past: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
     heard: tuple[SourceEvidence, ...] = ()  # Most recent evidence of each source, sorted by its name
 
+    @property
+    def sides(self) -> SideBelief:
+        """What is believed of the sides now."""
+        return self.now.sides
+
+    def since(self, stamp_ns: int) -> "WindowBelief":
+        """Return the belief without evidence of before a time."""
+        return replace(self, heard=tuple(one for one in self.heard if one.stamp_ns >= stamp_ns))
+
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "WindowBelief":
         """Return the belief after a time step without a window."""
         return replace(self, now=self.now.predict(rates_hz, step_ns))

@@ -42,53 +42,50 @@ def claimed_nats(probability: float) -> float:
     return math.log(known / (1.0 - known))
 
 
-def update_advisories(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
-    """Return the memory after the sustained rule has seen this window's statistic."""
-    before_ns = max((one.stamp_ns for one in memory.rules), default=measurement.stamp_ns)
+def update_advisories(memory: Memory, measurement: Measurement, model: FilterModel) -> None:
+    """Update the sustained rule of a source with this window's statistic."""
+    source, stamp_ns, heard = measurement.source, measurement.stamp_ns, measurement.heard
+    before_ns = max((one.stamp_ns for one in memory.rules.values()), default=stamp_ns)
     domain = measurement.domain
     fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
-    last = memory.rule_of(measurement.source, measurement.stamp_ns)
-    same = last.heard.reason == measurement.heard.reason
-    rule = SourceRule(
-        measurement.source,
-        measurement.stamp_ns,
-        fault=fault,
-        heard=measurement.heard,
-        heard_ns=last.heard_ns if same else measurement.stamp_ns,
-    )
-    if not measurement.heard.usable and memory.instant is not None:
+    last = memory.rules.get(source)
+    since_ns = last.heard_ns if last is not None and last.heard.reason == heard.reason else stamp_ns
+    rule = SourceRule(stamp_ns, fault=fault, heard=heard, heard_ns=since_ns)
+    if not heard.usable and memory.last.instant is not None:
         # What could not be heard neither raises an alarm nor ends one: silence does, after a second.
-        return memory.with_rule(replace(rule, statistic=last.statistic))
-    memory = ruled(memory, rule, measurement.signature, measurement.co_evidence, model)
-    elapsed_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
-    return _adapted(memory, elapsed_s, model.policy)
+        memory.rules[source] = replace(rule, statistic=() if last is None else last.statistic)
+        return
+    update_rule(memory, source, rule, measurement.signature, measurement.co_evidence, model)
+    if model.policy.adaptive is not None:
+        _, visible, none = memory.sides.hypotheses
+        memory.threshold = memory.threshold.advance(
+            model.policy.adaptive,
+            visible=visible,
+            none=none,
+            alarm=_rule_ends_ns(memory, model.policy) is not None,
+            elapsed_s=max(seconds(stamp_ns - before_ns), 0.0),
+        )
 
 
-def ruled(
-    memory: Memory, rule: SourceRule, said: SignatureEvidence, answer: CoEvidence, model: FilterModel
-) -> Memory:
-    """Return the memory after the sustained rule of a source has seen what it says."""
+def update_rule(
+    memory: Memory,
+    source: str,
+    rule: SourceRule,
+    said: SignatureEvidence,
+    answer: CoEvidence,
+    model: FilterModel,
+) -> None:
+    """Update the sustained rule of a source with what it says."""
     # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
     log_prior = np.log(model.policy.reference_prior)
     posterior = posterior_of(log_prior, said, answer)
     heard = posterior if isinstance(answer, Unqueried) else posterior_of(log_prior, said, NO_LOOK)
     ratio = posterior.log_lambda
     statistic, bounded = min(posterior.hidden_total, 1.0), ratio if math.isfinite(ratio) else None
-    instant = Instant(statistic, bounded, heard.log_lambda)
-    kept = (*memory.rule_of(rule.source).statistic, instant.statistic)[-model.policy.sustain_hops :]
-    return replace(memory.with_rule(replace(rule, statistic=kept)), instant=instant)
-
-
-def _adapted(memory: Memory, elapsed_s: float, policy: CueingPolicy) -> Memory:
-    """Return the memory with its adaptive threshold after this window."""
-    if policy.adaptive is None:
-        return memory
-    _, visible, none = memory.sides.hypotheses
-    alarm = _rule_ends_ns(memory, policy) is not None
-    threshold = memory.threshold.advance(
-        policy.adaptive, visible=visible, none=none, alarm=alarm, elapsed_s=elapsed_s
-    )
-    return replace(memory, threshold=threshold)
+    memory.last.instant = Instant(statistic, bounded, heard.log_lambda)
+    last = memory.rules.get(source)
+    every = (statistic,) if last is None else (*last.statistic, statistic)
+    memory.rules[source] = replace(rule, statistic=every[-model.policy.sustain_hops :])
 
 
 def advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
@@ -108,7 +105,7 @@ def standing(raised: tuple[SideAdvisory | None, ...], sides: SideBelief) -> tupl
 
 def raised_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
     """Return the advisory of each side at any risk: that by messages where what is heard raises none."""
-    ends_ns = (_rule_ends_ns(memory, model.policy, k) for k in range(len(memory.births)))
+    ends_ns = (_rule_ends_ns(memory, model.policy, k) for k in range(len(memory.history)))
     told = (None if end_ns is None else SideAdvisory(end_ns, announced=True) for end_ns in ends_ns)
     pairs = zip(_heard_advisories(memory, model), told, strict=True)
     return tuple(min(filter(None, pair), key=attrgetter("held"), default=None) for pair in pairs)
@@ -120,7 +117,7 @@ def _heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory 
     None before the first sequence: the first second of single windows was counted in no budget.
     """
     sequence, hidden = memory.sequence, memory.sides.hidden
-    if memory.no_sequence == TOO_FEW:
+    if memory.last.no_sequence == TOO_FEW:
         return (None,) * len(hidden)
     if sequence is not None and sequence.alarm is not None:
         ends_ns = sequence.alarm_ends_ns(memory.stamp_ns)
@@ -135,7 +132,7 @@ def _heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory 
 
 def decided_log_odds(memory: Memory, policy: CueingPolicy) -> float:
     """Return the largest sustained statistic of the sources that hear and are not silent, log-odds."""
-    heard = (one for one in memory.rules if not one.announced)
+    heard = (one for one in memory.rules.values() if not one.announced)
     fresh = (one for one in heard if one.stamp_ns + NEWS_HOLDS_NS >= memory.stamp_ns)
     return bounded_log_odds(max((one.sustained(policy.sustain_hops) for one in fresh), default=0.0))
 
@@ -145,7 +142,7 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
     if sides.risks[side] <= _HIGH_RISK:
         return None
     sequence = memory.sequence
-    if memory.no_sequence == TOO_FEW:
+    if memory.last.no_sequence == TOO_FEW:
         return "less than a second of sound: no alarm is raised yet"
     if sequence is None or sequence.alarm is None:
         return f"the statistic has not stayed above its threshold for {model.policy.sustain_hops} hops"
@@ -177,7 +174,7 @@ def _rule_ends_ns(memory: Memory, policy: CueingPolicy, announced: int | None = 
     """
     gamma, hops = policy.gamma_at(memory.threshold.shift_nats), policy.sustain_hops
     # A rule that announces no vehicle hears, which is asked for with None.
-    rules = (one for one in memory.rules if announced in (one.announced or (None,)))
+    rules = (one for one in memory.rules.values() if announced in (one.announced or (None,)))
     alarmed = (one for one in rules if len(one.statistic) >= hops and one.sustained(hops) >= gamma)
     # What cannot be heard is no news.
     news_ns = (one.stamp_ns if one.heard.usable else one.heard_ns for one in alarmed)

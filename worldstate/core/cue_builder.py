@@ -31,14 +31,14 @@ _Times = tuple[dict[str, float] | None, tuple[float, float, float] | None]
 
 def cues_of(memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...]) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
-    if memory.instant is None:
+    if memory.last.instant is None:
         return ()
     sides, raised = published_belief(memory, model), raised_advisories(memory, model)
     told, evidence = standing(raised, sides), _evidence(memory, model, raised)
     # All sides together: what is taken out of arrays once.
     times = _times(memory.sequence, [one is not None for one in told])
     rested_on = tuple(one for one in sensors if one.condition != "silent")
-    build = partial(_cue, memory, memory.instant, model, sides, rested_on)
+    build = partial(_cue, memory, memory.last.instant, model, sides, rested_on)
     return tuple(map(build, range(len(told)), told, times, evidence))
 
 
@@ -63,7 +63,7 @@ def _cue(
     arrival_s = time_to_arrival(closing_hz, motion.inverse_tta_std_hz)
     # Distance and speed of an announced vehicle tell more than the sound.
     interval_s = (track and visible_in(track, model.site)) or interval_s
-    since_ns, entity_id = memory.advised_ns[k], None if track is None else track.id
+    since_ns, entity_id = memory.history[k].advised_ns, None if track is None else track.id
     advisory = held = None
     if told is not None:
         advisory = Advisory(memory.stamp_ns if since_ns is None else since_ns, told.ends_ns, sensors)
@@ -127,7 +127,7 @@ def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
 
     .. math:: t_j = L_j - L_{j-1}
     """
-    kept, instant = memory.sequence, memory.instant
+    kept, instant = memory.sequence, memory.last.instant
     assert instant is not None
     if kept is not None and kept.alarm is not None:
         after, threshold = kept.log_odds(model.context), kept.alarm.threshold_nats
