@@ -109,8 +109,8 @@ class ExplanationBelief:
     def sides(self) -> SideBelief:
         """The belief of the sides, which exclude each other here; whether and when one comes is not told."""
         # A sum of exponentials may exceed one by rounding, which readers of a snapshot refuse.
-        k, sums = self.k, np.split(self.probabilities, [self.k, -1])
-        hidden, visible, none = (min(float(one.sum()), 1.0) for one in sums)
+        k, p = self.k, self.probabilities
+        hidden, visible, none = (min(float(one.sum()), 1.0) for one in (p[:k], p[k:-1], p[-1:]))
         each = tuple(self.probabilities.tolist())
         return SideBelief(each[:k], each[k : 2 * k], each[:k], hidden, (hidden, visible, none))
 

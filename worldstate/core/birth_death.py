@@ -48,12 +48,14 @@ def birth_death(
     )
     # Before births: another one is born on the side that it leaves.
     for one in memory.tracks:
-        _put_on_its_side(one, memory.sides, site)
+        if one.side_shares:
+            _put_on_its_side(one, memory.sides, site)
     for k in _sides_of_births(memory, alarmed, site):
         _give_birth(memory, k, measurement, site)
     if len(_hidden(memory.tracks)) != 1 or memory.sides.hidden_share(None) < HIDDEN:
         for one in memory.tracks:
-            _take_side_for_known(one, memory.sides)
+            if one.of_side is None:
+                one.side_shares, one.existence = (), memory.sides.existence(one.side)
 
 
 def _goes_on(
@@ -118,12 +120,6 @@ def _put_on_its_side(track: Track, sides: SideBelief, site: SiteGeometry) -> Non
     if side != track.side:
         track.side, track.motion = side, site.sides[side].prior()
     track.side_shares, track.existence = shares, sides.existence(None)
-
-
-def _take_side_for_known(track: Track, sides: SideBelief) -> None:
-    if track.of_side is None:
-        track.existence = sides.existence(track.side)
-    track.side_shares = ()
 
 
 def _rearmed(memory: Memory) -> list[bool]:

@@ -44,8 +44,8 @@ from worldstate.belief.track import (
 from worldstate.ground import BoolArray, FloatArray, seconds, wrap_angle
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
-from .advisories import NO_LOOK, claimed_nats, update_rule
 from .birth_death import REOCCLUSION_NS, after_look
+from .cues import NO_LOOK, claimed_nats, update_rule
 from .fixed_lag import LAG_NS
 from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory, SourceRule
 from .sequence_memory import SequenceMemory, alerted
@@ -208,7 +208,7 @@ def _existence(
     first = {i: one.existence for i, one in found.items() if not tracks[i].seen}
     before = np.array([max(one.existence, first.get(i, 0.0)) for i, one in enumerate(tracks)])
     counts = np.array([one.detected or i in first for i, one in enumerate(tracks)])
-    r = before.clip(_ROUNDING, 1.0 - _ROUNDING)
+    r = np.minimum(np.maximum(before, _ROUNDING), 1.0 - _ROUNDING)
     seen = np.array([one.seen for one in tracks])
     in_sight = np.where(seen, 1.0, 1.0 - np.array([one.behind for one in tracks]))
     odds = ratio = _odds(r)
@@ -223,7 +223,7 @@ def _existence(
 
 
 def _odds(probabilities: FloatArray) -> FloatArray:
-    bounded = probabilities.clip(_ROUNDING, 1.0 - _ROUNDING)
+    bounded = np.minimum(np.maximum(probabilities, _ROUNDING), 1.0 - _ROUNDING)
     return np.asarray(bounded / (1.0 - bounded))
 
 

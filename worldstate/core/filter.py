@@ -17,7 +17,7 @@ from worldstate.measurement import Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 
 from .birth_death import published
-from .cue_builder import cues_of
+from .cues import cues_of
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at

@@ -20,7 +20,6 @@ from .site_model import FilterModel
 
 def update_windows(memory: Memory, measurement: Measurement, model: FilterModel) -> None:
     """Update the memory with the signature of a window and its co-evidence."""
-    memory.last.predicted = memory.sides.hypotheses
     if isinstance(memory.belief, WindowBelief) and measurement.heard.usable:
         source, stamp_ns = measurement.source, measurement.stamp_ns
         window_ns, rates_hz = nanoseconds(model.site.settings.window_s), model.context.rates.values_hz
@@ -31,6 +30,8 @@ def update_windows(memory: Memory, measurement: Measurement, model: FilterModel)
         evidence = source, stamp_ns, signature, looked
         memory.belief, prior = memory.belief.update(*evidence, rates_hz, window_ns)
         memory.last.predicted = prior.sides.hypotheses
+    else:
+        memory.last.predicted = memory.sides.hypotheses
 
 
 def masked_by(signature: SignatureEvidence, share: float) -> SignatureEvidence:

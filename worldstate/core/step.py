@@ -11,8 +11,8 @@ from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
 
 from .acoustic_update import acoustic_update
-from .advisories import SideAdvisory, advisories, update_advisories
 from .birth_death import HIDDEN, birth_death, events_between, merge_tracks, past_edges, published, surviving
+from .cues import SideAdvisory, advisories, update_advisories
 from .detection_update import new_looks, update_looks, update_positions
 from .fixed_lag import Timed
 from .memory import CountedLook, Memory
