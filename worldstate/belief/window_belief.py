@@ -18,6 +18,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, posterior_of
 from worldstate.abduction.sequence.ratio_recursion import transitions
+from worldstate.ground import InvalidArgumentError
 from worldstate.ground.serialisation import Keys, Via, written_as
 from worldstate.ground.typing import FloatArray
 
@@ -208,6 +209,13 @@ class WindowBelief:
     def sides(self) -> SideBelief:
         """What is believed of the sides now."""
         return self.now.sides
+
+    def check(self, directions: int) -> None:
+        """Refuse what a file cannot have been written with, for so many approach sides."""
+        states = [len(one.log_probabilities) for one in (self.now, *(past for _, past in self.past))]
+        explanations = [len(one.log_likelihoods) for one in self.heard]
+        if set(states) != {2 * directions + 2} or set(explanations) - {directions + 2} or not self.past:
+            raise InvalidArgumentError(f"memory.belief: expected {directions} sides, and its past")
 
     def since(self, stamp_ns: int) -> "WindowBelief":
         """Return the belief without evidence of before a time."""

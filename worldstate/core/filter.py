@@ -1,6 +1,5 @@
 """The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
-from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -21,7 +20,6 @@ from .cues import cues_of
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
-from .sequence_memory import SequenceMemory
 from .site_model import FilterModel, from_here, published_belief, site_geometry_of
 from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
 from .step import advanced, take_in
@@ -280,23 +278,13 @@ class FilterRecord:
             self._check(memory)
 
     def _check(self, memory: Memory) -> None:
-        k, belief, rules = len(self.context.directions), memory.belief, memory.rules.values()
-        rows: list[tuple[str, Sized, int]] = [("history", memory.history, k)]
-        if isinstance(belief, SequenceMemory):
-            belief.check()
-        else:
-            if not belief.past:
-                raise InvalidArgumentError("memory.belief: expected it with its past")
-            beliefs = (belief.now, *(past for _, past in belief.past))
-            rows += [("belief", one.log_probabilities, 2 * k + 2) for one in beliefs]
-            rows += [("belief.heard", one.log_likelihoods, k + 2) for one in belief.heard]
-        for name, row, length in rows:
-            if len(row) != length:
-                raise InvalidArgumentError(f"memory.{name}: expected {length} numbers, got {len(row)}")
+        k, rules = len(self.context.directions), memory.rules.values()
+        memory.belief.check(k)
         if any(len(one.statistic) > self.policy.sustain_hops for one in rules):
             raise InvalidArgumentError("memory.rules: expected statistics of the policy's rule")
         announced = [side for one in rules for side in one.announced]
-        if max((*announced, *(track.side for track in memory.tracks)), default=0) >= k:
+        named = max((*announced, *(track.side for track in memory.tracks)), default=0)
+        if len(memory.history) != k or named >= k:
             raise InvalidArgumentError("memory: expected known sides")
 
 

@@ -127,18 +127,14 @@ class Memory:
 
     def draft(self) -> "Memory":
         """Return a copy that a step may write into."""
-        return Memory(
-            self.stamp_ns,
-            self.belief,
-            tuple([replace(one) for one in self.history]),
-            tuple([track.copy() for track in self.tracks]),
-            replace(self.counts),
-            replace(self.last),
-            self.threshold,
-            dict(self.rules),
-            dict(self.looks),
-            self.relations,
-            self.ego,
+        return replace(
+            self,
+            history=tuple(map(replace, self.history)),
+            tracks=tuple([track.copy() for track in self.tracks]),
+            counts=replace(self.counts),
+            last=replace(self.last),
+            rules=dict(self.rules),
+            looks=dict(self.looks),
         )
 
     def forget(self) -> None:

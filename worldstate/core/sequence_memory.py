@@ -140,9 +140,9 @@ class SequenceMemory:
     arrivals: tuple[ArrivalRate, ...] = (ArrivalRate(),) * len(SIDES)
     stamp_ns: int = 0
 
-    def check(self) -> None:
-        """Refuse what a file cannot have been written with."""
-        groups, sides = (len(GROUPS),), (len(SIDES), len(STATES))
+    def check(self, directions: int) -> None:
+        """Refuse what a file cannot have been written with, for so many approach sides."""
+        groups, sides = (len(GROUPS),), (directions, len(STATES))
         for name, array, shape in (
             ("share", self.share, groups),
             ("belief", self.states.belief, sides),
