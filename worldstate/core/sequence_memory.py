@@ -403,4 +403,7 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
         over_ns = tuple(
             None if risk < LEAST_RISK else kept.stamp_ns if over else ns for over, ns, risk in sides
         )
-    return replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns)
+    after = replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns)
+    # The belief is the same: what was derived of it, half of the time of a step, is not derived again.
+    vars(after).update(vars(kept) | vars(after))
+    return after
