@@ -130,8 +130,9 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
         ratios = np.vstack([log_ratios[pairs], np.zeros(len(columns))])
         logs = ratios[events, np.arange(len(columns))].sum(axis=1)
         weights = np.exp(logs - logs.max())
+        total = weights.sum()
         for column, given in zip(columns, events.T, strict=True):
-            chances[rows, column] = np.bincount(given, weights, len(rows) + 1)[:-1] / weights.sum()
+            chances[rows, column] = np.bincount(given, weights, len(rows) + 1)[:-1] / total
     return chances
 
 
