@@ -8,13 +8,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.association import (
-    LEAST_EXISTENCE,
-    MOST_EXISTENCE,
-    Association,
-    associated,
-    leaving,
-)
+from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, Association, associated, leaving
 from worldstate.belief.detection import Detection, Scan, camera_scan, fused, position_scan
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import (
@@ -23,13 +17,7 @@ from worldstate.belief.kinematics.cartesian import (
     update_bearing,
     update_position,
 )
-from worldstate.belief.kinematics.motion import (
-    AZIMUTH,
-    LOG_RANGE,
-    RADIAL_RATE,
-    MotionBelief,
-    update,
-)
+from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, RADIAL_RATE, MotionBelief, update
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry, normal_share
 from worldstate.belief.track import (
