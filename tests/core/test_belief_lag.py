@@ -75,7 +75,7 @@ def test_it_keeps_one_window_and_no_more():
     world = WorldFilter(context=STILL)
     for hop in range(200):
         world = world.update(heard(1.0 + hop / 10, signature))
-    assert len(world._memory.windows.past) == 11
+    assert len(world._memory.belief.past) == 11
 
 
 def test_a_loud_second_is_believed_at_once():

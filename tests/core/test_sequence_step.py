@@ -295,7 +295,7 @@ def test_readings_that_do_not_fit_are_refused() -> None:
     with pytest.raises(InvalidArgumentError, match="sequence: expected the directions"):
         one_sided.update(turned)
     damaged = run(WorldFilter(), [heard(1, said)])[0].to_dict()
-    damaged["memory"]["sequence"]["share"] = [2.0] * len(GROUPS)
+    damaged["memory"]["belief"]["share"] = [2.0] * len(GROUPS)
     with pytest.raises(InvalidArgumentError, match=r"sequence\.share"):
         WorldFilter.from_dict(damaged)
 

@@ -122,16 +122,17 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
     alone = gated & (gated.sum(axis=0) == 1) & (gated.sum(axis=1) == 1)[:, None]
     chances[alone] = np.exp(-np.logaddexp(0.0, -log_ratios[alone]))
     for rows, columns in _groups(gated & ~alone):
-        events = _joint_events(len(rows), len(columns))
+        events, pairs = _joint_events(len(rows), len(columns)), np.ix_(rows, columns)
         if events is None:
-            chances[np.ix_(rows, columns)] = propagated(log_ratios[np.ix_(rows, columns)])
+            chances[pairs] = propagated(log_ratios[pairs])
             continue
         # The last row is that of no measurement.
-        ratios = np.vstack([log_ratios[np.ix_(rows, columns)], np.zeros(len(columns))])
+        ratios = np.vstack([log_ratios[pairs], np.zeros(len(columns))])
         logs = ratios[events, np.arange(len(columns))].sum(axis=1)
         weights = np.exp(logs - logs.max())
+        total = weights.sum()
         for column, given in zip(columns, events.T, strict=True):
-            chances[rows, column] = np.bincount(given, weights, len(rows) + 1)[:-1] / weights.sum()
+            chances[rows, column] = np.bincount(given, weights, len(rows) + 1)[:-1] / total
     return chances
 
 

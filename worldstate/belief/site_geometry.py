@@ -86,12 +86,12 @@ class SiteGeometry:
 
     def past_edge(self, azimuth_rad: float, std_rad: float, way: float) -> float:
         """Return the chance that an azimuth lies past the edge on this way, 1 to the left and -1."""
-        edges = (one for one in self.sides if way * one.edge_azimuth_rad > 0.0)
-        past = (
+        past = [
             way * (azimuth_rad - one.edge_azimuth_rad) / math.hypot(std_rad, one.edge_std_rad)
-            for one in edges
-        )
-        return max(map(normal_share, past), default=0.0)
+            for one in self.sides
+            if way * one.edge_azimuth_rad > 0.0
+        ]
+        return normal_share(max(past)) if past else 0.0
 
     def view(self, look: Look) -> Sector:
         """Return where a look has searched."""

@@ -1,7 +1,7 @@
 """The belief of one entity."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, TypeAlias, TypeVar
@@ -45,9 +45,10 @@ NumbersT = TypeVar("NumbersT", float, FloatArray)  # Of one entity, or of each o
 Label: TypeAlias = Annotated[tuple[str, float], Keys("label", "probability")]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+# No slots: a copied dictionary takes a tenth of the time of `dataclasses.replace`, for every entity and step.
+@dataclass(eq=False)
 class Track:
-    """Existence, motion, class and history of one entity."""
+    """Existence, motion, class and history of one entity; a step writes into copies of its own."""
 
     id: str  # UUID for life
     side: Count  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
@@ -70,6 +71,12 @@ class Track:
     width_rad: float = 0.0  # Of its last box
     # P(it is of a side | exists) of one only heard, whose side is not known; empty where it is.
     side_shares: tuple[Probability, ...] = ()
+
+    def copy(self) -> "Track":
+        """Return a copy to write into; beliefs and labels are not copied, they are replaced as a whole."""
+        own = object.__new__(Track)
+        own.__dict__.update(self.__dict__)
+        return own
 
     @property
     def of_side(self) -> int | None:
@@ -133,46 +140,40 @@ def after_sighting(existence: NumbersT, miss_rate: float, clutter_rate: float) -
     return found / (found + (1.0 - existence) * clutter_rate)
 
 
-def predict_tracks(
-    tracks: Sequence[Track], hidden_shares: Sequence[float], step_s: float, site: SiteGeometry
-) -> tuple[Track, ...]:
-    """Return the tracks after a time step without a measurement; shares are P(hidden | exists)."""
-    moved = _driven_on(tracks, step_s, site)
-    polar = [i for i, track in enumerate(moved) if track.place is None]
-    if not polar:
-        return moved
-    relaxed = _relaxed([moved[i] for i in polar], [hidden_shares[i] for i in polar], step_s, site)
-    after = dict(zip(polar, relaxed, strict=True))
-    return tuple(after.get(i, track) for i, track in enumerate(moved))
+def predict_tracks(tracks: Sequence[Track], sides: SideBelief, step_s: float, site: SiteGeometry) -> None:
+    """Move tracks on by a time step without a measurement."""
+    shares = {track.id: hidden_share(track, sides) for track in tracks}
+    _drive_on([track for track in tracks if track.place is not None], step_s, site)
+    # Those that have just lost their place, too.
+    polar = [track for track in tracks if track.place is None]
+    if polar:
+        _relax(polar, [shares[track.id] for track in polar], step_s, site)
 
 
-def turned(track: Track, faster_rad_s: float) -> Track:
-    """Return a track in the axes of an ego vehicle that now turns so much faster to the left."""
-    if not track.seen or track.place is not None:
-        return track
-    mean = track.motion.mean.copy()
-    mean[AZIMUTH_RATE] -= faster_rad_s
-    return replace(track, motion=replace(track.motion, mean=mean))
+def turn(tracks: Sequence[Track], faster_rad_s: float) -> None:
+    """Turn tracks into the axes of an ego vehicle that now turns so much faster to the left."""
+    for track in tracks:
+        if track.seen and track.place is None:
+            mean = track.motion.mean.copy()
+            mean[AZIMUTH_RATE] -= faster_rad_s
+            track.motion = replace(track.motion, mean=mean)
 
 
-def _driven_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> tuple[Track, ...]:
-    """Return the tracks with their places a step later, or without those that are lost."""
-    placed = [(i, one.place, acceleration_psd(one)) for i, one in enumerate(tracks) if one.place]
-    if not placed:
-        return tuple(tracks)
-    stacked = CartesianBelief.stacked([place for _, place, _ in placed])
-    accelerations = np.array([one for _, _, one in placed])
+def _drive_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> None:
+    """Move the places of tracks on by a step, and drop those that are lost."""
+    if not tracks:
+        return
+    stacked = CartesianBelief.stacked([one.place for one in tracks if one.place])
+    accelerations = np.array([acceleration_psd(one) for one in tracks])
     after = predict_place(stacked, step_s, accelerations, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
-    moved = list(tracks)
-    for (i, _, _), place in zip(placed, after.each(), strict=True):
-        track = tracks[i]
-        if place.position_std_m <= _LOST_PLACE_M:
-            # No life time here: a sender that keeps sending is there, a silent one is lost within seconds.
-            moved[i] = replace(track, place=place)
-        else:
-            motion = track.motion if track.seen else site.sides[track.side].prior()
-            moved[i] = replace(track, place=None, behind=1.0, motion=motion)
-    return follow_places(moved, site)
+    for track, place in zip(tracks, after.each(), strict=True):
+        # No life time here: a sender that keeps sending is there, a silent one is lost within seconds.
+        track.place = place
+        if place.position_std_m > _LOST_PLACE_M:
+            track.place, track.behind = None, 1.0
+            if not track.seen:
+                track.motion = site.sides[track.side].prior()
+    follow_places(tracks, site)
 
 
 def acceleration_psd(track: Track) -> float:
@@ -180,10 +181,10 @@ def acceleration_psd(track: Track) -> float:
     return _ACCELERATION if track.moving else _PARKED_ACCELERATION
 
 
-def _relaxed(
-    tracks: list[Track], hidden_shares: list[float], step_s: float, site: SiteGeometry
-) -> Iterator[Track]:
-    """Yield tracks without a place after a step, drawn to what is expected of vehicles in view or hidden."""
+def _relax(
+    tracks: Sequence[Track], hidden_shares: Sequence[float], step_s: float, site: SiteGeometry
+) -> None:
+    """Move tracks without a place by a step, drawn to what is expected of vehicles in view or hidden."""
     seen = np.array([track.seen for track in tracks])
     accelerations = np.where([track.moving for track in tracks], _ACCELERATION, _PARKED_ACCELERATION)
     motion = predict(MotionBelief.stacked([track.motion for track in tracks]), step_s, accelerations)
@@ -194,11 +195,11 @@ def _relaxed(
     of = [-1 if one.seen else one.side for one in tracks]
     towards = MotionBelief(expected.mean[of], expected.covariance[of])
     relaxed = relax(motion, towards, kept, math.exp(-step_s / _RELAXATION_S))
+    lasts = math.exp(-step_s / _VISIBLE_LIFE_S)
     for track, moved in zip(tracks, relaxed.each(), strict=True):
-        existence = track.existence
+        track.motion = moved
         if track.seen:
-            existence *= math.exp(-step_s / _VISIBLE_LIFE_S)
-        yield replace(track, motion=moved, existence=existence)
+            track.existence *= lasts
 
 
 @lru_cache(maxsize=64)
@@ -207,19 +208,16 @@ def _expected(sides: tuple[SideGeometry, ...]) -> MotionBelief:
     return MotionBelief.stacked([*(side.prior() for side in sides), _IN_VIEW])
 
 
-def follow_places(tracks: Sequence[Track], site: SiteGeometry) -> tuple[Track, ...]:
-    """Return the tracks with the polar motion, and the chance to be hidden, that follow from their places."""
-    places = [track.place for track in tracks if track.place is not None]
-    if not places:
-        return tuple(tracks)
-    polar = polar_motion(CartesianBelief.stacked(places), site.ego_speed_mps, site.ego_yaw_rate_rad_s)
-    motions, followed = iter(polar.each()), list(tracks)
-    for i, track in enumerate(tracks):
-        if track.place is not None:
-            motion = next(motions)
-            behind = site.sides[track.side].behind(motion.azimuth_rad, motion.azimuth_std_rad)
-            followed[i] = replace(track, motion=motion, behind=behind)
-    return tuple(followed)
+def follow_places(tracks: Sequence[Track], site: SiteGeometry) -> None:
+    """Give tracks the polar motion, and the chance to be hidden, that follow from their places."""
+    placed = [track for track in tracks if track.place is not None]
+    if not placed:
+        return
+    places = CartesianBelief.stacked([track.place for track in placed if track.place])
+    polar = polar_motion(places, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
+    for track, motion in zip(placed, polar.each(), strict=True):
+        track.motion = motion
+        track.behind = site.sides[track.side].behind(motion.azimuth_rad, motion.azimuth_std_rad)
 
 
 def relabelled(

@@ -18,6 +18,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, posterior_of
 from worldstate.abduction.sequence.ratio_recursion import transitions
+from worldstate.ground import InvalidArgumentError
 from worldstate.ground.serialisation import Keys, Via, written_as
 from worldstate.ground.typing import FloatArray
 
@@ -109,8 +110,8 @@ class ExplanationBelief:
     def sides(self) -> SideBelief:
         """The belief of the sides, which exclude each other here; whether and when one comes is not told."""
         # A sum of exponentials may exceed one by rounding, which readers of a snapshot refuse.
-        k, sums = self.k, np.split(self.probabilities, [self.k, -1])
-        hidden, visible, none = (min(float(one.sum()), 1.0) for one in sums)
+        k, p = self.k, self.probabilities
+        hidden, visible, none = (min(float(one.sum()), 1.0) for one in (p[:k], p[k:-1], p[-1:]))
         each = tuple(self.probabilities.tolist())
         return SideBelief(each[:k], each[k : 2 * k], each[:k], hidden, (hidden, visible, none))
 
@@ -203,6 +204,22 @@ class WindowBelief:
     # Time stamps, ns, in order, and the posterior at each.
     past: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
     heard: tuple[SourceEvidence, ...] = ()  # Most recent evidence of each source, sorted by its name
+
+    @property
+    def sides(self) -> SideBelief:
+        """What is believed of the sides now."""
+        return self.now.sides
+
+    def check(self, directions: int) -> None:
+        """Refuse what a file cannot have been written with, for so many approach sides."""
+        states = [len(one.log_probabilities) for one in (self.now, *(past for _, past in self.past))]
+        explanations = [len(one.log_likelihoods) for one in self.heard]
+        if set(states) != {2 * directions + 2} or set(explanations) - {directions + 2} or not self.past:
+            raise InvalidArgumentError(f"memory.belief: expected {directions} sides, and its past")
+
+    def since(self, stamp_ns: int) -> "WindowBelief":
+        """Return the belief without evidence of before a time."""
+        return replace(self, heard=tuple(one for one in self.heard if one.stamp_ns >= stamp_ns))
 
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "WindowBelief":
         """Return the belief after a time step without a window."""

@@ -1,7 +1,6 @@
 """Update the entities with an acoustic bearing and approach rate, by probabilistic data association."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -30,19 +29,19 @@ _IN_VIEW_PATH, _IN_VIEW_STD = 0.8, 0.12
 _ANYWHERE_RAD2 = math.pi**2 / 12.0
 
 
-def acoustic_update(memory: Memory, measurement: Measurement, weight: float) -> Memory:
-    """Return the memory after the bearing and the approach rate of a measurement.
+def acoustic_update(memory: Memory, measurement: Measurement, weight: float) -> None:
+    """Update the entities with the bearing and the approach rate of a measurement.
 
     R is divided by `weight`: consecutive windows overlap, and full weight for each would count the same
     samples up to ten times.
     """
     # A measured position tells more than a bearing that may be that of a wall.
-    at = [i for i, track in enumerate(memory.tracks) if track.moving and track.place is None]
+    tracks = [track for track in memory.tracks if track.moving and track.place is None]
     bearing, approach = measurement.bearing, measurement.approach
     silent = isinstance(bearing, NotUsable) and isinstance(approach, NotUsable)
-    if weight <= 0.0 or silent or not at:
-        return memory
-    updated, tracks, sides = list(memory.tracks), [memory.tracks[i] for i in at], memory.sides
+    if weight <= 0.0 or silent or not tracks:
+        return
+    sides = memory.sides
     visible = sides.hypotheses[1]
     # P(this entity is the source of this window's sound)
     sounding = [visible * one.existence if one.seen else sides.existence(one.side) for one in tracks]
@@ -58,15 +57,10 @@ def acoustic_update(memory: Memory, measurement: Measurement, weight: float) -> 
     if not isinstance(approach, NotUsable):
         std = approach.std_hz / math.sqrt(weight)
         motion = update(motion, RADIAL_RATE, -approach.inverse_tta_hz, std, np.array(sounding))
-    for i, track, moved, chance in zip(at, tracks, motion.each(), sounding, strict=True):
-        updated[i] = replace(
-            track,
-            motion=moved,
-            updated_ns=measurement.stamp_ns,
-            sources=merged(track.sources, measurement.source),
-            approach_heard=track.approach_heard or (chance > 0.5 and not isinstance(approach, NotUsable)),
-        )
-    return replace(memory, tracks=tuple(updated))
+    for track, moved, chance in zip(tracks, motion.each(), sounding, strict=True):
+        track.motion, track.updated_ns = moved, measurement.stamp_ns
+        track.sources = merged(track.sources, measurement.source)
+        track.approach_heard |= chance > 0.5 and not isinstance(approach, NotUsable)
 
 
 def association_probability(

@@ -1,18 +1,17 @@
 """Births, hand-overs and deaths of entities, those that have become one, and the events of all this."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from operator import attrgetter, itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL, Association
+from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track, born, heard_as
-from worldstate.belief.window_belief import ExplanationBelief
+from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
 from worldstate.ground.values import nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Event
@@ -36,40 +35,39 @@ _AGE = attrgetter("created_ns", "id")
 
 def birth_death(
     memory: Memory, alarmed: Sequence[bool], measurement: Measurement, site: SiteGeometry
-) -> Memory:
-    """Return the memory with hidden entities born, updated and removed.
+) -> None:
+    """Let hidden entities be born, go on or end.
 
     Shapes: alarmed (K,).
     """
-    current = {
-        None if one is None else one.id for one in map(partial(hidden_on, memory.tracks), _sides(site))
-    }
-    updated = (
-        _heard_on(one, alarmed, measurement, memory.sides, site) if one.id in current else one
+    heard = [hidden_on(memory.tracks, k) for k in _sides(site)]
+    memory.tracks = tuple(
+        one
         for one in memory.tracks
+        if one not in heard or _goes_on(one, alarmed, measurement, memory.sides, site)
     )
     # Before births: another one is born on the side that it leaves.
-    tracks = (_on_its_side(one, memory.sides, site) for one in updated if one is not None)
-    memory = replace(memory, tracks=tuple(tracks))
+    for one in memory.tracks:
+        if one.side_shares:
+            _put_on_its_side(one, memory.sides, site)
     for k in _sides_of_births(memory, alarmed, site):
-        memory = _with_birth(memory, k, measurement, site)
-    if len(_hidden(memory.tracks)) == 1 and memory.sides.hidden_share(None) >= HIDDEN:
-        return memory
-    return replace(memory, tracks=tuple(_of_known_side(one, memory.sides) for one in memory.tracks))
+        _give_birth(memory, k, measurement, site)
+    if len(_hidden(memory.tracks)) != 1 or memory.sides.hidden_share(None) < HIDDEN:
+        for one in memory.tracks:
+            if one.of_side is None:
+                one.side_shares, one.existence = (), memory.sides.existence(one.side)
 
 
-def _heard_on(
+def _goes_on(
     track: Track, alarmed: Sequence[bool], measurement: Measurement, sides: SideBelief, site: SiteGeometry
-) -> Track | None:
-    """Return a hidden entity after one more hop; None where it is no longer believed."""
-    track = replace(track, labels=heard_as(track, measurement.kinds))
+) -> bool:
+    """Update a hidden entity by one more hop; tell whether it is still believed."""
+    track.labels = heard_as(track, measurement.kinds)
     if track.place is not None:
-        return track  # It was announced, and is there until its place is lost
-    existence = sides.existence(track.of_side)
+        return True  # It was announced, and is there until its place is lost
+    track.existence = sides.existence(track.of_side)
     named = any(alarmed[k] for k in _sides(site) if track.of_side in (k, None))
-    return (
-        replace(track, existence=existence) if existence >= site.settings.death_probability or named else None
-    )
+    return track.existence >= site.settings.death_probability or named
 
 
 def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> list[int]:
@@ -90,50 +88,43 @@ def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry
     ]
 
 
-def _with_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> Memory:
-    """Return the memory with one more hidden entity on a side, of unknown side where it is the only one."""
-    kept, counts, sides = list(memory.tracks), list(memory.births), memory.sides
-    # After a hand-over it is another one, of the other side.
-    first = sides.both is not None and not _hidden(kept) and all(_rearmed(memory))
-    shares = sides.side_shares(site.settings.death_probability) if first else ()
-    # What came into view from here before was another vehicle: the new one starts without its mass.
-    forget = partial(ExplanationBelief.forget_origin, direction=k)
-    memory = replace(memory, windows=memory.windows and memory.windows.map(forget))
-    one = _returning(kept, k, measurement.stamp_ns, site)
+def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> None:
+    """Add one more hidden entity on a side, of unknown side where it is the only one."""
+    sides, shares = memory.sides, tuple[float, ...]()
+    one = _returning(memory.tracks, k, measurement.stamp_ns, site)
     if one is None:
-        one = born(site.sides[k].label, counts[k], 0.0, measurement.stamp_ns, site)
+        # After a hand-over it is another one, of the other side.
+        if sides.both is not None and not _hidden(memory.tracks) and all(_rearmed(memory)):
+            shares = sides.side_shares(site.settings.death_probability)
+        one = born(site.sides[k].label, memory.history[k].births, 0.0, measurement.stamp_ns, site)
+        memory.history[k].births += 1
         # A detector adds to the kinds at the hand-over.
-        one = replace(one, labels=measurement.kinds or one.labels, sources=(measurement.source,))
-        counts[k] += 1
-    else:
-        kept.remove(one)
-        shares = ()
-    stamp_ns, motion = measurement.stamp_ns, site.sides[k].prior()
-    one = replace(one, side=k, seen=False, came_from=1.0, existence=min(sides.hidden[k], 1.0))
-    one = replace(one, motion=motion, updated_ns=stamp_ns, place=None, behind=1.0, side_shares=shares)
-    kept.append(_on_its_side(one, sides, site))
-    return replace(memory, tracks=tuple(kept), births=tuple(counts))
+        one.labels, one.sources = measurement.kinds or one.labels, (measurement.source,)
+    # What came into view from here before was another vehicle: the new one starts without its mass.
+    if isinstance(memory.belief, WindowBelief):
+        memory.belief = memory.belief.map(partial(ExplanationBelief.forget_origin, direction=k))
+    one.side, one.seen, one.came_from, one.existence = k, False, 1.0, min(sides.hidden[k], 1.0)
+    one.motion, one.updated_ns = site.sides[k].prior(), measurement.stamp_ns
+    one.place, one.behind, one.side_shares = None, 1.0, shares
+    _put_on_its_side(one, sides, site)
+    memory.tracks = (*(other for other in memory.tracks if other is not one), one)
 
 
-def _on_its_side(track: Track, sides: SideBelief, site: SiteGeometry) -> Track:
-    """Return an entity of unknown side on its likelier one."""
+def _put_on_its_side(track: Track, sides: SideBelief, site: SiteGeometry) -> None:
+    """Put an entity of unknown side on its likelier one."""
     if track.of_side is not None:
-        return _of_known_side(track, sides)
+        track.side_shares = ()
+        return
     shares = sides.side_shares(site.settings.death_probability)
     side = shares.index(max(shares))
-    motion = track.motion if side == track.side else site.sides[side].prior()
-    return replace(track, side=side, side_shares=shares, motion=motion, existence=sides.existence(None))
-
-
-def _of_known_side(track: Track, sides: SideBelief) -> Track:
-    if not track.side_shares:
-        return track
-    existence = track.existence if track.of_side is not None else sides.existence(track.side)
-    return replace(track, side_shares=(), existence=existence)
+    if side != track.side:
+        track.side, track.motion = side, site.sides[side].prior()
+    track.side_shares, track.existence = shares, sides.existence(None)
 
 
 def _rearmed(memory: Memory) -> list[bool]:
-    return [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in memory.handover_ns]
+    stamps_ns = (one.handover_ns for one in memory.history)
+    return [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in stamps_ns]
 
 
 def _sides(site: SiteGeometry) -> range:
@@ -144,19 +135,19 @@ def _hidden(tracks: Iterable[Track]) -> list[Track]:
     return [one for one in tracks if not one.seen and one.behind >= HIDDEN]
 
 
-def merged_tracks(memory: Memory, site: SiteGeometry) -> tuple[tuple[Track, ...], dict[str, str]]:
-    """Return the tracks with those that have become one as one, and by the ids that end those that go on.
+def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
+    """Merge tracks that have become one; return by the ids that end those that go on.
 
     Of two at one place, of the same class, one has just been found and the other not for a second. They go
     on where the first is, under the id that was known earlier; so do the halves of one of unknown side.
     """
-    left, stamp_ns, into = list(memory.tracks), memory.stamp_ns, dict[str, str]()
-    tracks = memory.tracks
+    tracks, stamp_ns, into = memory.tracks, memory.stamp_ns, dict[str, str]()
+    ended = list[Track]()
     if _are_halves(_hidden(tracks), memory.sides, site):
         first, second = sorted(_hidden(tracks), key=_AGE)
-        shares = memory.sides.side_shares(site.settings.death_probability)
-        left.remove(second)
-        left[left.index(first)] = _on_its_side(replace(first, side_shares=shares), memory.sides, site)
+        first.side_shares = memory.sides.side_shares(site.settings.death_probability)
+        _put_on_its_side(first, memory.sides, site)
+        ended.append(second)
         into[second.id] = first.id
     found = [one for one in tracks if one.seen and one.last_seen_ns == stamp_ns]
     lost = [one for one in tracks if one.seen and stamp_ns - (one.last_seen_ns or 0) >= _ALONE_NS]
@@ -164,14 +155,12 @@ def merged_tracks(memory: Memory, site: SiteGeometry) -> tuple[tuple[Track, ...]
         same = next((one for one in found if _at_one_place(one, other)), None)
         if same is not None:
             first, second = sorted((same, other), key=_AGE)
-            known = max(same.existence, other.existence)
-            one = replace(
-                same, id=first.id, created_ns=first.created_ns, came_from=first.came_from, existence=known
-            )
-            left.remove(other)
-            left[left.index(same)] = found[found.index(same)] = one
             into[second.id] = first.id
-    return tuple(left), into
+            same.existence = max(same.existence, other.existence)
+            same.id, same.created_ns, same.came_from = first.id, first.created_ns, first.came_from
+            ended.append(other)
+    memory.tracks = tuple(one for one in tracks if one not in ended)
+    return into
 
 
 def _are_halves(hidden: list[Track], sides: SideBelief, site: SiteGeometry) -> bool:
@@ -211,7 +200,7 @@ def hidden_on(tracks: Iterable[Track], k: int) -> Track | None:
     return max(there, key=lambda one: (one.side == k, one.existence), default=None)
 
 
-def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -> Track | None:
+def _returning(tracks: Iterable[Track], k: int, stamp_ns: int, site: SiteGeometry) -> Track | None:
     """Return the moving entity last seen near this side's edge within the reocclusion time, if any."""
     side = site.sides[k]
     candidates = [
@@ -254,53 +243,51 @@ def _became(before: Track, after: Track | None) -> EventKind | None:
 
 
 def after_look(
-    memory: Memory, tracks: Sequence[Track], whose: Association, stamp_ns: int, site: SiteGeometry
-) -> Memory:
-    """Return the memory with the tracks after a look: those of before in their order, then the new ones."""
-    before = memory.tracks
-    emerged = (i for i in whose.found if tracks[i].seen and not before[i].seen)
+    memory: Memory, emerged: Mapping[int, float], fresh: Iterable[Track], stamp_ns: int, site: SiteGeometry
+) -> None:
+    """Update the memory after a look that has found new tracks, and some that were not seen before.
+
+    `emerged` is the chance that a detection was theirs, by their places in the memory.
+    """
     # Of the side where it is: what was heard may have been believed on the other one.
-    handed_over = {tracks[i].side: max(HANDOVER_RESIDUAL, 1.0 - whose.chances[i]) for i in emerged}
+    handed_over = {
+        memory.tracks[i].side: max(HANDOVER_RESIDUAL, 1.0 - chance) for i, chance in emerged.items()
+    }
     # First seen near an edge, it came past it unheard.
     unheard = {
         track.side
-        for track in tracks[len(before) :]
+        for track in fresh
         if track.seen and track.moving
         if site.sides[track.side].distance_rad(track.motion.azimuth_rad, track.width_rad)
         <= 2.0 * EDGE_STD_RAD
     }
-    memory = replace(memory, tracks=surviving(tracks, site.settings))
-    return past_edges(memory, handed_over, unheard, stamp_ns)
+    memory.tracks = surviving(memory.tracks, site.settings)
+    past_edges(memory, handed_over, unheard, stamp_ns)
 
 
 def past_edges(
     memory: Memory, handed_over: Mapping[int, float], unheard: Collection[int], stamp_ns: int
-) -> Memory:
-    """Return the memory after vehicles came past the edges of some sides: the one place that tells of it.
+) -> None:
+    """Update the memory after vehicles came past the edges of some sides: the one place that tells of it.
 
     `handed_over` is P(it was another vehicle than the one believed hidden there), by side; `unheard` are
     sides from which one came that was not believed.
     """
     if not handed_over and not unheard:
-        return memory
-    windows, sequence = memory.windows, memory.sequence
-    for side, residual in handed_over.items():
-        emerge = partial(ExplanationBelief.emerge, direction=side, residual=residual)
-        windows = windows and windows.map(emerge)
-    if sequence is not None:
+        return
+    if isinstance(memory.belief, WindowBelief):
+        for side, residual in handed_over.items():
+            emerge = partial(ExplanationBelief.emerge, direction=side, residual=residual)
+            memory.belief = memory.belief.map(emerge)
+    else:
         hidden = [one for one in memory.tracks if not one.seen]
         # One that is still believed hidden where another came from was not what came.
         left = {k: float(any(one.side == k for one in hidden)) for k in unheard}
         # Vehicles of another side that were told apart before: by a message, or since they were seen.
         apart = {one.side for one in hidden if one.detected or one.last_seen_ns is not None}
-        sequence = sequence.handed_over(left | dict(handed_over), apart, stamp_ns)
-    before = enumerate(memory.handover_ns)
-    return replace(
-        memory,
-        windows=windows,
-        handover_ns=tuple(stamp_ns if k in handed_over else before_ns for k, before_ns in before),
-        sequence=sequence,
-    )
+        memory.belief = memory.belief.handed_over(left | dict(handed_over), apart, stamp_ns)
+    for side in handed_over:
+        memory.history[side].handover_ns = stamp_ns
 
 
 def surviving(tracks: Sequence[Track], settings: FilterSettings) -> tuple[Track, ...]:

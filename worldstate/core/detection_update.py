@@ -3,19 +3,12 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.association import (
-    LEAST_EXISTENCE,
-    MOST_EXISTENCE,
-    Association,
-    associated,
-    leaving,
-)
+from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, Association, associated, leaving
 from worldstate.belief.detection import Detection, Scan, camera_scan, fused, position_scan
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import (
@@ -24,13 +17,7 @@ from worldstate.belief.kinematics.cartesian import (
     update_bearing,
     update_position,
 )
-from worldstate.belief.kinematics.motion import (
-    AZIMUTH,
-    LOG_RANGE,
-    RADIAL_RATE,
-    MotionBelief,
-    update,
-)
+from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, RADIAL_RATE, MotionBelief, update
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry, normal_share
 from worldstate.belief.track import (
@@ -45,11 +32,11 @@ from worldstate.belief.track import (
 from worldstate.ground import BoolArray, FloatArray, seconds, wrap_angle
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
-from .advisories import NO_LOOK, claimed_nats, ruled
 from .birth_death import REOCCLUSION_NS, after_look
+from .cues import NO_LOOK, claimed_nats, update_rule
 from .fixed_lag import LAG_NS
 from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory, SourceRule
-from .sequence_memory import alerted
+from .sequence_memory import SequenceMemory, alerted
 from .site_model import FilterModel
 
 # Of (theta_dot rad/s, rho 1/s) at the first box: a car at 50 km/h passing at 15 m has .9 rad/s, two
@@ -62,8 +49,8 @@ _Found = Mapping[int, Detection]  # By the index of the track
 
 def new_looks(
     memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings
-) -> tuple[Memory, Measurement, list[tuple[CameraLook, float]]]:
-    r"""Return the memory that knows of the looks of a measurement, it, and the new ones, weighed.
+) -> tuple[Measurement, list[tuple[CameraLook, float]]]:
+    r"""Note the looks of a measurement; return it, and the new ones, weighed.
 
     .. math:: \kappa = \min(dt / T, 1), \quad T = look interval
 
@@ -73,118 +60,114 @@ def new_looks(
     """
     new = []
     for one in measurement.looks:
-        look, last = one.look, memory.last_look(one.look.sensor)
+        look, last = one.look, memory.looks.get(one.look.sensor)
         # One stray stamp must not hide the looks after it, nor an image of long ago be new for ever.
         in_time = -FORGOTTEN_NS < look.stamp_ns - measurement.stamp_ns <= LAG_NS
         if in_time and (last is None or look.stamp_ns > last.stamp_ns):
             since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
             new.append((one, min(max(since_s, 0.0) / settings.look_interval_s, 1.0)))
-            counted = CountedLook(
-                look.sensor, look.stamp_ns, measurement.source, look.answer, look.sector_rad
+            memory.looks[look.sensor] = CountedLook(
+                look.stamp_ns, measurement.source, look.answer, look.sector_rad
             )
-            memory = memory.with_look(counted)
         elif not in_time or (last is not None and last.source != measurement.source):
             when = "was counted before" if in_time else "is of another time"
             said = Unqueried(f"this look of {look.sensor} {when}")
             measurement = replace(measurement, co_evidence=said)
-    return memory, measurement, new
+    return measurement, new
 
 
 def update_looks(
     memory: Memory, measurement: Measurement, looks: Sequence[tuple[CameraLook, float]], model: FilterModel
-) -> Memory:
-    """Return the memory after the new looks of a measurement, all cameras at once."""
-    if not looks:
-        return memory
-    scans = [camera_scan(seen, model.site.view(seen.look), weight) for seen, weight in looks]
-    return detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
+) -> None:
+    """Update the memory with the new looks of a measurement, all cameras at once."""
+    if looks:
+        scans = [camera_scan(seen, model.site.view(seen.look), weight) for seen, weight in looks]
+        detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
 
 
-def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> Memory:
-    """Return the memory after the positions of a radar or a radio: entities, and announced hidden ones."""
-    settings, last = model.site.settings, memory.last_look(scan.source)
+def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> None:
+    """Update the memory with the positions of a radar or a radio: entities, and announced hidden ones."""
+    settings, last = model.site.settings, memory.looks.get(scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     weight = min(elapsed_s / settings.look_interval_s, 1.0)
-    memory = detection_update(memory, [position_scan(scan, weight)], None, scan.stamp_ns, model.site)
-    memory = replace(memory.with_look(_scan_look(scan)), seq=memory.seq + 1)
-    if memory.sequence is not None:
-        memory = replace(memory, sequence=alerted(memory.sequence, model.context))
+    detection_update(memory, [position_scan(scan, weight)], None, scan.stamp_ns, model.site)
+    memory.looks[scan.source] = _scan_look(scan)
+    if isinstance(memory.belief, SequenceMemory):
+        memory.belief = alerted(memory.belief, model.context)
     chances = announced(memory.tracks, model.site)
     if not any(chances):
         # An entity that has come into view, or is gone, ends the rule of the source that announced it.
-        return replace(memory, rules=tuple(one for one in memory.rules if one.source != scan.source))
-    if scan.searched is not None:
-        return memory
-    said = SignatureEvidence(model.context.directions, tuple(map(claimed_nats, chances)), 0.0, 0.0)
-    sides = tuple(k for k, chance in enumerate(chances) if chance > 0.5)
-    return ruled(memory, SourceRule(scan.source, scan.stamp_ns, announced=sides), said, NO_LOOK, model)
+        memory.rules.pop(scan.source, None)
+    elif scan.searched is None:
+        said = SignatureEvidence(model.context.directions, tuple(map(claimed_nats, chances)), 0.0, 0.0)
+        sides = tuple(k for k, chance in enumerate(chances) if chance > 0.5)
+        rule = SourceRule(scan.stamp_ns, announced=sides)
+        update_rule(memory, scan.source, rule, said, NO_LOOK, model)
 
 
 def _scan_look(scan: PositionScan) -> CountedLook:
     """Return a scan as a look at its sector, or at none where it is of messages."""
-    source, stamp_ns, searched = scan.source, scan.stamp_ns, scan.searched
+    searched = scan.searched
     if searched is None:
-        return CountedLook(source, stamp_ns, source)
+        return CountedLook(scan.stamp_ns, scan.source)
     miss, half_rad = 1.0 - searched.detection_probability, searched.sector.half_width_rad
     answer = (Present if scan.positions else Absent)(miss, searched.clutter_rate)
     ends_rad = (searched.sector.centre_rad - half_rad, searched.sector.centre_rad + half_rad)
-    return CountedLook(source, stamp_ns, source, answer, ends_rad)
+    return CountedLook(scan.stamp_ns, scan.source, answer, ends_rad)
 
 
 def detection_update(
     memory: Memory, scans: Sequence[Scan], asked: CoEvidence | None, stamp_ns: int, site: SiteGeometry
-) -> Memory:
-    """Return the memory after all looks of an instant, whose order carries no meaning.
+) -> None:
+    """Update the memory with all looks of an instant, whose order carries no meaning.
 
     `asked` is what cameras answer of the sector of a sound; None of positions.
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
-    whose = associated(known, detections, site)
-    memory, fresh = _born(memory, [detections[j] for j in whose.new], scans[0], stamp_ns, site)
-    tracks = (*known, *fresh)
+    whose, unseen = associated(known, detections, site), [not one.seen for one in known]
+    fresh = _born(memory, [detections[j] for j in whose.new], scans[0], stamp_ns, site)
+    memory.tracks = tracks = (*known, *fresh)
     rows = whose.found | dict(enumerate(whose.new, start=len(known)))
     found = {i: detections[j] for i, j in rows.items()}
     if scans[0].sector is None:
         existence = [_told(one, found.get(i), scans[0]) for i, one in enumerate(tracks)]
     else:
         existence = _existence(tracks, found, _hits(tracks, rows, whose, by_look), scans)
-    moved, views, chances = (
-        _moved(tracks, found),
-        _other_views(memory, scans),
-        whose.chances + [1.0] * len(fresh),
-    )
-    after = list[Track]()
+    views, chances = _other_views(memory, scans), whose.chances + [1.0] * len(fresh)
+    _move(tracks, found)
     for i, track in enumerate(tracks):
+        track.existence = existence[i]
         if i in found:
-            changes = moved[i] | _seen_as(track, found[i], chances[i], scans, stamp_ns, site)
+            _see(track, found[i], chances[i], scans, stamp_ns, site)
         else:
-            changes = _unseen(track, scans, asked, views, stamp_ns, site)
-        after.append(replace(track, existence=existence[i], **changes))
+            _miss(track, scans, asked, views, stamp_ns, site)
     if scans[0].sector is None:
-        after = [_announced(one, site) if i in found else one for i, one in enumerate(after)]
-    return after_look(memory, follow_places(after, site), whose, stamp_ns, site)
+        for i in found:
+            _announce(tracks[i], site)
+    follow_places(tracks, site)
+    emerged = {i: chances[i] for i in whose.found if unseen[i] and tracks[i].seen}
+    after_look(memory, emerged, fresh, stamp_ns, site)
 
 
 def _born(
     memory: Memory, new: Sequence[Detection], scan: Scan, stamp_ns: int, site: SiteGeometry
-) -> tuple[Memory, list[Track]]:
+) -> list[Track]:
     """Return new entities before their detections count; hidden where messages say so."""
-    if not new:
-        return memory, []
-    fresh, births, sighted = list[Track](), list(memory.births), memory.sighted
+    fresh = list[Track]()
     for one in new:
         side = site.hiding_side(one.azimuth_rad) if one.found is None else None
         existence = min(one.existence, MOST_EXISTENCE)
         if side is None:
-            track = born("visible", sighted, existence, stamp_ns, site)
-            fresh.append(replace(track, side=site.nearest_side(one.azimuth_rad)))
-            sighted += 1
+            track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
+            track.side = site.nearest_side(one.azimuth_rad)
+            memory.counts.sighted += 1
         else:
-            track = born(site.sides[side].label, births[side], existence, stamp_ns, site)
-            fresh.append(replace(track, side=side, came_from=1.0))
-            births[side] += 1
-    fresh = [replace(one, sources=(scan.source,)) for one in fresh]
-    return replace(memory, births=tuple(births), sighted=sighted), fresh
+            track = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
+            track.side, track.came_from = side, 1.0
+            memory.history[side].births += 1
+        track.sources = (scan.source,)
+        fresh.append(track)
+    return fresh
 
 
 def _hits(
@@ -213,7 +196,7 @@ def _existence(
     first = {i: one.existence for i, one in found.items() if not tracks[i].seen}
     before = np.array([max(one.existence, first.get(i, 0.0)) for i, one in enumerate(tracks)])
     counts = np.array([one.detected or i in first for i, one in enumerate(tracks)])
-    r = before.clip(_ROUNDING, 1.0 - _ROUNDING)
+    r = np.minimum(np.maximum(before, _ROUNDING), 1.0 - _ROUNDING)
     seen = np.array([one.seen for one in tracks])
     in_sight = np.where(seen, 1.0, 1.0 - np.array([one.behind for one in tracks]))
     odds = ratio = _odds(r)
@@ -228,7 +211,7 @@ def _existence(
 
 
 def _odds(probabilities: FloatArray) -> FloatArray:
-    bounded = probabilities.clip(_ROUNDING, 1.0 - _ROUNDING)
+    bounded = np.minimum(np.maximum(probabilities, _ROUNDING), 1.0 - _ROUNDING)
     return np.asarray(bounded / (1.0 - bounded))
 
 
@@ -256,24 +239,24 @@ def _told(track: Track, told: Detection | None, scan: Scan) -> float:
     return min(before * odds / (before * odds + 1.0 - before), MOST_EXISTENCE)
 
 
-def _moved(tracks: Sequence[Track], found: _Found) -> dict[int, dict[str, Any]]:
-    """Return the motion or the place of the found tracks, by their index, after what was measured of them."""
-    moved, usual = dict[int, dict[str, Any]](), list[int]()
+def _move(tracks: Sequence[Track], found: _Found) -> None:
+    """Update the motion or the place of the found tracks with what was measured of them."""
+    usual = list[int]()
     for i, one in found.items():
         track = tracks[i]
         if one.position is not None or track.place is not None:
-            moved[i] = {"place": _placed(track, one)}
+            track.place = _placed(track, one)
         elif track.seen and one.moving == track.moving:
             usual.append(i)
         else:
-            moved[i] = {"motion": _motion_at(one, track.motion)}
+            track.motion = _motion_at(one, track.motion)
     if usual:
         motion = MotionBelief.stacked([tracks[i].motion for i in usual])
         azimuth_rad = np.array([found[i].azimuth_rad for i in usual])
         std_rad = np.array([found[i].std_rad for i in usual])
         after = update(motion, AZIMUTH, azimuth_rad, std_rad, weight=1.0).each()
-        moved |= {i: {"motion": one} for i, one in zip(usual, after, strict=True)}
-    return moved
+        for i, moved in zip(usual, after, strict=True):
+            tracks[i].motion = moved
 
 
 def _placed(track: Track, found: Detection) -> CartesianBelief:
@@ -299,27 +282,26 @@ def _motion_at(box: Detection, before: MotionBelief) -> MotionBelief:
     return MotionBelief.around((mean[0], mean[1], mean[2], mean[3]), (std[0], std[1], std[2], std[3]))
 
 
-def _seen_as(
+def _see(
     track: Track, found: Detection, chance: float, scans: Sequence[Scan], stamp_ns: int, site: SiteGeometry
-) -> dict[str, Any]:
-    """Return what a detection changes of its track; one not in view before takes its side and class there."""
-    classes, changes = found.classes, dict[str, Any](updated_ns=stamp_ns)
-    if classes:
-        changes["labels"] = relabelled(track.labels, classes) if track.seen else classes
+) -> None:
+    """Update a track with its detection; one not in view before takes its side and class there."""
+    track.updated_ns, track.sources = stamp_ns, merged(track.sources, scans[0].source)
+    if found.classes:
+        track.labels = relabelled(track.labels, found.classes) if track.seen else found.classes
     if found.moving is not None:
-        changes["moving"] = found.moving
-    if found.position is None:
-        changes["width_rad"] = found.width_rad
+        track.moving = found.moving
+    if found.width_rad is None:
+        track.approach_heard = True  # By the velocity of its position
     else:
-        changes["approach_heard"] = True
-    changes["sources"] = merged(track.sources, scans[0].source)
+        track.width_rad = found.width_rad
     if found.found is None:
-        return changes
+        return
     if not track.seen:
-        side = site.nearest_side(found.azimuth_rad)
-        changes |= {"seen": True, "side": side, "came_from": track.came_from * chance}
-    miss_rate = _miss_rate(scans, found.azimuth_rad)
-    return changes | {"last_seen_ns": stamp_ns, "answer": "visible", "miss_rate": miss_rate}
+        track.seen, track.side = True, site.nearest_side(found.azimuth_rad)
+        track.came_from *= chance
+    track.last_seen_ns, track.answer = stamp_ns, "visible"
+    track.miss_rate = _miss_rate(scans, found.azimuth_rad)
 
 
 def _miss_rate(scans: Sequence[Scan], azimuth_rad: float) -> float | None:
@@ -328,46 +310,45 @@ def _miss_rate(scans: Sequence[Scan], azimuth_rad: float) -> float | None:
     return math.prod(rates) if rates else None
 
 
-def _announced(track: Track, site: SiteGeometry) -> Track:
-    """Return a track that a message has placed, on the side whose occluder hides it there, if one does."""
+def _announce(track: Track, site: SiteGeometry) -> None:
+    """Put a track that a message has placed on the side whose occluder hides it there, if one does."""
     assert track.place is not None
     x, y = track.place.mean[:2].tolist()
     side = site.hiding_side(math.atan2(y, x))
     unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
-    if side is None or (track.seen and unseen_ns <= REOCCLUSION_NS):
-        return track
-    return replace(track, side=side, seen=False, came_from=1.0)
+    if side is not None and (not track.seen or unseen_ns > REOCCLUSION_NS):
+        track.side, track.seen, track.came_from = side, False, 1.0
 
 
-def _unseen(
+def _miss(
     track: Track,
     scans: Sequence[Scan],
     asked: CoEvidence | None,
     views: Sequence[Sector],
     stamp_ns: int,
     site: SiteGeometry,
-) -> dict[str, Any]:
-    """Return what the looks of an instant, none of which has found a track, change of its last answer."""
-    absent, unasked = {"answer": "absent"}, {"answer": "unqueried", "miss_rate": None}
-    if not track.detected:
+) -> None:
+    """Update the last answer about a track that none of the looks of an instant has found."""
+    if track.detected:
+        miss_rate = _miss_rate(scans, track.motion.azimuth_rad)
+        # Where only other cameras have looked, or a radar elsewhere, the last answer holds.
+        holds = asked is None or any(one.touches(track.motion.azimuth_rad) for one in views)
+        if miss_rate is not None and asked is not None and _has_left(track, miss_rate, stamp_ns, site):
+            miss_rate, holds = None, False
+    else:
         # What is only heard was asked of in the sector of its sound.
-        if isinstance(asked, Absent):
-            return absent | {"miss_rate": asked.miss_rate}
-        return {} if asked is None else unasked
-    miss_rate = _miss_rate(scans, track.motion.azimuth_rad)
+        miss_rate, holds = asked.miss_rate if isinstance(asked, Absent) else None, asked is None
     if miss_rate is not None:
-        left = asked is not None and _has_left(track, miss_rate, stamp_ns, site)
-        return unasked if left else absent | {"miss_rate": miss_rate}
-    # Where only other cameras have looked, or a radar elsewhere, the last answer holds.
-    covered = any(one.touches(track.motion.azimuth_rad) for one in views)
-    return {} if asked is None or covered else unasked
+        track.answer, track.miss_rate = "absent", miss_rate
+    elif not holds:
+        track.answer, track.miss_rate = "unqueried", None
 
 
 def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
     """Return where cameras with a sector of their own looked in the last second."""
     if not any(one.names_sector for one in scans):
         return []
-    recent = (one for one in memory.looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
+    recent = (one for one in memory.looks.values() if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
     asked = (one for one in recent if not isinstance(one.answer, Unqueried))
     return [Sector.between(*one.sector_rad) for one in asked if one.sector_rad is not None]
 

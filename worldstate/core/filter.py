@@ -1,6 +1,5 @@
 """The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
-from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -11,29 +10,22 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.detection import BY_ALL
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
-from worldstate.ground import LEAST_HEARD, InvalidArgumentError, in_range, integer_ns, nanoseconds, seconds
+from worldstate.ground import LEAST_HEARD, InvalidArgumentError, in_range, integer_ns, nanoseconds
 from worldstate.ground.serialisation import Layout, decode, encode
 from worldstate.measurement import Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 
-from .acoustic_update import acoustic_update
-from .advisories import update_advisories
 from .birth_death import published
-from .chronicle import chronicled, update_entities
-from .cue_builder import cues_of
-from .detection_update import new_looks, update_looks, update_positions
+from .cues import cues_of
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import NEWS_HOLDS_NS, Memory, first_memory
-from .prediction import advance, update_odometry
 from .relations import relations_at
-from .side_update import update_sequence, update_windows
-from .site_model import FilterModel, from_here, published_belief, site_geometry_of, without_open_sides
+from .site_model import FilterModel, from_here, published_belief, site_geometry_of
 from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
+from .step import advanced, take_in
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
-# All that two cameras and a radio find at a crowded crossing; a step costs with their square.
-MOST_TRACKS = 128
 # A crowded street shows some forty; at 600 a step took .3 s.
 MOST_BOXES = 64
 
@@ -116,7 +108,7 @@ class WorldFilter:
     @cached_property
     def state(self) -> WorldState:
         """The snapshot S_t."""
-        memory, settings = self._memory, self.settings
+        memory, last, settings = self._memory, self._memory.last, self.settings
         model = from_here(self._model, memory.ego)
         context = model.context
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings)
@@ -125,20 +117,20 @@ class WorldFilter:
         deaf = heard is not None and all(one.share < LEAST_HEARD for one in heard)
         return WorldState(
             stamp_ns=memory.stamp_ns,
-            seq=memory.seq,
+            seq=memory.counts.measurements,
             entities=entities_of(tracks, memory, model.site),
-            relations=relations_at(memory, tracks, memory.relations, context),
-            context=replace(context, priors=Priors(*(memory.predicted or memory.sides.hypotheses))),
+            relations=relations_at(memory, tracks, context),
+            context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
             calibrated=self.policy.alpha > 0.0 and not deaf,
-            bearing=memory.bearing,
-            domain=memory.domain,
-            no_sequence=memory.no_sequence,
-            delivery=replace(self._lag.delivery, tracks_left_out=memory.tracks_left_out),
+            bearing=last.bearing,
+            domain=last.domain,
+            no_sequence=last.no_sequence,
+            delivery=replace(self._lag.delivery, tracks_left_out=memory.counts.left_out),
             valid_until_ns=max((one.stamp_ns + NEWS_HOLDS_NS for one in sensors), default=None),
             sensors=sensors,
             searched=searched_views(memory, context),
-            events=memory.events,
+            events=last.events,
             heard=heard,
             ego=None if memory.ego is None else ego_of(memory.ego),
         )
@@ -169,7 +161,7 @@ class WorldFilter:
         if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
             return self
         # From the last measurement on, so that many small steps are one step to the bit.
-        return replace(self, memory=advance(self._lag.latest, stamp_ns, self._model), lag=self._lag)
+        return replace(self, memory=advanced(self._lag.latest, stamp_ns, self._model), lag=self._lag)
 
     def update(self, measurement: Timed) -> "WorldFilter":
         """Return the filter after a measurement or a scan, at its stamp or, if that has passed, the belief's.
@@ -200,40 +192,19 @@ class WorldFilter:
 
     def _step(self, memory: Memory, measurement: Timed) -> Memory:
         """Return the memory after one more measurement, not earlier than the last one."""
-        before = memory
         if memory is self._lag.latest and measurement.stamp_ns == self.stamp_ns:
-            memory = self._memory  # It was predicted there before
-        # Within the slack the belief is not moved back.
+            draft = self._memory.draft()  # It was predicted there before
         elif measurement.stamp_ns > memory.stamp_ns:
-            memory = advance(memory, measurement.stamp_ns, self._model)
-        carried, model = memory, from_here(self._model, memory.ego)
-        if isinstance(measurement, Odometry):
-            memory = update_odometry(memory, measurement)
-        elif isinstance(measurement, PositionScan):
-            memory = update_positions(memory, measurement, model)
-        else:
-            memory = self._perceived(memory, measurement, model)
-        return chronicled(before, carried, _with_likeliest(memory), model)
-
-    def _perceived(self, memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
-        """Return the memory after a measurement with its signature, its looks and its sequence."""
-        measurement = without_open_sides(measurement, model.context)
-        since_ns = measurement.stamp_ns - memory.rule_of(measurement.source, self.start_ns).stamp_ns
-        memory, measurement, looks = new_looks(memory, measurement, self.start_ns, self.settings)
-        # Evidence first: association and births need the explanations of this very window.
-        memory = update_windows(memory, measurement, model)
-        # Of windows that overlap, what is new counts.
-        weight = min(max(seconds(since_ns), 0.0) / self.settings.window_s, 1.0)
-        memory = acoustic_update(memory, measurement, weight)
-        memory = update_looks(memory, measurement, looks, model)
-        memory = update_advisories(memory, measurement, model)
-        memory = update_sequence(memory, measurement, [seen for seen, _ in looks], model)
-        return update_entities(memory, measurement, model)
+            draft = advanced(memory, measurement.stamp_ns, self._model)
+        else:  # Within the slack the belief is not moved back
+            draft = memory.draft()
+        take_in(memory, draft, measurement, self.start_ns, self._model)
+        return draft
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery
         fresh = first_memory(self.context, measurement.stamp_ns)
-        fresh = replace(fresh, tracks_left_out=self._memory.tracks_left_out)
+        fresh.counts.left_out = self._memory.counts.left_out
         counted = replace(delivery, reanchored=delivery.reanchored + 1)
         world = replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=FixedLag(fresh, (), counted))
         return world.update(measurement)
@@ -307,36 +278,14 @@ class FilterRecord:
             self._check(memory)
 
     def _check(self, memory: Memory) -> None:
-        k, windows = len(self.context.directions), memory.windows
-        rows: list[tuple[str, Sized, int]] = [
-            (name, getattr(memory, name), k) for name in ("births", "handover_ns", "advised_ns")
-        ]
-        if windows is not None:
-            beliefs = (windows.now, *(belief for _, belief in windows.past))
-            rows += [("windows", one.log_probabilities, 2 * k + 2) for one in beliefs]
-            rows += [("windows.heard", one.log_likelihoods, k + 2) for one in windows.heard]
-        for name, row, length in rows:
-            if len(row) != length:
-                raise InvalidArgumentError(f"memory.{name}: expected {length} numbers, got {len(row)}")
-        if memory.sequence is not None:
-            memory.sequence.check()
-        elif windows is None or not windows.past:
-            raise InvalidArgumentError("memory.windows: expected a belief and its past, or a sequence")
-        if any(len(one.statistic) > self.policy.sustain_hops for one in memory.rules):
+        k, rules = len(self.context.directions), memory.rules.values()
+        memory.belief.check(k)
+        if any(len(one.statistic) > self.policy.sustain_hops for one in rules):
             raise InvalidArgumentError("memory.rules: expected statistics of the policy's rule")
-        announced = [side for one in memory.rules for side in one.announced]
-        if max((*announced, *(track.side for track in memory.tracks)), default=0) >= k:
+        announced = [side for one in rules for side in one.announced]
+        named = max((*announced, *(track.side for track in memory.tracks)), default=0)
+        if len(memory.history) != k or named >= k:
             raise InvalidArgumentError("memory: expected known sides")
-
-
-def _with_likeliest(memory: Memory) -> Memory:
-    """Return the memory with the likeliest tracks; boxes and claims do not push out what is only heard."""
-    tracks, left_out = memory.tracks, max(len(memory.tracks) - MOST_TRACKS, 0)
-    if not left_out:
-        return memory
-    order = sorted(range(len(tracks)), key=lambda i: (tracks[i].detected, -tracks[i].existence))
-    kept = tuple(tracks[i] for i in sorted(order[:MOST_TRACKS]))
-    return replace(memory, tracks=kept, tracks_left_out=memory.tracks_left_out + left_out)
 
 
 def _counting_boxes(measurement: Measurement) -> tuple[Measurement, int]:

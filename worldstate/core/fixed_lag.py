@@ -88,7 +88,7 @@ class FixedLag:
             return False  # Of none
         last = self.arrivals[-1]
         # A slow stream goes on at its own pace; the first measurement of all has none.
-        pace_ns = last.measurement.stamp_ns - last.before.stamp_ns if last.before.seq else 0
+        pace_ns = last.measurement.stamp_ns - last.before.stamp_ns if last.before.counts.measurements else 0
         return stamp_ns - max(now_ns, self.latest.stamp_ns) > max(LAG_NS, 2 * pace_ns)
 
     def _taken(self, measurement: Timed, step: Step) -> "FixedLag":

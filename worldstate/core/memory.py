@@ -1,9 +1,7 @@
 """The state that the filter carries from one call to the next."""
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from operator import attrgetter
-from typing import Annotated, TypeAlias
+from typing import TypeAlias
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
@@ -12,7 +10,7 @@ from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Track
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
-from worldstate.ground.serialisation import Count, Keys, Probability
+from worldstate.ground.serialisation import Count, Probability
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing, Heard
 from worldstate.state import Context, Event, Relation
@@ -23,7 +21,7 @@ from .sequence_memory import SequenceMemory
 NEWS_HOLDS_NS = nanoseconds(1.0)
 # Names come and go; without this, a checkpoint holds every one that was ever told.
 FORGOTTEN_NS = nanoseconds(3600.0)
-StampNs: TypeAlias = Annotated[int | None, Keys("stamp_ns")]
+Belief: TypeAlias = WindowBelief | SequenceMemory
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +31,6 @@ class SourceRule:
     What another one measures does not end its alarm.
     """
 
-    source: str
     stamp_ns: int  # Of its last measurement
     # Of as many measurements as the rule asks for, the last one last.
     statistic: tuple[Probability, ...] = ()
@@ -51,11 +48,19 @@ class SourceRule:
 class CountedLook:
     """The last look of a sensor, what it said, and the source whose measurement carried it first."""
 
-    sensor: str
     stamp_ns: int
     source: str
     answer: CoEvidence = field(default=Unqueried("messages search nothing"))
     sector_rad: tuple[float, float] | None = None  # Where it searched; None for the view of the context
+
+
+@dataclass(slots=True)
+class SideHistory:
+    """What happened on one approach side so far."""
+
+    births: Count = 0  # Hidden entities born
+    handover_ns: int | None = None  # Last hand-over
+    advised_ns: int | None = None  # Since when an advisory has been out
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,67 +72,78 @@ class Instant:
     heard_nats: float  # Log-odds of hidden by sound alone
 
 
-# No slots: the belief of the sides is computed once.
-@dataclass(frozen=True, eq=False)
-class Memory:
-    """State of a filter, as checkpoints hold it; everything else in a filter is configuration."""
+@dataclass(slots=True)
+class LastSaid:
+    """What the last measurements said, as a snapshot states it."""
 
-    stamp_ns: int  # Time of the belief
-    # By single windows, until a sequence is read, which then is the only belief.
-    windows: WindowBelief | None
-    births: tuple[Count, ...]  # Hidden entities born so far on each side
-    handover_ns: tuple[StampNs, ...]  # Last hand-over on each side
-    tracks: tuple[Track, ...] = ()  # Entities
-    seq: Count = 0  # Measurements so far
-    sighted: Count = 0  # Entities born in view so far
     # P(hidden), P(visible), P(none) before the last evidence; None before the first.
     predicted: tuple[Probability, Probability, Probability] | None = None
     instant: Instant | None = None  # Of the last window; None before the first
+    bearing: Bearing | None = None
+    domain: DomainVerdict | None = None
+    no_sequence: NotUsable | None = None  # Why it did not say when vehicles come into view
+    events: tuple[Event, ...] = ()
+
+
+@dataclass(slots=True)
+class Counts:
+    """How many there were so far."""
+
+    measurements: Count = 0
+    sighted: Count = 0  # Entities born in view
+    left_out: Count = 0  # Entities beyond the most that are kept
+
+
+@dataclass(slots=True, eq=False)
+class Memory:
+    """State of a filter, as checkpoints hold it; everything else in a filter is configuration.
+
+    A step writes into a draft of its own; what a filter or its buffer holds is not changed.
+    """
+
+    stamp_ns: int  # Time of the belief
+    # By single windows, until a sequence is read, which then is the only belief.
+    belief: Belief
+    history: tuple[SideHistory, ...]
+    tracks: tuple[Track, ...] = ()  # Entities
+    counts: Counts = field(default_factory=Counts)
+    last: LastSaid = field(default_factory=LastSaid)
     # How far the threshold has moved, where the policy lets it.
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
-    rules: tuple[SourceRule, ...] = ()  # One of every source, sorted by its name
-    looks: tuple[CountedLook, ...] = ()  # Last one of every sensor, sorted by its name
-    bearing: Bearing | None = None  # Of the last measurement
-    domain: DomainVerdict | None = None  # Of the last measurement
-    # Vehicles that come into view, and when; None without such a model, and why the last one did not say it.
-    sequence: SequenceMemory | None = None
-    no_sequence: NotUsable | None = None
-    advised_ns: tuple[StampNs, ...] = ()  # Since when an advisory has been out on each side
-    events: tuple[Event, ...] = ()  # Of the last measurement
-    relations: tuple[Relation, ...] = ()  # Then, with the intervals in which they have held
-    tracks_left_out: Count = 0  # So far, each beyond the most that are kept
+    rules: dict[str, SourceRule] = field(default_factory=dict)  # By the source
+    looks: dict[str, CountedLook] = field(default_factory=dict)  # Last one by the sensor
+    relations: tuple[Relation, ...] = ()  # With the intervals in which they have held
     ego: EgoBelief | None = None  # By odometry; None without
 
-    def __post_init__(self) -> None:
-        if not self.advised_ns:
-            object.__setattr__(self, "advised_ns", (None,) * len(self.births))
-
-    def rule_of(self, source: str, start_ns: int = 0) -> SourceRule:
-        """Return what a source said last; of one that has said nothing, nothing since a start."""
-        first = SourceRule(source, start_ns, heard_ns=start_ns)
-        return next((one for one in self.rules if one.source == source), first)
-
-    def with_rule(self, rule: SourceRule) -> "Memory":
-        """Return the memory with what a source said last."""
-        others = (one for one in self.rules if one.source != rule.source)
-        return replace(self, rules=tuple(sorted((*others, rule), key=attrgetter("source"))))
-
-    def last_look(self, sensor: str) -> CountedLook | None:
-        """Return the last look of a sensor; None where it has made none."""
-        return next((one for one in self.looks if one.sensor == sensor), None)
-
-    def with_look(self, look: CountedLook) -> "Memory":
-        """Return the memory with the last look of a sensor."""
-        others = (one for one in self.looks if one.sensor != look.sensor)
-        return replace(self, looks=tuple(sorted((*others, look), key=attrgetter("sensor"))))
-
-    @cached_property
+    @property
     def sides(self) -> SideBelief:
         """What is believed of the sides, by whichever evidence there is; messages not yet taken in."""
-        if self.sequence is not None:
-            return self.sequence.sides
-        assert self.windows is not None
-        return self.windows.now.sides
+        return self.belief.sides
+
+    @property
+    def sequence(self) -> SequenceMemory | None:
+        """The belief by a sequence; None before the first one."""
+        return self.belief if isinstance(self.belief, SequenceMemory) else None
+
+    def draft(self) -> "Memory":
+        """Return a copy that a step may write into."""
+        return replace(
+            self,
+            history=tuple(map(replace, self.history)),
+            tracks=tuple([track.copy() for track in self.tracks]),
+            counts=replace(self.counts),
+            last=replace(self.last),
+            rules=dict(self.rules),
+            looks=dict(self.looks),
+        )
+
+    def forget(self) -> None:
+        """Drop sources and sensors that have been unheard for an hour."""
+        since_ns = self.stamp_ns - FORGOTTEN_NS
+        self.rules = {name: one for name, one in self.rules.items() if one.stamp_ns >= since_ns}
+        self.looks = {name: one for name, one in self.looks.items() if one.stamp_ns >= since_ns}
+        if isinstance(self.belief, WindowBelief):
+            self.belief = self.belief.since(since_ns)
 
 
 def first_memory(context: Context, start_ns: int) -> Memory:
@@ -139,25 +155,5 @@ def first_memory(context: Context, start_ns: int) -> Memory:
         belief = ExplanationBelief.settled(k, context.rates.values_hz)
     else:
         belief = ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)
-    return Memory(
-        stamp_ns=start_ns,
-        windows=WindowBelief(belief, ((start_ns, belief),)),
-        births=(0,) * k,
-        handover_ns=(None,) * k,
-    )
-
-
-def without_forgotten(memory: Memory, stamp_ns: int) -> Memory:
-    """Return the memory without sources and sensors that have then been unheard for an hour."""
-    since_ns = stamp_ns - FORGOTTEN_NS
-    stamps_ns = [one.stamp_ns for one in memory.rules] + [one.stamp_ns for one in memory.looks]
-    if min(stamps_ns, default=since_ns) >= since_ns:  # Nearly always: what else is kept has their names
-        return memory
-    windows = memory.windows
-    return replace(
-        memory,
-        rules=tuple(one for one in memory.rules if one.stamp_ns >= since_ns),
-        looks=tuple(one for one in memory.looks if one.stamp_ns >= since_ns),
-        windows=windows
-        and replace(windows, heard=tuple(one for one in windows.heard if one.stamp_ns >= since_ns)),
-    )
+    history = tuple(SideHistory() for _ in range(k))
+    return Memory(start_ns, WindowBelief(belief, ((start_ns, belief),)), history)

@@ -26,11 +26,9 @@ _BESIDE = 10.0  # Metres ahead that a metre beside the lane counts for
 _LEAST = 0.05  # What is less likely is not named
 
 
-def relations_at(
-    memory: Memory, tracks: Sequence[Track], known: Sequence[Relation], context: Context
-) -> tuple[Relation, ...]:
-    """Return the relations of some tracks, with the interval in which each has held, by those `known`."""
-    before = {(one.src, one.dst, one.kind): one for one in known}
+def relations_at(memory: Memory, tracks: Sequence[Track], context: Context) -> tuple[Relation, ...]:
+    """Return the relations of some tracks, with the interval in which each has held by those in memory."""
+    before = {(one.src, one.dst, one.kind): one for one in memory.relations}
     edges = [one for track in tracks for one in _edges(track, memory, context)]
     placed = [one for one in tracks if one.place and one.place.known]
     if placed:

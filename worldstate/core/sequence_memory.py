@@ -141,9 +141,9 @@ class SequenceMemory:
     arrivals: tuple[ArrivalRate, ...] = (ArrivalRate(),) * len(SIDES)
     stamp_ns: int = 0
 
-    def check(self) -> None:
-        """Refuse what a file cannot have been written with."""
-        groups, sides = (len(GROUPS),), (len(SIDES), len(STATES))
+    def check(self, directions: int) -> None:
+        """Refuse what a file cannot have been written with, for so many approach sides."""
+        groups, sides = (len(GROUPS),), (directions, len(STATES))
         for name, array, shape in (
             ("share", self.share, groups),
             ("belief", self.states.belief, sides),
@@ -410,4 +410,7 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
         over_ns = tuple(
             None if risk < LEAST_RISK else kept.stamp_ns if over else ns for over, ns, risk in sides
         )
-    return replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns)
+    after = replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns)
+    # The belief is the same: what was derived of it, half of the time of a step, is not derived again.
+    vars(after).update(vars(kept) | vars(after))
+    return after

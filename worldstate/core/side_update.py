@@ -8,6 +8,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.belief.window_belief import WindowBelief
 from worldstate.ground import LEAST_HEARD, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement import CameraLook, Heard, Measurement
@@ -17,19 +18,20 @@ from .sequence_memory import informed
 from .site_model import FilterModel
 
 
-def update_windows(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
-    """Return the memory after the signature of a window with its co-evidence."""
-    windows = memory.windows
-    memory = replace(memory, predicted=memory.sides.hypotheses)
-    if windows is not None and measurement.heard.usable:
+def update_windows(memory: Memory, measurement: Measurement, model: FilterModel) -> None:
+    """Update the memory with the signature of a window and its co-evidence."""
+    if isinstance(memory.belief, WindowBelief) and measurement.heard.usable:
         source, stamp_ns = measurement.source, measurement.stamp_ns
         window_ns, rates_hz = nanoseconds(model.site.settings.window_s), model.context.rates.values_hz
         looked = log_co_evidence(measurement.co_evidence, len(model.site.sides))
         said = masked_by(measurement.signature, measurement.heard.share)
-        signature = _with_hand_overs(said, memory.handover_ns, stamp_ns - window_ns)
-        windows, prior = windows.update(source, stamp_ns, signature, looked, rates_hz, window_ns)
-        memory = replace(memory, windows=windows, predicted=prior.sides.hypotheses)
-    return memory
+        handover_ns = [one.handover_ns for one in memory.history]
+        signature = _with_hand_overs(said, handover_ns, stamp_ns - window_ns)
+        evidence = source, stamp_ns, signature, looked
+        memory.belief, prior = memory.belief.update(*evidence, rates_hz, window_ns)
+        memory.last.predicted = prior.sides.hypotheses
+    else:
+        memory.last.predicted = memory.sides.hypotheses
 
 
 # P(a vehicle that comes into view within three seconds adds a decibel or more to 300 Hz to 2 kHz), by how far
@@ -72,7 +74,7 @@ def masked_by(signature: SignatureEvidence, share: float) -> SignatureEvidence:
 
 
 def _with_hand_overs(
-    signature: SignatureEvidence, handover_ns: tuple[int | None, ...], begin_ns: int
+    signature: SignatureEvidence, handover_ns: Iterable[int | None], begin_ns: int
 ) -> SignatureEvidence:
     """Return the evidence, its visible likelihood at least the hidden one for a window after a hand-over."""
     # A window that begins before a hand-over holds sound of the vehicle while it was hidden; without this,
@@ -91,18 +93,10 @@ def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
 
 def update_sequence(
     memory: Memory, measurement: Measurement, looks: Iterable[CameraLook], model: FilterModel
-) -> Memory:
-    """Return the memory after what a sequence model and the cameras say of vehicles that come into view."""
+) -> None:
+    """Update the memory with what a sequence model and the cameras say of vehicles that come into view."""
     said, site = measurement.sequence, model.site
-    if said is None and memory.sequence is None:
-        return memory
     told = [site.in_sight(one) for one in looks if not isinstance(one.look.answer, Unqueried)]
-    refused = said if isinstance(said, NotUsable) else None
-    sequence = informed(memory.sequence, measurement, told, model.context)
-    return replace(
-        memory,
-        sequence=sequence,
-        windows=memory.windows if sequence is None else None,
-        # Other sources do not speak of it: what was said last holds.
-        no_sequence=memory.no_sequence if said is None else refused,
-    )
+    memory.belief = informed(memory.sequence, measurement, told, model.context) or memory.belief
+    if said is not None:  # Other sources do not speak of it: what was said last holds
+        memory.last.no_sequence = said if isinstance(said, NotUsable) else None

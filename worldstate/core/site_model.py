@@ -13,7 +13,7 @@ from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.window_belief import LOG_FLOOR
+from worldstate.belief.window_belief import LOG_FLOOR, WindowBelief
 from worldstate.measurement import Measurement
 from worldstate.state import Context
 from worldstate.state.context import seen_from
@@ -91,7 +91,7 @@ def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
     view, so that the calibrated map g of the policy can only lower it.
     """
     sides = memory.sides
-    if memory.sequence is None:
+    if isinstance(memory.belief, WindowBelief):
         hidden = sides.hypotheses[0]
         risk = min(float(model.policy.risk_map(hidden)), hidden)
         # The floor only matters where P(hidden) has underflowed; then no direction has a share.

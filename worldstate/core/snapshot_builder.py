@@ -24,15 +24,7 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import HIDDEN_BIAS_STD, SiteGeometry
 from worldstate.belief.track import Track, acceleration_psd, hidden_share
 from worldstate.ground import FloatArray, seconds
-from worldstate.state import (
-    Classification,
-    Context,
-    Entity,
-    Hearing,
-    SearchedView,
-    SensorHealth,
-    Visibility,
-)
+from worldstate.state import Classification, Context, Entity, Hearing, SearchedView, SensorHealth, Visibility
 from worldstate.state.entity import AzimuthSource, SideShare
 from worldstate.state.sensor import Ego
 
@@ -245,17 +237,20 @@ def ego_of(ego: EgoBelief) -> Ego:
 
 def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
     """Return how every sensor is that spoke or looked."""
-    spoke = {rule.source: (rule.stamp_ns, rule.fault) for rule in memory.rules}
-    looked = {look.sensor: (look.stamp_ns, _look_fault(look)) for look in memory.looks}
+    spoke = {name: (rule.stamp_ns, rule.fault) for name, rule in memory.rules.items()}
+    looked = {name: (look.stamp_ns, _look_fault(look)) for name, look in memory.looks.items()}
     told = sorted((looked | spoke).items())
     return tuple(_health(name, ns, fault, memory.stamp_ns) for name, (ns, fault) in told)
 
 
 def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
     """Return how well every source that listens could hear; of one that is silent nothing is known."""
-    listening = [one for one in memory.rules if not one.announced]
-    fresh = [one for one in listening if memory.stamp_ns <= one.stamp_ns + NEWS_HOLDS_NS]
-    told = tuple(Hearing(one.source, one.heard.share, one.heard_ns, one.heard.reason) for one in fresh)
+    listening = [(name, one) for name, one in sorted(memory.rules.items()) if not one.announced]
+    told = tuple(
+        Hearing(name, one.heard.share, one.heard_ns, one.heard.reason)
+        for name, one in listening
+        if memory.stamp_ns <= one.stamp_ns + NEWS_HOLDS_NS
+    )
     return told if listening else None
 
 
@@ -277,13 +272,13 @@ def searched_views(memory: Memory, context: Context) -> tuple[SearchedView, ...]
     half_rad = context.view_half_angle_rad
     return tuple(
         SearchedView(
-            look.sensor,
+            sensor,
             look.stamp_ns,
             isinstance(look.answer, Present),
             look.answer.miss_rate,
             look.answer.clutter_rate,
             look.sector_rad or (-half_rad, half_rad),
         )
-        for look in memory.looks
+        for sensor, look in sorted(memory.looks.items())
         if not isinstance(look.answer, Unqueried)
     )

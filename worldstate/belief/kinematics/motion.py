@@ -117,6 +117,8 @@ class GaussianBelief:
 # Range only scales the angular noise of an acceleration, and bearings from a standing ego do not measure it:
 # outside these limits the noise would vanish or throw the bearing.
 NEAREST_M, FARTHEST_M = 3.0, 200.0
+_LOG_NEAREST, _LOG_FARTHEST = math.log(NEAREST_M), math.log(FARTHEST_M)
+_IDENTITY = np.eye(4)
 # Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
 # array.
 _CLOSEST_SHARE = 0.5
@@ -170,7 +172,7 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: _Numbers) -> 
         start[..., RADIAL_RATE] = np.maximum(start[..., RADIAL_RATE], -_CLOSEST_SHARE / step_s)
     # Clipped before exp: approach rates that contradict each other drive log r, which is not measured, so far
     # that exp overflows.
-    range_m = np.exp(np.clip(belief.mean[..., LOG_RANGE], math.log(NEAREST_M), math.log(FARTHEST_M)))
+    range_m = np.exp(np.minimum(np.maximum(belief.mean[..., LOG_RANGE], _LOG_NEAREST), _LOG_FARTHEST))
     flow = jacobian(start, step_s)
     covariance = flow @ belief.covariance @ flow.mT + process_noise(acceleration_psd, range_m, step_s)
     return _belief(propagate(start, step_s), covariance)
@@ -189,8 +191,8 @@ def relax(
     # Constant velocity alone would move a hidden vehicle out of its occlusion without evidence or, at a
     # constant bearing without a measured range, through the array.
     phi = np.empty_like(belief.mean)
-    phi[..., :RADIAL_RATE] = np.expand_dims(bearing_kept, -1)
-    phi[..., RADIAL_RATE:] = np.expand_dims(radial_kept, -1)
+    phi[..., :RADIAL_RATE] = np.asarray(bearing_kept)[..., None]
+    phi[..., RADIAL_RATE:] = np.asarray(radial_kept)[..., None]
     offset = belief.mean - towards.mean
     offset[..., AZIMUTH] = wrap_angle(offset[..., AZIMUTH])
     covariance = _outer(phi) * belief.covariance + (1.0 - phi**2)[..., None] * towards.covariance
@@ -212,17 +214,16 @@ def update(belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weigh
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
     """
-    noise = np.expand_dims(np.square(np.maximum(std, _LEAST_STD)), -1)
+    noise = np.square(np.maximum(std, _LEAST_STD))[..., None]
     residual = value - belief.mean[..., row]
     if row == AZIMUTH:
         residual = wrap_angle(residual)
     gain = belief.covariance[..., row] / (belief.covariance[..., row, row, None] + noise)
     # Joseph's form stays positive definite where P - K H P loses it to rounding: a sharp bearing on a belief
     # that is sharp already.
-    keep = np.eye(4) - gain[..., None] * np.eye(4)[row]
+    keep = _IDENTITY - gain[..., None] * _IDENTITY[row]
     updated = keep @ belief.covariance @ keep.mT + noise[..., None] * _outer(gain)
-    step = gain * np.expand_dims(residual, -1)
-    w = np.expand_dims(weight, -1)
+    step, w = gain * np.asarray(residual)[..., None], np.asarray(weight)[..., None]
     covariance = w[..., None] * updated + (1.0 - w)[..., None] * belief.covariance
     return _belief(belief.mean + w * step, covariance + (w * (1.0 - w))[..., None] * _outer(step))
 
