@@ -115,11 +115,13 @@ class WorldFilter:
         heard = hearings(memory)
         # What could not be heard is no evidence, and no budget was measured without it.
         deaf = heard is not None and all(one.share < LEAST_HEARD for one in heard)
+        # Those of the last step hold until time passes, or odometry moves the place.
+        is_fresh = memory is self._lag.latest and memory.ego is None
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.counts.measurements,
             entities=entities_of(tracks, memory, model.site),
-            relations=relations_at(memory, tracks, context),
+            relations=memory.relations if is_fresh else relations_at(memory, tracks, context),
             context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
             calibrated=self.policy.alpha > 0.0 and not deaf,
