@@ -7,7 +7,7 @@ SHELL := /bin/sh
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo check test slow lint schema docs matrix dist clean
+.PHONY: demo check test slow mutations lint schema docs matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -39,6 +39,11 @@ test: $(VENV)/.test
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --hypothesis-profile=anew
+
+# Whether the core's tests notice an error of sign, factor or order, and a published quantity that stands still.
+mutations: $(VENV)/.test
+	$(BIN)/python tests/core/run_mutations.py
+	$(BIN)/python tests/core/run_mutations.py --freeze
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

@@ -401,7 +401,9 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     left, right = list(kept.log_odds(context).values())[-1].tolist()
     since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
-    rows = [[row[1 + k] for row in recent if row[0] >= (ns or 0)] for k, ns in enumerate(kept.emerged_ns)]
+    rows = [
+        [row[1 + k] for row in recent if ns is None or row[0] >= ns] for k, ns in enumerate(kept.emerged_ns)
+    ]
     decided, over_ns, alarm = np.array([float(np.mean(row)) for row in rows]), kept.over_ns, kept.alarm
     if alarm is not None:
         decided = alarm.deciding(decided, kept.posterior.groups[0], np.array(kept.learned_nats(context)))

@@ -1,0 +1,160 @@
+"""Apply every mutation of `mutations.json` to a copy of the library, and tell which test notices it.
+
+A mutation is an error of sign, factor or order that somebody could make: its area, a file, a piece of text
+that stands there once, what replaces it, and the test likeliest to notice it. That one runs first, the suite
+of the core where it passes, each in a process of its own, forked after the packages from elsewhere were
+imported, which takes longer than most tests.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+EXPECTED, EXAMPLE = 0.9, "Example: python tests/core/run_mutations.py --area belief --only 5"
+_ELSEWHERE = (
+    "scipy.linalg",
+    "scipy.optimize",
+    "scipy.stats",
+    "scipy.signal",
+    "hypothesis",
+    "jsonschema",
+    "pytest",
+)
+
+
+class Mutation(NamedTuple):
+    """One line of `mutations.json`."""
+
+    area: str
+    file: str
+    old: str
+    new: str
+    test: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.file}: {self.old} -> {self.new}"
+
+
+MUTATIONS = [Mutation(*row) for row in json.loads(Path(__file__).with_name("mutations.json").read_text())]
+Stages = list[tuple[str, ...]]
+AREAS = ("belief", "association", "alarm", "hearing")
+
+
+def copied(root: Path) -> None:
+    """Copy what the tests need, links as links."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in {line.split("/")[0] for line in listed.splitlines()}:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, root / name, symlinks=True)
+        else:
+            shutil.copy2(ROOT / name, root / name)
+
+
+def noticed_by(root: Path, tests: tuple[str, ...], limit_s: float, freeze: str | None = None) -> str | None:
+    """Return the first test that fails, or that the time is up; None where all pass."""
+    out = root / "out.txt"
+    child = os.fork()
+    if child == 0:
+        with out.open("w") as file:
+            os.dup2(file.fileno(), 1), os.dup2(file.fileno(), 2)
+        os.chdir(root)
+        os.environ |= {"PYTHONPATH": f"{root}:{root / 'lab'}"} | (
+            {"WORLDSTATE_FREEZE": freeze} if freeze else {}
+        )
+        sys.path[:0] = [str(root), str(root / "lab")]
+        plain = ("-q", "-x", "--tb=no", "-rfE", "-p", "no:xdist", "-p", "no:cacheprovider")
+        os._exit(import_module("pytest").main([*plain, *tests]))
+    ends_s = time.monotonic() + limit_s
+    while (done := os.waitpid(child, os.WNOHANG))[0] == 0:
+        if time.monotonic() > ends_s:
+            os.kill(child, 9)
+            os.waitpid(child, 0)
+            return f"no end within {limit_s:.0f} s"
+        time.sleep(0.1)
+    if done[1] == 0:
+        return None
+    lines, code = out.read_text().splitlines(), os.waitstatus_to_exitcode(done[1])
+    if code in (4, 5):
+        raise SystemExit(f"no such test: {tests}")
+    first = (line.split(" - ")[0] for line in lines if line.startswith(("FAILED", "ERROR")))
+    return next(first, f"pytest ended with {code}")
+
+
+def mutated(root: Path, one: Mutation, stages: Stages, limit_s: float) -> str | None:
+    """Return what notices a mutation; None of a survivor."""
+    path = root / one.file
+    stat, text = path.stat(), path.read_text()
+    assert text.count(one.old) == 1, one.name
+    path.write_text(text.replace(one.old, one.new))
+    noticed = first_of(root, stages, limit_s)
+    path.write_text(text)
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # What was compiled of it is valid again
+    return noticed
+
+
+def first_of(root: Path, stages: Stages, limit_s: float, freeze: str | None = None) -> str | None:
+    return next(filter(None, (noticed_by(root, tests, limit_s, freeze) for tests in stages)), None)
+
+
+def results(root: Path, told: argparse.Namespace) -> Iterator[tuple[str, str, str | None]]:
+    """Yield area, name and what noticed it of every mutation, or of every quantity that is held."""
+    rest = [] if told.quick else [("tests/core",)]
+    if told.freeze:
+        sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+        names = [one for one in import_module("published_quantities").quantities() if told.match in one]
+        for name in names[: told.only]:
+            yield "freeze", name, first_of(root, [("tests/core/test_published.py",), *rest], told.limit, name)
+        return
+    of_area = [one for one in MUTATIONS if told.area in (None, one.area) and told.match in one.name]
+    for one in of_area[: told.only]:
+        yield one.area, one.name, mutated(root, one, [(one.test,), *rest], told.limit)
+
+
+def main() -> bool:
+    """Run the campaign and print one line a mutant; return whether so many were noticed as are expected."""
+    parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLE)
+    parser.add_argument("--area", choices=AREAS, help="of the mutations; all where not given")
+    parser.add_argument("--match", default="", metavar="TEXT", help="only those with it in their name")
+    parser.add_argument("--only", type=int, metavar="N", help="the first so many")
+    parser.add_argument("--freeze", action="store_true", help="hold published quantities instead")
+    parser.add_argument("--quick", action="store_true", help="only the tests named with each")
+    parser.add_argument("--limit", type=float, default=600.0, metavar="S", help="seconds a run (%(default)s)")
+    told = parser.parse_args()
+    for name in _ELSEWHERE:
+        import_module(name)
+    noticed, every, start_s = Counter[str](), Counter[str](), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        copied(root)
+        noticed_by(root, ("--collect-only", "tests/core"), told.limit)  # Compiles all that is not mutated
+        sys.dont_write_bytecode = True
+        last_s = time.monotonic()
+        for area, name, by in results(root, told):
+            every[area] += 1
+            noticed[area] += by is not None
+            now_s = time.monotonic()
+            print(
+                f"{sum(every.values())} {area} {now_s - last_s:.0f} s: {name}: {by or 'SURVIVED'}", flush=True
+            )
+            last_s = now_s
+    for area, number in every.items():
+        print(f"{area}: {noticed[area]} of {number}, {noticed[area] / number:.0%}")
+    print(f"{time.monotonic() - start_s:.0f} s")
+    least = 1.0 if told.freeze else EXPECTED
+    return all(noticed[area] >= least * number for area, number in every.items())
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main() else 1)

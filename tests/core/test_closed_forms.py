@@ -1,0 +1,410 @@
+"""What the formulas of the core give in cases that can be summed by hand, one law each."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
+from worldstate.abduction.cueing.risk_map import PlattMap
+from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
+from worldstate.abduction.sequence.sequence_chain import BEHIND, COMES, context_prior, states_of
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.association import associated, emergence_density, joint_association, reached_edge
+from worldstate.belief.detection import camera_scan, fused
+from worldstate.belief.hidden_bearing import hidden_motion, time_to_visible
+from worldstate.belief.kinematics.cartesian import CartesianBelief
+from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
+from worldstate.belief.track import born
+from worldstate.core.acoustic_update import association_probability
+from worldstate.core.sequence_memory import ArrivalRate, SequenceMemory, carried, informed
+from worldstate.ground import LEAST_HEARD
+from worldstate.measurement import CameraLook, Heard, Look, Sector
+
+SEEDS, UNIT = st.integers(0, 2**32 - 1), st.floats(0.01, 0.99)
+NATS, LARGE = st.floats(-4.0, 4.0), st.floats(0.0, 9.0)  # Large ones have to be limited
+SILENT, UNASKED = NotUsable("not scripted"), Unqueried("no camera")
+FLAT = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+COMING = len(COMING_S)
+SHARE = 0.9 * np.random.default_rng(0).dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
+LEFT, RIGHT = SideGeometry("left", 0.56, 0.96, 0.35), SideGeometry("right", -0.56, -0.96, 0.35)
+SITE = SiteGeometry((LEFT, RIGHT), 0.6, FilterSettings())
+
+
+def odds(chance: float) -> float:
+    return chance / (1.0 - chance)
+
+
+def drawn(seed: int) -> np.ndarray:
+    """Return the groups of two sides that a sequence might read."""
+    rng = np.random.default_rng(seed)
+    return 0.99 * rng.dirichlet(np.full(len(GROUPS), 0.3), 2) + 0.01 / len(GROUPS)
+
+
+def said(
+    hop: int, groups: np.ndarray | None = None, heard: Heard | None = None, signature=FLAT
+) -> Measurement:
+    reading = None if groups is None else SequenceReading(groups, SHARE, 0.1, SequenceAlarm(0.0, 20.0))
+    told = (hop * 10**8, signature, UNASKED, SILENT, SILENT)
+    return Measurement(*told, sequence=reading, heard=heard or Heard())
+
+
+# Hearing
+
+
+@given(NATS, NATS, NATS, NATS, st.floats(LEAST_HEARD, 1.0))
+@settings(max_examples=20)
+def test_a_window_that_is_masked_in_part_is_the_mean_of_heard_and_not(
+    left, right, visible, none, share
+) -> None:
+    """One that is masked sounds as if it were not there: in view or nobody, each as often."""
+    there = [
+        share * math.exp(one) + (1.0 - share) * 0.5 * (math.exp(visible) + math.exp(none))
+        for one in (left, right)
+    ]
+    dull = SignatureEvidence(("left", "right"), (left, right), visible, none)
+    clear = replace(dull, hidden=tuple(map(math.log, there)))
+    one = WorldFilter().update(said(10, heard=Heard(share, "wind"), signature=dull)).belief
+    other = WorldFilter().update(said(10, signature=clear)).belief
+    assert one.hypotheses == pytest.approx(other.hypotheses) and one.hidden == pytest.approx(other.hidden)
+
+
+@given(SEEDS, SEEDS, st.floats(0.1, 1.0))
+@settings(max_examples=10)
+def test_the_odds_of_a_reading_masked_in_part_lie_between_it_and_what_was_expected(one, other, share) -> None:
+    r"""Eq.: odds' = s odds(read) + (1 - s) odds(expected)."""
+    before, read = WorldFilter().update(said(1, drawn(one))), drawn(other)
+    expected = before.predict(0.1).belief.risks
+    after = before.update(said(2, read, Heard(share, "wind"))).belief.risks
+    for k in (0, 1):
+        mixed = share * odds(read[k, :COMING].sum()) + (1.0 - share) * odds(expected[k])
+        assert odds(after[k]) == pytest.approx(mixed, rel=1e-6)
+
+
+def test_an_alarm_that_cannot_be_heard_any_more_ends_after_a_second_and_not_before() -> None:
+    loud, quiet = (SignatureEvidence(("left", "right"), (one, -3.0), -3.0, -one) for one in (6.0, -6.0))
+    world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02))
+    for hop in range(1, 11):
+        world = world.update(said(hop, signature=loud))
+    assert world.state.calibrated
+    for hop in range(11, 24):
+        # Noise that sounds like an empty street, heard by nobody.
+        world = world.update(said(hop, heard=Heard(0.0, "lost samples"), signature=quiet))
+        state = world.state
+        named = any(cue.advisory is not None for cue in state.cues)
+        assert named == (hop <= 21), hop
+        assert state.heard is not None and not state.calibrated
+        assert [(one.share, one.since_ns) for one in state.heard] == [(0.0, 11 * 10**8)]
+
+
+# Belief
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_a_vehicle_on_any_side_is_as_likely_as_on_each_less_on_both(seed) -> None:
+    sides = WorldFilter().update(said(1, drawn(seed))).belief
+    assert sides.hidden_on(None) == pytest.approx(sum(sides.hidden) - sides.both) == pytest.approx(sides.risk)
+
+
+@given(UNIT, UNIT, UNIT, UNIT)
+def test_messages_make_the_explanations_give_way_alike(hidden, visible, one, other) -> None:
+    rest = 1.0 - hidden
+    before = SideBelief(
+        (hidden, 0.0), (0.0, 0.0), (hidden, 0.0), hidden, (hidden, rest * visible, rest * (1.0 - visible))
+    )
+    after = before.at_least((one, other)).hypotheses
+    assert sum(after) == pytest.approx(1.0) and after[0] == pytest.approx(
+        max(hidden, 1.0 - (1.0 - one) * (1.0 - other))
+    )
+    assert after[1] * (1.0 - visible) == pytest.approx(after[2] * visible)
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.01, 0.9))
+def test_a_look_finds_something_or_nothing_whatever_is_there(miss_rate, clutter_rate) -> None:
+    nothing, something = (kind(miss_rate, clutter_rate).log_likelihoods() for kind in (Absent, Present))
+    assert np.exp(nothing) + np.exp(something) == pytest.approx([1.0] * 3)
+    assert np.exp(nothing) == pytest.approx((1.0 - clutter_rate) * np.array([1.0, miss_rate, 1.0]))
+
+
+@given(SEEDS, UNIT)
+@settings(max_examples=20)
+def test_a_context_moves_the_odds_of_those_who_come_to_its_own_within_limits(seed, hidden) -> None:
+    share = drawn(seed)[0]
+    usual, moved = (
+        math.log(odds(float(one[:COMING].sum()))) for one in (share, context_prior(share, hidden))
+    )
+    assert moved - usual == pytest.approx(np.clip(math.log(odds(hidden)) - usual, -0.5, 2.0), abs=1e-9)
+    np.testing.assert_allclose(
+        at_prior(share, share, context_prior(share, hidden)), context_prior(share, hidden)
+    )
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_what_else_spoke_keeps_its_worth_when_the_sequence_moves(seed) -> None:
+    """With a chain that stands still: p ~ q (p / q of before) l."""
+    rng = np.random.default_rng(seed)
+    belief, alone, now = rng.dirichlet(np.ones(5), 3)
+    log_l = rng.normal(size=5)
+    after = next_belief(SequenceBelief(belief[None], alone[None]), now[None], np.eye(5), log_l)
+    expected = now * belief / alone * np.exp(log_l)
+    np.testing.assert_allclose(after.belief[0], expected / expected.sum())
+    np.testing.assert_array_equal(after.alone[0], now)
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_a_vehicle_comes_behind_another_as_often_as_prior_and_sound_have_one_in_view(seed) -> None:
+    prior, groups = drawn(seed)
+    in_view = [one[COMING] / one[COMING:].sum() for one in (prior, groups)]
+    states = states_of(groups, prior)
+    assert states[BEHIND].sum() == pytest.approx(np.mean(in_view) * groups[:COMING].sum())
+    assert states[COMES].sum() == pytest.approx(groups[:COMING].sum())
+
+
+def memory_of(groups: np.ndarray, **more) -> SequenceMemory:
+    return SequenceMemory(
+        first_belief(states_of(groups, SHARE)), SHARE, 0.1, SequenceAlarm(0.0, 20.0), **more
+    )
+
+
+@given(SEEDS, UNIT)
+@settings(max_examples=20)
+def test_behind_one_that_has_come_into_view_another_comes_as_often_as_usual(seed, residual) -> None:
+    before = memory_of(drawn(seed))
+    after = before.handed_over({0: residual}, (1,), 10**9)
+    share = round(1.0 / 6.0, 2)
+    assert after.comes[0] == pytest.approx((1.0 - residual) * share + residual * before.comes[0])
+    assert after.comes[1] == pytest.approx(before.comes[1])
+
+
+@given(SEEDS, UNIT, UNIT)
+@settings(max_examples=20)
+def test_one_that_may_have_come_into_view_unseen_stays_for_six_seconds_in_the_mean(seed, left, step) -> None:
+    before = memory_of(drawn(seed), unseen=(left, 0.0))
+    after = carried(before, round(6e9 * step), round(6e9 * step), Context())
+    soon = before.posterior.within()[0, :, 0]
+    assert after.unseen == pytest.approx((max(left * math.exp(-step), soon[0]), soon[1]))
+
+
+def test_a_sound_in_view_is_of_one_that_came_or_of_one_of_whom_nothing_is_known() -> None:
+    groups = np.full((2, len(GROUPS)), 1e-9)
+    groups[0, GROUPS.index("seen")] = groups[1, GROUPS.index("none")] = 1.0
+    groups /= groups.sum(axis=1, keepdims=True)
+    sides = memory_of(groups, unseen=(0.5, 0.0)).sides
+    # P(it came | one of the two is there), each with a chance of its own; one in ten came from elsewhere.
+    assert sides.emerged[0] == pytest.approx(0.5 / (1.0 - 0.5 * 0.9), abs=1e-6)
+    assert sides.hypotheses == pytest.approx((0.0, 0.5, 0.5), abs=1e-6)
+
+
+# Alarm
+
+
+@given(SEEDS, st.tuples(LARGE, LARGE), st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)))
+@settings(max_examples=20)
+def test_the_alarm_takes_learned_traffic_out_of_what_both_sides_allow(seed, log_odds, learned) -> None:
+    alarm, groups = SequenceAlarm(0.3, 20.0), drawn(seed)
+    busy = groups.copy()
+    busy[:, :COMING] *= np.exp(learned)[:, None]
+    one, other = (
+        alarm.deciding(np.array(log_odds), groups),
+        alarm.deciding(np.array(log_odds), busy, np.array(learned)),
+    )
+    np.testing.assert_allclose(one, other, atol=1e-9)
+    # Of the less likely side no more than that it is likelier than that only the other one comes.
+    less = int(np.argmin(log_odds))
+    apart = math.log(groups[less, :COMING].sum() / groups[less, GROUPS.index("other")])
+    if log_odds[0] != log_odds[1]:
+        assert one[less] == pytest.approx(min(log_odds[less], 0.3 + apart), abs=1e-6)
+        assert one[1 - less] == log_odds[1 - less]
+
+
+@given(SEEDS)
+@settings(max_examples=10)
+def test_what_was_learned_of_the_traffic_moves_the_risk_and_not_the_alarm(seed) -> None:
+    groups = drawn(seed)
+    busy = (ArrivalRate(20.0, 100.0), ArrivalRate(0.0, 6e3))
+    usual, learned = (
+        informed(memory_of(groups, **more), said(1, groups), (), Context())
+        for more in ({}, {"arrivals": busy})
+    )
+    nats = learned.learned_nats(Context())
+    assert nats == pytest.approx([0.5, -0.5])
+    np.testing.assert_allclose(
+        *(list(one.log_odds(Context()).values())[-1] for one in (usual, learned)), atol=1e-6
+    )
+    moved = [np.log(one.comes) - np.log1p(-one.comes) for one in (usual, learned)]
+    np.testing.assert_allclose(moved[1] - moved[0], nats, atol=1e-6)
+
+
+@given(SEEDS, st.integers(-(10**4), -10))
+@settings(max_examples=5)
+def test_an_alarm_does_not_depend_on_what_its_clock_counts_from(seed, start_s) -> None:
+    worlds = [WorldFilter(), WorldFilter(start_ns=start_s * 10**9)]
+    for hop in range(1, 6):
+        heard = said(hop, drawn(seed + hop))
+        later = replace(heard, stamp_ns=heard.stamp_ns + start_s * 10**9)
+        worlds = [one.update(told) for one, told in zip(worlds, (heard, later), strict=True)]
+        told = [
+            [(cue.evidence.compared_nats, cue.advisory is None) for cue in one.state.cues] for one in worlds
+        ]
+        assert told[0] == told[1]
+
+
+@given(NATS, NATS, NATS, NATS, UNIT)
+@settings(max_examples=10)
+def test_the_statistic_is_that_of_one_window_whose_look_has_missed(left, right, visible, none, miss) -> None:
+    one = said(10, signature=SignatureEvidence(("left", "right"), (left, right), visible, none))
+    hidden, others = np.exp([left, right]).sum(), miss * math.exp(visible) + math.exp(none)
+    cue = WorldFilter().update(replace(one, co_evidence=Absent(miss))).state.cues[0]
+    assert cue.statistic == pytest.approx(hidden / (hidden + others))
+    # The ratio of the means, whatever the prior.
+    assert cue.log_lambda == pytest.approx(math.log(hidden / others))
+
+
+@pytest.mark.parametrize(("right", "named"), [(5.0, ["left"]), (6.0, ["left", "right"])])
+def test_the_rule_names_the_likelier_side_or_both_in_a_tie(right, named) -> None:
+    loud, world = SignatureEvidence(("left", "right"), (6.0, right), -3.0, -3.0), WorldFilter()
+    for hop in range(1, 11):
+        world = world.update(said(hop, signature=loud))
+    assert min(cue.risk for cue in world.state.cues) > 0.15
+    assert [cue.direction for cue in world.state.cues if cue.advisory is not None] == named
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+def test_a_budget_is_stated_of_the_rule_and_confidences_sum_to_one(sequence) -> None:
+    policy = replace(uncalibrated_policy(), alpha=0.02, risk_map=PlattMap(-0.5, -2.0))
+    world = WorldFilter(policy=policy)
+    for hop in range(1, 9):
+        world = world.update(
+            said(hop, drawn(3) if sequence else None, signature=replace(FLAT, hidden=(1.0, 0.2)))
+        )
+    cues = world.state.cues
+    assert {cue.alpha for cue in cues} == {None if sequence else 0.02}
+    assert sum(cue.confidence for cue in cues) == pytest.approx(1.0)
+    # A map that raises what is hidden is not followed: at most all of it comes.
+    assert all(cue.risk <= cue.hypotheses.hidden + 1e-12 for cue in cues)
+
+
+@pytest.mark.parametrize("group", range(7))
+def test_the_interval_of_the_time_holds_nine_of_ten_of_a_group_and_its_margin(group) -> None:
+    groups = np.full((1, 2, len(GROUPS)), 1e-12)
+    groups[..., group] = 1.0
+    begin, end = (0.0, *COMING_S)[group], COMING_S[group]
+    low, mean, high = SequencePosterior(groups, 0.2).time_to_visible_s()[0, 0]
+    assert mean == pytest.approx(0.5 * (begin + end))
+    within = begin + np.array([0.05, 0.95]) * (end - begin)
+    assert (low, high) == pytest.approx((max(within[0] - 0.2, 0.0), within[1] + 0.2), abs=1e-6)
+
+
+# Association
+
+
+def seen(azimuth_rad: float, existence: float):
+    motion = MotionBelief.around((azimuth_rad, 0.0, 0.0, 3.2), (0.05, 0.1, 0.1, 0.3))
+    return replace(born("visible", 0, existence, 0, SITE), seen=True, motion=motion, existence=existence)
+
+
+def box_scan(azimuth_rad: float, miss_rate: float, name: str = "camera", std_rad: float = 0.02):
+    look = Look(name, 0, Present(miss_rate, 0.01), (-0.6, 0.6))
+    return camera_scan(CameraLook(look, (Sighting(azimuth_rad, std_rad, "car", 0.9),)), Sector(0.0, 0.6), 1.0)
+
+
+@given(st.floats(-0.1, 0.1), st.floats(0.1, 0.9), st.floats(0.05, 0.6))
+@settings(max_examples=20)
+def test_a_box_is_of_the_one_entity_there_or_of_a_new_one(apart, existence, miss_rate) -> None:
+    (detection,) = box_scan(0.1 + apart, miss_rate).detections
+    variance, found = 0.05**2 + 0.02**2, 1.0 - miss_rate
+    own = found * existence * math.exp(-0.5 * apart**2 / variance) / math.sqrt(2.0 * math.pi * variance)
+    new = (1.0 - found * existence) * 0.05 / 1.2  # Unheard ones, anywhere in the view
+    whose = associated([seen(0.1, existence)], [detection], SITE)
+    assert whose.pairs[0, 0] == pytest.approx(own / (own + new), rel=1e-4)
+
+
+def test_one_in_view_takes_a_poor_detection_in_its_gate_before_a_new_one_is_born() -> None:
+    poor = np.array([[-1.0]])
+    in_view, hidden = (joint_association(poor, np.array([detected])) for detected in (True, False))
+    assert (in_view.found, in_view.new, hidden.found, hidden.new) == ({0: 0}, [], {}, [0])
+
+
+@given(UNIT, UNIT)
+@settings(max_examples=10)
+def test_what_two_cameras_find_is_found_unless_both_miss_it(one, other) -> None:
+    scans = [box_scan(0.1, one, "a"), box_scan(0.1, other, "b", std_rad=0.04)]
+    ((both,), by_look) = fused(scans)
+    assert both.found == pytest.approx(1.0 - one * other) and by_look.tolist() == [[True, True]]
+    assert both.std_rad**-2 == pytest.approx(0.02**-2 + 0.04**-2)
+    assert both.log_new == pytest.approx(math.log(0.05 / 1.2))
+
+
+@given(st.floats(0.3, 1.4), st.floats(0.05, 0.4))
+@settings(max_examples=20)
+def test_a_hidden_vehicle_comes_past_its_edge_on_either_side_alike_and_sooner_when_near(azimuth, std) -> None:
+    def near(side: int, way: float, at: float) -> float:
+        motion = MotionBelief.around((way * at, 0.0, -0.2, 3.2), (std, 0.1, 0.1, 0.3))
+        return reached_edge(replace(born("left", 0, 0.9, 0, SITE), side=side, motion=motion), SITE)
+
+    assert near(0, 1.0, azimuth) == pytest.approx(near(1, -1.0, azimuth))
+    assert near(0, 1.0, azimuth) >= near(0, 1.0, azimuth + 0.3)
+    assert near(0, 1.0, 0.5) > near(0, 1.0, 1.5)
+
+
+def test_one_in_five_is_heard_on_the_wrong_side() -> None:
+    hidden = replace(born("left", 0, 0.9, 0, SITE), side=0)
+    at_edges = [replace(box_scan(way * 0.56, 0.1).detections[0], width_rad=0.0) for way in (1.0, -1.0)]
+    here, there = emergence_density([hidden], at_edges, SITE)[:, 0]
+    peak = 1.0 / (0.15 * math.sqrt(2.0 * math.pi))
+    assert (here, there) == pytest.approx((0.8 * peak, 0.2 * peak), rel=1e-6)
+
+
+@given(st.floats(-0.5, 0.5), UNIT)
+@settings(max_examples=20)
+def test_a_peak_is_the_entitys_own_or_anywhere_ahead(apart, own_path) -> None:
+    variance = 0.05**2 + 0.1**2
+    own = own_path * math.exp(-0.5 * apart**2 / variance) / math.sqrt(2.0 * math.pi * variance)
+    chance = association_probability(seen(0.1, 0.9), 0.1 + apart, 0.1, own_path)
+    assert chance == pytest.approx(own / (own + (1.0 - own_path) / math.pi), rel=1e-9)
+
+
+@given(
+    st.floats(5.0, 15.0),
+    st.floats(12.0, 30.0),
+    st.floats(-2.0, 2.0),
+    st.floats(-10.0, -4.0),
+    st.floats(0.0, 3.0),
+)
+@settings(max_examples=20)
+def test_at_its_time_to_visible_a_vehicle_stands_at_the_edge_as_seen_by_one_that_drives(
+    x, y, vx, vy, speed
+) -> None:
+    place = CartesianBelief(np.array([x, y, vx, vy]), np.diag([0.2, 0.2, 0.1, 0.1]))
+    time_s, _ = time_to_visible(place, LEFT, speed) or (None, None)
+    if time_s is not None:
+        at = (x + (vx - speed) * time_s, y + vy * time_s)
+        assert math.atan2(at[1], at[0]) == pytest.approx(LEFT.edge_azimuth_rad) and time_s > 0.0
+    # Driving towards what stands in front of the edge hides it for ever, away from the lane it comes sooner.
+    standing = time_to_visible(
+        CartesianBelief(np.array([10.0, 20.0, 0.0, -8.0]), place.covariance), LEFT, 0.0
+    )
+    assert standing is not None and standing[0] == pytest.approx((20.0 - 10.0 * math.tan(0.56)) / 8.0)
+
+
+@pytest.mark.parametrize("group", [1, 4, 7])
+def test_one_only_heard_goes_towards_the_axis_at_the_pace_of_its_lane(group) -> None:
+    coming = np.full(COMING, 1e-9)
+    coming[group] = 1.0
+    for side, way in ((LEFT, 1.0), (RIGHT, -1.0)):
+        moved = hidden_motion(coming, 1.0, side, side.prior())
+        assert way * moved.azimuth_rad > 0.56
+        expected = -way * side.pace_hz * math.cos(moved.azimuth_rad) ** 2
+        assert moved.mean[AZIMUTH_RATE] == pytest.approx(expected, rel=1e-9)

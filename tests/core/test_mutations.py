@@ -1,0 +1,41 @@
+"""The list of mutations fits the library, and the suite of the core notices nine in ten of them."""
+
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from published_quantities import CONSTANT, quantities
+
+sys.path.insert(0, str(Path(__file__).parent))
+from run_mutations import AREAS, MUTATIONS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_mutation_stands_once_in_its_file() -> None:
+    wrong = [one.name for one in MUTATIONS if (ROOT / one.file).read_text().count(one.old) != 1]
+    wrong += [one.name for one in MUTATIONS if one.old == one.new or not _exists(one.test)]
+    assert wrong == []
+    areas = Counter(one.area for one in MUTATIONS)
+    assert set(areas) == set(AREAS) and min(areas.values()) >= 15
+    assert len(set(MUTATIONS)) == len(MUTATIONS)
+
+
+def _exists(test: str) -> bool:
+    file, _, name = test.partition("::")
+    return (ROOT / file).is_file() and (not name or f"def {name}(" in (ROOT / file).read_text())
+
+
+def test_every_field_of_a_snapshot_is_a_quantity_or_constant() -> None:
+    assert {"RiskCue.risk", "Entity.azimuth_rad", "Hearing.share", "Priors.hidden"} <= set(quantities())
+    assert CONSTANT.isdisjoint(quantities())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("held", [(), ("--freeze",)])
+def test_nine_in_ten_mutations_and_every_quantity_that_is_held_are_noticed(held: tuple[str, ...]) -> None:
+    program = [sys.executable, str(ROOT / "tests/core/run_mutations.py"), *held]
+    done = subprocess.run(program, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
