@@ -77,7 +77,7 @@ left: advisory held: below the threshold now, it ends without news
     threshold                +1.00         +1.00
   side: 0.50 of what is hidden; risk 0.40
   comes into view: 0.05 in 0.5 s, 0.10 in 1 s, 0.16 in 2 s, 0.26 in 3 s; 2.2 s from now (0.0 to 4.8)
-  entity: f8eadf57 hidden at +59 deg (std 9), exists with 0.54, by acoustic; the last look did not find it
+  entity: f8eadf57 hidden at -59 deg (std 9), exists with 0.54, by acoustic; the last look did not find it
 sound: sounds like speech: the evidence of this hop counts little
 sensor acoustic: impaired (sounds like speech)
 sensor camera: working

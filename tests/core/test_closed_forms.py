@@ -26,6 +26,7 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import born
 from worldstate.core.acoustic_update import association_probability
+from worldstate.core.birth_death import hidden_on
 from worldstate.core.sequence_memory import ArrivalRate, SequenceMemory, carried, informed
 from worldstate.ground import LEAST_HEARD
 from worldstate.measurement import CameraLook, Heard, Look, Sector
@@ -408,3 +409,11 @@ def test_one_only_heard_goes_towards_the_axis_at_the_pace_of_its_lane(group) -> 
         assert way * moved.azimuth_rad > 0.56
         expected = -way * side.pace_hz * math.cos(moved.azimuth_rad) ** 2
         assert moved.mean[AZIMUTH_RATE] == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_cue_names_an_entity_of_its_own_side_before_one_of_unknown_side() -> None:
+    faint, likely = born("left", 0, 0.3, 0, SITE), born("left", 1, 0.6, 0, SITE)
+    unknown = replace(born("right", 0, 0.9, 0, SITE), side=1, side_shares=(0.4, 0.6))
+    assert hidden_on((unknown, faint, likely), 0) is likely
+    assert hidden_on((unknown, faint), 1) is hidden_on((unknown,), 0) is unknown
+    assert hidden_on((faint, likely), 1) is None

@@ -31,6 +31,7 @@ _LOST_RAD = 0.8  # Standard deviation; beyond, the azimuth is known to no more t
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
 _AGE = attrgetter("created_ns", "id")
+_TIE = 1e-9  # Relative
 
 
 def birth_death(
@@ -111,13 +112,13 @@ def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeom
 
 
 def _put_on_its_side(track: Track, sides: SideBelief, site: SiteGeometry) -> None:
-    """Put an entity of unknown side on its likelier one."""
+    """Put an entity of unknown side on its likelier one; in a tie it stays, which rounding must not undo."""
     if track.of_side is not None:
         track.side_shares = ()
         return
     shares = sides.side_shares(site.settings.death_probability)
-    side = shares.index(max(shares))
-    if side != track.side:
+    if shares[track.side] < max(shares) * (1.0 - _TIE):
+        side = shares.index(max(shares))
         track.side, track.motion = side, site.sides[side].prior()
     track.side_shares, track.existence = shares, sides.existence(None)
 

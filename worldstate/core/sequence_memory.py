@@ -114,6 +114,7 @@ _ONE_IN_VIEW = np.eye(len(STATES))[
 ]
 LEAST_RISK = 0.1  # An advisory does not stand beside a risk that denies it
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
+_TIE = 1e-9  # Relative
 
 
 # No slots: what is derived is computed once, and read by every entity and cue.
@@ -317,7 +318,8 @@ class SequenceMemory:
 
 def _as_few(chances: FloatArray) -> FloatArray:
     """Return the chances with as much as one vehicle allows on the likelier side; a tie stays a tie."""
-    total, first = float(chances.sum()), chances == chances.max()
+    # Rounding must not choose a side.
+    total, first = float(chances.sum()), chances >= chances.max() * (1.0 - _TIE)
     one = min(total, 1.0)
     return np.where(first, one, total - one) if first.sum() == 1 else chances
 
