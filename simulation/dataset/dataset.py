@@ -24,7 +24,7 @@ from worldstate.adapters.datasets.ovad import (
     OvadDataset,
 )
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.adapters.files.file_io import atomic_path, write_text
+from worldstate.adapters.files.file_io import atomic_path, write_json, write_text
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
@@ -52,7 +52,6 @@ from .recording import (
     refuse_foreign,
     simulate_recording,
     sound_writer,
-    write_json,
 )
 
 # The running number in an ID has four digits.

@@ -1,6 +1,5 @@
 """One recording: sound at every microphone, detections of the camera, and the truth."""
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -132,11 +131,6 @@ def sound_writer(
         raise InputFileError(
             path, f"expected to write {samples} samples, the disk may be full: {error}"
         ) from error
-
-
-def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Write an object, whose numbers are all finite, on one line."""
-    path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def refuse_foreign(target: Path) -> None:

@@ -11,6 +11,7 @@ from scipy.fft import rfft, rfftfreq
 
 from worldstate.adapters.datasets.ovad import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
 from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.files.file_io import write_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray
@@ -20,7 +21,6 @@ from worldstate.simulation.dataset.recording import (
     put_in_place,
     refuse_foreign,
     sound_writer,
-    write_json,
 )
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 
