@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+# Relative: rounding must not choose a side, or the mirrored world would have the other one.
+TIE = 1e-9
+
 
 @dataclass(frozen=True, slots=True)
 class SideBelief:

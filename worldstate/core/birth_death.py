@@ -8,7 +8,7 @@ from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.side_belief import TIE, SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track, born, heard_as
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
@@ -31,7 +31,6 @@ _LOST_RAD = 0.8  # Standard deviation; beyond, the azimuth is known to no more t
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
 _AGE = attrgetter("created_ns", "id")
-_TIE = 1e-9  # Relative
 
 
 def birth_death(
@@ -117,7 +116,7 @@ def _put_on_its_side(track: Track, sides: SideBelief, site: SiteGeometry) -> Non
         track.side_shares = ()
         return
     shares = sides.side_shares(site.settings.death_probability)
-    if shares[track.side] < max(shares) * (1.0 - _TIE):
+    if shares[track.side] < max(shares) * (1.0 - TIE):
         side = shares.index(max(shares))
         track.side, track.motion = side, site.sides[side].prior()
     track.side_shares, track.existence = shares, sides.existence(None)

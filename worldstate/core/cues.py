@@ -18,7 +18,7 @@ from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.hidden_bearing import announced
-from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.side_belief import TIE, SideBelief
 from worldstate.ground.values import seconds
 from worldstate.measurement import Measurement
 from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
@@ -30,8 +30,6 @@ from .side_update import heard_beside
 from .site_model import FilterModel, published_belief
 from .snapshot_builder import hidden_azimuth, sector, time_to_arrival, visible_in
 
-# Relative: rounding must not choose a side, or the mirrored world would have the other one.
-_TIE = 1e-9
 _MOST_CERTAIN = 0.999  # Of a message
 NO_LOOK = Unqueried("sound alone")
 _HIGH_RISK = 0.7
@@ -137,7 +135,7 @@ def _heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory 
         return tuple(
             None if end_ns is None else SideAdvisory(end_ns, decided < threshold) for end_ns, decided in pairs
         )
-    rule, least = _rule_ends_ns(memory, model.policy), max(hidden) * (1.0 - _TIE)
+    rule, least = _rule_ends_ns(memory, model.policy), max(hidden) * (1.0 - TIE)
     named = None if rule is None else SideAdvisory(rule)
     return tuple(named if p >= least else None for p in hidden)
 

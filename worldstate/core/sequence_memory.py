@@ -26,7 +26,7 @@ from worldstate.abduction.sequence.sequence_chain import (
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.side_belief import TIE, SideBelief
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, seconds
 from worldstate.ground.serialisation import Probability
 from worldstate.measurement.measurement import Look, Measurement
@@ -110,11 +110,10 @@ _SEEN_GROUP = GROUPS.index("seen")
 _SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range(len(STATES))])
 # What every state becomes when a vehicle comes into view, shape (states, states).
 _ONE_IN_VIEW = np.eye(len(STATES))[
-    [len(COMING_S) + i % len(COMING_S) if comes else STATES.index("seen") for i, comes in enumerate(COMES)]
+    [len(COMING_S) + i % len(COMING_S) if comes else SEEN for i, comes in enumerate(COMES)]
 ]
 LEAST_RISK = 0.1  # An advisory does not stand beside a risk that denies it
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
-_TIE = 1e-9  # Relative
 
 
 # No slots: what is derived is computed once, and read by every entity and cue.
@@ -319,7 +318,7 @@ class SequenceMemory:
 def _as_few(chances: FloatArray) -> FloatArray:
     """Return the chances with as much as one vehicle allows on the likelier side; a tie stays a tie."""
     # Rounding must not choose a side.
-    total, first = float(chances.sum()), chances >= chances.max() * (1.0 - _TIE)
+    total, first = float(chances.sum()), chances >= chances.max() * (1.0 - TIE)
     one = min(total, 1.0)
     return np.where(first, one, total - one) if first.sum() == 1 else chances
 
