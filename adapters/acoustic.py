@@ -25,27 +25,25 @@ from worldstate.abduction.road_users import (
     SIREN,
     UNKNOWN,
     ClassShares,
+    DomainGuard,
+    DomainVerdict,
+    Foreign,
     RoadUserModel,
+    WarningSignal,
     likeliest,
+    neutral,
     with_siren,
 )
 from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
-from worldstate.abduction.signature.domain_guard import (
-    DomainGuard,
-    DomainVerdict,
-    Foreign,
-    ModelDomain,
-    WarningSignal,
-    neutral,
-)
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.adapters.camera.vision_query import SeveralCameras
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.health.channel_health import ArrayHealth
-from worldstate.frontend.levels import falling
+from worldstate.frontend.hop_spectra import falling
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd

@@ -16,7 +16,7 @@ from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.fixed_lag import Timed
-from worldstate.frontend.frame import AcousticFrame
+from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.measurement import Measurement

@@ -28,9 +28,8 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
 
-from .domain_guard import ModelDomain
-from .ensemble import EnsembleModel
-from .site_reference import SiteReference, log_levels
+from .ensemble import EnsembleModel, SiteReference, log_levels
+from .published_signature import ModelDomain
 
 # Share of the difference in level that is carried over; all of the pattern is.
 _LEVEL_GAIN = 0.25
@@ -175,7 +174,7 @@ class SiteSignature:
     Examples
     --------
     >>> from worldstate.abduction.signature.ensemble import Expert
-    >>> from worldstate.abduction.signature.site_reference import SiteReference
+    >>> from worldstate.abduction.signature.ensemble import SiteReference
     >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
     >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))), np.zeros(6))
     >>> signature = SiteSignature(model)

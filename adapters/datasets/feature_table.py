@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from worldstate.abduction.signature.domain_guard import ModelDomain
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.files.file_io import atomic_path, number, read_record, read_rows, write_json
 from worldstate.ground.errors import InputFileError, InvalidArgumentError

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from worldstate.abduction.signature.domain_guard import EgoMotion, ModelDomain
+from worldstate.abduction.signature.published_signature import EgoMotion, ModelDomain
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,

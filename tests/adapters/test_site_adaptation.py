@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Absent
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.abduction.posterior import statistic
+from worldstate.abduction.evidence import statistic
+from worldstate.abduction.signature.ensemble import site_reference
 from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings, SiteSignature
-from worldstate.abduction.signature.site_reference import site_reference
 from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint

@@ -8,9 +8,9 @@ import pytest
 
 from worldstate import Measurement, NotUsable, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.cli.main import main
 from worldstate.measurement import Look
 

@@ -29,7 +29,7 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import Source, open_source, unoccluded_sector
 from worldstate.core.filter import WorldFilter
-from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Measurement

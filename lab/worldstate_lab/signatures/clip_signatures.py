@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from worldstate.frontend.levels import LevelMeter
+from worldstate.frontend.hop_spectra import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.levels import LevelMeter
+from worldstate.frontend.hop_spectra import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError

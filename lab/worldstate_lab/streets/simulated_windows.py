@@ -17,7 +17,7 @@ from worldstate.adapters.datasets.feature_extraction import WINDOW_S, window_end
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.frontend.array.steering import cross_spectra
+from worldstate.frontend.array.steering import cross_spectra, one_blas_thread
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
     FEATURE_RATE_HZ,
@@ -28,7 +28,6 @@ from worldstate.frontend.direction.feature import (
     segment_feature,
 )
 from worldstate.frontend.spectra.stft import band_bins, whiten
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 from worldstate.simulation.dataset.recording import simulate_recording

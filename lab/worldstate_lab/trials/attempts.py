@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.ground.errors import WorldstateError
 from worldstate.simulation.parallel import in_processes
 

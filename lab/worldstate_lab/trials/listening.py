@@ -23,12 +23,12 @@ from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.approach.doppler import radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import BEARING_HOPS, HOP_RATE_HZ, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds

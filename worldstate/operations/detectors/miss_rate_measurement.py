@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from worldstate.abduction.co_evidence import Sector
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.camera_health import (
     FAMILIES,
@@ -28,7 +29,6 @@ from worldstate.adapters.camera.video import VIDEO_NAME, Video
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
-from worldstate.measurement.sector import Sector
 from worldstate.operations.figure_style import figure_file, legend_beside
 
 MakeDetector = Callable[[], Detector]

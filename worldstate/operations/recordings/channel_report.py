@@ -9,9 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.frame import AcousticFrame
-from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Fault
-from worldstate.frontend.health.dropouts import Dropout
+from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Dropout, Fault
+from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import Via
 from worldstate.ground.values import NotUsable, seconds

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from worldstate.abduction.signature.domain_guard import Foreign
+from worldstate.abduction.road_users import Foreign
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.file_io import atomic_path
