@@ -1,7 +1,7 @@
 """Sectors that a co-evidence channel is asked about, its answers and its miss rate.
 
-Answers are present, absent or unqueried. Absence is a measurement and has a type of its own. A sensor that was
-not asked gives neither presence nor absence: `Unqueried`, beta = 1. The miss rate beta_c(theta, d), over
+Answers are present, absent or unqueried. Absence is a measurement and has a type of its own. A sensor that
+was not asked gives neither presence nor absence: `Unqueried`, beta = 1. The miss rate beta_c(theta, d), over
 azimuth and degradation, never falls.
 """
 

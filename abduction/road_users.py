@@ -4,8 +4,8 @@ Both are a softmax over classes of x, the numbers of one microphone over two sec
 
 .. math:: p_c = \frac{e^{\ell_c}}{\sum_k e^{\ell_k}}, \qquad \ell_c = w_c^T x + b_c
 
-Of the kinds one is *unknown*: sound in which a vehicle, if there is one, lies below the ambience. Of the guard
-the classes are the street, kinds of foreign sounds and warning signals of vehicles:
+Of the kinds one is *unknown*: sound in which a vehicle, if there is one, lies below the ambience. The classes
+of the guard are the street, kinds of foreign sounds and warning signals of vehicles:
 
 .. math:: \lambda = \log \sum_{c \ne street} e^{\ell_c} - \ell_{street}
 

@@ -13,9 +13,8 @@ from scipy.ndimage import convolve, gaussian_filter, sobel
 from scipy.special import ndtri
 
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
-
-from .video import opencv
 
 Family = Literal["blur", "darkness", "noise", "all"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
@@ -78,7 +77,7 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
 
 def blurred(frame: ImageArray, sigma_px: float, rng: np.random.Generator) -> ImageArray:
     """Blur; a wide one on a reduced image, whose pixels are themselves a box of variance (f^2 - 1) / 12."""
-    cv2 = opencv()
+    cv2 = optional("cv2")
     if sigma_px < _NO_BLUR_PX:
         return frame
     height, width = frame.shape[:2]

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
 from .detections import DetectionFrame
-from .video import opencv
 
 # No edge of an image is narrower: pixels have a size, and noise is smoothed before it is looked for.
 NARROWEST_EDGE_PX = 3.0
@@ -62,7 +62,7 @@ class MotionDetector:
     """
 
     def __init__(self, background: Background = "mog2") -> None:
-        self._cv2 = opencv()
+        self._cv2 = optional("cv2")
         self._background = self._make_background(background)
         self._seen = 0
 
@@ -142,7 +142,7 @@ class MotionDetector:
 
 def _difference(frame: ImageArray, background: ImageArray) -> Float32Array:
     """Return the largest difference over the colours between a frame and its background, (height, width)."""
-    cv2 = opencv()
+    cv2 = optional("cv2")
     apart = cv2.absdiff(frame, background)
     apart = apart if apart.ndim == 2 else apart.max(axis=2)
     smooth: Float32Array = cv2.GaussianBlur(apart.astype(np.float32), (0, 0), _SMOOTHING_PX)
@@ -164,7 +164,7 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
     # A pixel of the outline is an edge if within `width_px` of it the change rises by its whole contrast over
     # at most that width: regions without a gradient at their boundary are changes of the light (Javed,
     # Shafique and Shah, 2002).
-    cv2 = opencv()
+    cv2 = optional("cv2")
     contrast = float(np.percentile(apart[region], _CONTRAST_PERCENTILE))
     across, down = (cv2.Sobel(apart, cv2.CV_32F, *order, scale=1.0 / 8.0) for order in ((1, 0), (0, 1)))
     reach = np.ones((2 * round(width_px) + 1,) * 2, dtype=np.uint8)

@@ -12,7 +12,6 @@ from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntAr
 
 from .box_linking import overlaps
 from .detections import MAX_BOXES_A_FRAME, DetectionFrame
-from .video import opencv
 
 # ONNX files are protocol buffers, which end at 2 GiB.
 MAX_BYTES = 2 << 30
@@ -94,7 +93,7 @@ class OnnxDetector:
         return self._best(np.clip(boxes / scale, 0.0, limits), scores, classes)
 
     def _letterbox(self, frame: ImageArray) -> tuple[Float32Array, float]:
-        cv2 = opencv()
+        cv2 = optional("cv2")
         height, width = frame.shape[:2]
         scale = min(self._size[0] / height, self._size[1] / width)
         fitted = cv2.resize(frame, (max(round(width * scale), 1), max(round(height * scale), 1)))

@@ -18,9 +18,8 @@ from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
-from worldstate.operations.training.folds import folds_by_recording, out_of_fold
 from worldstate.operations.training.site_references import with_site_references
-from worldstate.operations.training.training import fit_ensemble
+from worldstate.operations.training.training import fit_ensemble, folds_by_recording, out_of_fold
 
 SETTINGS = SiteEstimateSettings()
 

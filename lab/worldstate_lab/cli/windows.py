@@ -59,7 +59,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc
-from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
+from worldstate.operations.training.training import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
 from worldstate_lab.metrics.by_group import auroc_by_group, macro, rate, worst_rate

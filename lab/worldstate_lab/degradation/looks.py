@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from worldstate.adapters.camera.camera_channel import any_motion
 from worldstate.adapters.camera.camera_health import (
     LARGEST_PX,
     LEVELS,
@@ -23,8 +22,9 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionFram
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.motion_detector import Background, MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import Video, opencv
+from worldstate.adapters.camera.video import Video, any_motion
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import FloatArray, ImageArray
 from worldstate.ground.values import nanoseconds
 from worldstate.operations.recordings.hop_table import HopTable
@@ -153,7 +153,7 @@ def _reduced(frame: ImageArray, width_px: int) -> ImageArray:
     if width <= width_px:
         return frame
     size = (width_px, max(round(height * width_px / width), 1))
-    cv2 = opencv()
+    cv2 = optional("cv2")
     reduced: ImageArray = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
     return reduced
 
@@ -168,7 +168,7 @@ def _centre(frame: ImageArray) -> ImageArray:
 @contextmanager
 def _one_opencv_thread() -> Iterator[None]:
     """Keep OpenCV on the calling thread: recordings are what is worked on side by side."""
-    cv2 = opencv()
+    cv2 = optional("cv2")
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

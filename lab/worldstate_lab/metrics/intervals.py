@@ -23,7 +23,7 @@ from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import poisson_interval
-from worldstate.operations.training.folds import recording_labels
+from worldstate.operations.training.training import recording_labels
 
 # Twelve draws lie beyond each end of the interval.
 DRAWS = 500

@@ -26,8 +26,7 @@ from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_pass
 
-from .box_tracks import box_tracks
-from .pass_labels import PassLabel, label_passes
+from .pass_labels import PassLabel, box_tracks, label_passes
 
 # No vehicle comes out of an arm nearer to the axis: one that turns there has overtaken, or was two.
 _LEAST_EDGE_RAD = math.radians(5.0)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.ground.errors import WorldstateError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import FloatArray, ImageArray
 from worldstate.operations.figure_style import BLUE, GREEN, PURPLE, RED
 from worldstate.operations.metrics.approach_table import onset_outcome, rising_edges
@@ -148,7 +149,7 @@ def _image(image: ImageArray, time_s: float, what: str, boxes: HopTable, truth: 
     height, width = image.shape[:2]
     scale = min(_IMAGE_PX / width, 1.0)
     size = (round(width * scale), round(height * scale))
-    small = opencv().resize(image, size, interpolation=opencv().INTER_AREA)
+    small = optional("cv2").resize(image, size, interpolation=optional("cv2").INTER_AREA)
     box = _box_at(boxes, time_s)
     column = (
         None
