@@ -1,5 +1,4 @@
 from .acoustic import AcousticAdapter as AcousticAdapter
-from .acoustic import AcousticSettings as AcousticSettings
 from .acoustic import Grounding as Grounding
 from .audio.sound_file import AudioSource as AudioSource
 from .audio.sound_file import RawPcm as RawPcm

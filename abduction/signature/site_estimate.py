@@ -156,8 +156,6 @@ class SiteSignature:
         The one that is asked.
     settings : SiteEstimateSettings, optional
         Forgetting time.
-    hop_s : float
-        Seconds between two windows.
     estimate : SiteEstimate, optional
         From a checkpoint; a fresh one unless given.
 
@@ -187,12 +185,10 @@ class SiteSignature:
         model: EnsembleModel,
         settings: SiteEstimateSettings | None = None,
         *,
-        hop_s: float = HOP_S,
         estimate: SiteEstimate | None = None,
     ) -> None:
         self._model = model
         self._settings = settings or SiteEstimateSettings()
-        self._hop_s = in_range("hop_s", hop_s, 0.0, np.inf, open_low=True, open_high=True)
         self.estimate = estimate or SiteEstimate.start(model.n_features)
         finite_array("estimate", self.estimate.level, (model.n_features,))
 
@@ -216,5 +212,5 @@ class SiteSignature:
         """
         window = finite_array("feature", feature, (self._model.n_features,))
         reference = self.estimate.reference(self._model)
-        self.estimate = self.estimate.updated(window, self._hop_s, self._settings)
+        self.estimate = self.estimate.updated(window, HOP_S, self._settings)
         return self._model.answer(log_levels(window)[None], reference.row[None])

@@ -17,21 +17,19 @@ from worldstate_lab.degradation.conditions import (
     FAMILIES,
     OFF,
     RAIN_DB,
+    READINGS,
     Condition,
     all_conditions,
+    degradation_in,
     degrade_reduced,
+    detections_in,
+    health_of,
     level_rms,
+    look,
+    motion_detectors,
     rained,
 )
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
-from worldstate_lab.degradation.looks import (
-    READINGS,
-    degradation_in,
-    detections_in,
-    health_of,
-    look,
-    motion_detectors,
-)
 from worldstate_lab.degradation.staged_filter import (
     STATES,
     by_condition,
@@ -46,8 +44,7 @@ from worldstate_lab.evaluation.report.degradation_section import (
     stream_table,
     sweep_tables,
 )
-from worldstate_lab.trials.attempts import Failed, attempted
-from worldstate_lab.trials.pass_cache import PassCache
+from worldstate_lab.trials.pass_cache import Failed, PassCache, attempted
 
 from worldstate.abduction.co_evidence import Absent, default_miss_rates
 from worldstate.adapters.audio.sound_file import open_sound

@@ -17,9 +17,8 @@ from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STA
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
-from worldstate_lab.metrics.bearing_gating import bearing_curve
+from worldstate_lab.metrics.track_measures import bearing_curve
 from worldstate_lab.streets.simulated_windows import simulated_window_pair
-from worldstate_lab.trials.attempts import Failed
 from worldstate_lab.trials.classification import (
     Classifiers,
     classified,
@@ -30,8 +29,8 @@ from worldstate_lab.trials.classification import (
 )
 from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import pass_time_s
-from worldstate_lab.trials.takes import Take, TakeList
-from worldstate_lab.trials.trial import Decisions, Trial
+from worldstate_lab.trials.pass_cache import Failed
+from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
 
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features

@@ -31,10 +31,8 @@ from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.line_of_sight import VisionOnly
 from worldstate_lab.metrics.intervals import stratified_draws
-from worldstate_lab.report.pages import Document, Section, markdown_page, write_document
-from worldstate_lab.report.table import Figure, Table, Value
-from worldstate_lab.trials.takes import Take, TakeList
-from worldstate_lab.trials.trial import Decisions, Trial
+from worldstate_lab.report.table import Document, Figure, Section, Table, Value, markdown_page, write_document
+from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
 
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.metrics.approach_table import auroc

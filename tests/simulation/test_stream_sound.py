@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import soundfile
 from scipy.signal import welch
-from worldstate_lab.trials.takes import find_takes
+from worldstate_lab.trials.trial import find_takes
 
 from worldstate.adapters.datasets.ovad import Recording, choose_array
 from worldstate.cli.main import main

@@ -111,7 +111,9 @@ class FactorGraph:
 
 # Of (theta, theta_dot, rho) of an entity of which nothing is known: anywhere, passing or closing at
 # up to the rates of a vehicle some ten metres away.
-_START_STD = (1.5, 0.7, 0.7)
+_START_STD = (1.5, 0.7, 0.7, 0.7)
+# Distance at which an entity is first observed; the last deviation is of its logarithm.
+_START_M = 25.0
 _BLOCK_NS = 1_000_000_000
 
 
@@ -281,9 +283,8 @@ class FixedLagSmoother:
 
     def _first(self, entity: str, stamp_ns: int, every: Sequence[Observation]) -> _Entity:
         """Begin an entity where it is first observed, with a prior that is wide in all else."""
-        chosen = self.settings
         toward = next((one.azimuth_rad for one in every if isinstance(one, Bearing)), None)
-        log_m = math.log(next((one.range_m for one in every if isinstance(one, Range)), chosen.range_m))
+        log_m = math.log(next((one.range_m for one in every if isinstance(one, Range)), _START_M))
         place = next((one.position_m for one in every if isinstance(one, Position)), None)
         if place is not None:
             toward, log_m = math.atan2(place[1], place[0]), math.log(max(math.hypot(*place), 1.0))
@@ -293,9 +294,9 @@ class FixedLagSmoother:
             )
         one = self._entities[entity] = _Entity()
         state = np.array([toward, 0.0, 0.0, log_m])
-        prior = np.array([state[0], 0.0, 0.0, math.log(chosen.range_m)])
+        prior = np.array([state[0], 0.0, 0.0, math.log(_START_M)])
         key = self._add_state(one, stamp_ns, state)
-        spread = np.diag(np.square([*_START_STD, chosen.range_log_std]))
+        spread = np.diag(np.square([*_START_STD]))
         self._graph.add(f.prior_factor(key, prior, spread))
         return one
 

@@ -62,13 +62,16 @@ from worldstate.operations.metrics.approach_table import auroc
 from worldstate.operations.training.training import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
-from worldstate_lab.metrics.by_group import auroc_by_group, macro, rate, worst_rate
 from worldstate_lab.metrics.intervals import (
     DRAWS,
+    auroc_by_group,
     calibration_error_sampling,
+    macro,
     middle,
     paired_gains,
+    rate,
     recording_draws,
+    worst_rate,
 )
 
 # The floor belongs to the risks: another seed in every run would only add noise to it.

@@ -39,8 +39,22 @@ from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stre
 from worldstate_lab.metrics.intervals import middle, poisson_upper, stratified_draws
 
 from .awareness import Estimate
-from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions, level_rms, rained
-from .looks import READINGS, StagedDetector, degradation_in, detections_in
+from .conditions import (
+    CLEAN,
+    LENS,
+    OFF,
+    RAIN,
+    RAIN_DB,
+    READINGS,
+    ROOF,
+    Condition,
+    StagedDetector,
+    all_conditions,
+    degradation_in,
+    detections_in,
+    level_rms,
+    rained,
+)
 
 # Changes whenever the same sound and looks would give other beliefs.
 VERSION = 5

@@ -11,8 +11,7 @@ from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, cauti
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate_lab.metrics.intervals import deal_folds
 from worldstate_lab.trials.classification import Classifiers, TrainedOn, junction_of
-from worldstate_lab.trials.takes import Take
-from worldstate_lab.trials.trial import Decisions, Method, Trial
+from worldstate_lab.trials.trial import Decisions, Method, Take, Trial
 
 FOLDS = 5
 

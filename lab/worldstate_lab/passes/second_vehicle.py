@@ -16,9 +16,8 @@ from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.approach_table import SLACK_S, Figures, StreamApproach, mean_of
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
 
-from .band_levels import added_db
 from .followed_stream import PassedStream
-from .pass_outcomes import SEEN_AFTER_S, seen_at, vehicle_at
+from .pass_outcomes import SEEN_AFTER_S, added_db, seen_at, vehicle_at
 
 WITHIN_S, NOTICED_DB, STATED = 3.0, 1.0, 0.3
 JUST_LEFT_S = 2.0  # What has left the view is as loud as it was for so long, and masks as before

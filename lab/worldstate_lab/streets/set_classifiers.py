@@ -24,7 +24,7 @@ from worldstate.operations.training.training import folds_by_recording
 from worldstate_lab.features.published_classifier import PublishedClassifier
 from worldstate_lab.metrics.intervals import Interval, middle, recording_draws
 
-from .window_measures import (
+from .simulated_windows import (
     AZIMUTHS_DEG,
     CLASS_GROUPS,
     DESCRIPTORS,

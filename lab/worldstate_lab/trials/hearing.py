@@ -14,7 +14,6 @@ from worldstate.ground.serialisation import encode
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.trials.pass_cache import origin_of
 
-from .attempts import Failed
 from .listening import (
     VERSION,
     chain_tables,
@@ -23,9 +22,8 @@ from .listening import (
     model_refusal,
     unfiltered_decisions,
 )
-from .pass_cache import PassCache, content_hash, fingerprint
-from .takes import Take
-from .trial import DECISION_COLUMNS, Decisions, Trial
+from .pass_cache import Failed, PassCache, content_hash, fingerprint
+from .trial import DECISION_COLUMNS, Decisions, Take, Trial
 
 ALPHA = 0.02
 # Streams are cut into pieces of this length, dealt to folds in their order: a threshold is then set on other

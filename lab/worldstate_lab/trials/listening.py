@@ -36,7 +36,6 @@ from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.state import RiskCue, WorldState
 from worldstate_lab.metrics.stream_statistic import stream_statistic
 
-from .takes import Take
 from .trial import (
     BOX_COLUMNS,
     DECISION_COLUMNS,
@@ -46,6 +45,7 @@ from .trial import (
     TRACK_COLUMNS,
     TRUTH_COLUMNS,
     Decisions,
+    Take,
 )
 
 # Changes whenever a pass over the same recording would give other numbers.

@@ -18,8 +18,7 @@ from worldstate.operations.metrics.approach_table import onset_outcome, rising_e
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.evaluation.evaluation import ALPHA, Evaluation
 from worldstate_lab.evaluation.protocols import STANDING
-from worldstate_lab.report.pages import Section
-from worldstate_lab.report.table import Figure
+from worldstate_lab.report.table import Figure, Section
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from .measured_values import PROPOSED

@@ -14,8 +14,7 @@ from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
 from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STANDING, Protocol
 from worldstate_lab.methods.table_rows import GROUNDED
-from worldstate_lab.report.pages import Document, Section
-from worldstate_lab.report.table import Cell, Figure, Table, Value
+from worldstate_lab.report.table import Cell, Document, Figure, Section, Table, Value
 from worldstate_lab.trials.hearing import data_fingerprint
 
 from .approach_timeline import approach_section

@@ -9,8 +9,8 @@ from worldstate.ground.typing import FloatArray, IntArray
 from worldstate.ground.values import NotUsable
 from worldstate.operations.figure_style import BLUE, RED
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.bearing_gating import PUBLISHED, bearing_curve
-from worldstate_lab.metrics.by_group import worst_group
+from worldstate_lab.metrics.intervals import worst_group
+from worldstate_lab.metrics.track_measures import PUBLISHED, bearing_curve
 from worldstate_lab.report.table import Figure, Value
 
 from .panels import COLOURS, GREY, MARKS, legend_below

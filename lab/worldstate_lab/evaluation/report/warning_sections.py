@@ -10,8 +10,7 @@ from worldstate_lab.evaluation.protocols import STANDING
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate_lab.evaluation.scores import paired
 from worldstate_lab.methods.table_rows import CURVE_ALPHAS
-from worldstate_lab.report.pages import Section
-from worldstate_lab.report.table import Cell, Figure, Table, Value
+from worldstate_lab.report.table import Cell, Figure, Section, Table, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from .approach_timeline import leads_s
