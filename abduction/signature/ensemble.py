@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
-from worldstate.ground.checks import check_shape, freeze_arrays, in_range
+from worldstate.ground.checks import check_shape, freeze_arrays, in_range, one_of
 from worldstate.ground.serialisation import ADDED, Layout, Via
 
 from .published_signature import ModelDomain, SignatureModel
@@ -201,8 +201,7 @@ class Expert:
     intercepts: FloatArray  # shape (classes,): Added to the weighted sums
 
     def __post_init__(self) -> None:
-        if self.view not in VIEWS:
-            raise InvalidArgumentError(f"view: expected one of {', '.join(VIEWS)}, got {self.view!r:.40}")
+        one_of("view", self.view, VIEWS)
         inputs, classes = np.size(self.mean), np.size(self.intercepts)
         freeze_arrays(self, mean=(inputs,), scale=(inputs,), weights=(classes, inputs), intercepts=(classes,))
         if (self.scale <= 0).any():

@@ -13,6 +13,7 @@ from scipy.ndimage import convolve, gaussian_filter, sobel
 from scipy.special import ndtri
 
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
+from worldstate.ground.checks import one_of
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
 
@@ -65,8 +66,7 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
     """
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3):
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
-    if family not in FAMILIES:
-        raise InvalidArgumentError(f"family: expected {', '.join(FAMILIES)}, got {family!r:.40}")
+    one_of("family", family, FAMILIES)
     if degradation == 0.0:
         return frame
     staged = tuple(STRENGTHS) if family == "all" else (family,)

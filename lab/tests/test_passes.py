@@ -19,11 +19,12 @@ from worldstate_lab.passes.followed_stream import (
 from worldstate_lab.passes.pass_outcomes import (
     above_place_db,
     added_db,
+    hearing_allows,
     level_db,
     pass_figures,
+    second_figures,
     sides_by_risk,
 )
-from worldstate_lab.passes.second_vehicle import hearing_allows, second_figures
 
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter, nanoseconds
 from worldstate.abduction.co_evidence import Unqueried

@@ -24,9 +24,9 @@ from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate_lab.evaluation.figures import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.front_end_study import front_end_study
 from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, ProtocolRun
-from worldstate_lab.evaluation.report.approach_timeline import approach_figure
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.panels import roc_curve
+from worldstate_lab.evaluation.report.recording_panels import approach_figure
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.line_of_sight import VisionOnly

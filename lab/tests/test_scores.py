@@ -14,7 +14,7 @@ from worldstate_lab.metrics.intervals import calibration_error_sampling, stratif
 from worldstate_lab.metrics.track_measures import gating_curve
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
-from worldstate.abduction.cueing.calibration_error import (
+from worldstate.abduction.cueing.risk_map import (
     expected_calibration_error,
 )
 from worldstate.ground.errors import InvalidArgumentError

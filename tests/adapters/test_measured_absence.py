@@ -28,8 +28,8 @@ from worldstate.adapters.camera.camera_health import (
     strength,
 )
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates, save_miss_rates
-from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import open_video, video_degradation
 from worldstate.adapters.camera.vision_query import VisionQuery

@@ -16,12 +16,12 @@ from passing_boxes import CAMERA, EDGE_RAD, LANE_M, passing
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
+from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.labelling.label_files import file_below, open_label, window_rows
 from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks, label_passes
 from worldstate.operations.labelling.street_figure import draw_passes
-from worldstate.operations.recordings.true_track import TrueTrack
 
 
 def t0_s(start_s: float, speed: float) -> float:

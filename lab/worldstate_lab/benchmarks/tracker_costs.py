@@ -5,8 +5,8 @@ measurements, their association known, by einsum.
 
 Stone Soup's GM-PHD and JPDA over azimuths, of peaks of a microphone array and boxes of a camera, get what
 their books ask for: detection probability and clutter of either sensor, a nearly constant rate of turn, and
-the sector that the camera searches. In Stone Soup the probability of detection is one number, so that a target
-outside that sector is kept from the camera's scan.
+the sector that the camera searches. In Stone Soup the probability of detection is one number, so that a
+target outside that sector is kept from the camera's scan.
 """
 
 import time

@@ -74,8 +74,8 @@ from worldstate_lab.evaluation.report.warning_sections import equal_table
 from worldstate_lab.report.table import Cell, Table, Value, plain, write_document
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
-from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import model_refusal
+from worldstate_lab.trials.pass_cache import Hearing
 from worldstate_lab.trials.trial import Take, TakeList, find_takes
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.

@@ -42,7 +42,7 @@ import numpy as np
 from joblib import Parallel, delayed
 from scipy.special import bdtrc
 
-from worldstate.abduction.cueing.calibration_error import (
+from worldstate.abduction.cueing.risk_map import (
     brier_score,
     expected_calibration_error,
 )

@@ -32,8 +32,8 @@ from worldstate.adapters.camera.camera_health import (
     strength,
 )
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
+from worldstate.adapters.camera.detectors import Background, MotionDetector
 from worldstate.adapters.camera.miss_rates import MissRates
-from worldstate.adapters.camera.motion_detector import Background, MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import Video, any_motion
 from worldstate.adapters.source import Source

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.abduction.cueing.calibration_error import BINS
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
+from worldstate.abduction.cueing.risk_map import BINS
 from worldstate.abduction.sequence.sequence_model import held
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError

@@ -18,7 +18,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.cueing.calibration_error import BINS
+from worldstate.abduction.cueing.risk_map import BINS
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError

@@ -30,6 +30,7 @@ LOWEST_RATE_HZ = 8000.0 / 0.45
 MOTOR_VEHICLES = ("car", "truck", "bus", "motorcycle")
 
 
+_OF_A_CLIP = ("kind", "microphone", "recording", "site", "split")
 _COLUMNS = ("energy", "kinds", "microphones", "recordings", "sites", "splits")
 
 
@@ -48,24 +49,11 @@ class ClipSignatures:
 
     @classmethod
     def of(
-        cls,
-        name: str,
-        rows: Sequence[tuple[ClipLabels, FloatArray]],
-        *,
-        left_out: tuple[str, ...] = (),
+        cls, name: str, rows: Sequence[tuple[ClipLabels, FloatArray]], *, left_out: tuple[str, ...] = ()
     ) -> "ClipSignatures":
         """Put clips one below the other."""
-        labels = [one for one, _ in rows]
-        return cls(
-            name=name,
-            energy=np.array([energy for _, energy in rows]),
-            kinds=np.array([one.kind for one in labels]),
-            microphones=np.array([one.microphone for one in labels]),
-            recordings=np.array([one.recording for one in labels]),
-            sites=np.array([one.site for one in labels]),
-            splits=np.array([one.split for one in labels]),
-            left_out=left_out,
-        )
+        labels = [np.array([getattr(one, column) for one, _ in rows]) for column in _OF_A_CLIP]
+        return cls(name, np.array([energy for _, energy in rows]), *labels, left_out=left_out)
 
     @property
     def background(self) -> BoolArray:

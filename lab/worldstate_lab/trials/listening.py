@@ -15,6 +15,7 @@ from worldstate.adapters.acoustic import Grounding, observe
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.datasets.ovad import read_true_tracks
 from worldstate.adapters.files.acoustic_domain import TRAIN, feature_order
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import Step, listen_steps, measure_steps
@@ -32,7 +33,6 @@ from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream
-from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.state import RiskCue, WorldState
 from worldstate_lab.metrics.stream_statistic import stream_statistic
 

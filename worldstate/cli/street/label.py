@@ -44,10 +44,10 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
+    from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.operations.labelling.label_files import file_below, write_open_label, write_window_labels
     from worldstate.operations.labelling.pass_labels import box_tracks, label_passes
     from worldstate.operations.labelling.street_figure import write_pass_figure
-    from worldstate.operations.recordings.true_track import read_true_tracks
 
     output.check_outputs(arguments, "out", "windows", figures=("figure",))
     source, detections = sensors.camera_source(arguments, inputs.sound_of(arguments))

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 from zlib import crc32
 
 import numpy as np
@@ -30,6 +30,7 @@ from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.checks import one_of
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
@@ -95,8 +96,7 @@ class CueingSettings:
         in_range("block_s", self.block_s, 1.0, 3600.0)
         if self.keep_per_hour is not None:
             AdaptiveBudget(self.keep_per_hour)
-        if self.method not in ("conformal", "plain"):
-            raise InvalidArgumentError(f"method: expected conformal or plain, got {self.method!r:.40}")
+        one_of("method", self.method, get_args(ThresholdKind))
 
     @property
     def block_hops(self) -> int:

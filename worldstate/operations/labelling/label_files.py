@@ -1,7 +1,6 @@
 """Files of labels: trajectories in the layout of ASAM OpenLABEL, windows as `train --labels` reads them."""
 
 import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 
 from worldstate.adapters.datasets.feature_extraction import FRONT, window_ends_s
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.adapters.files.file_io import atomic_path, write_text
+from worldstate.adapters.files.file_io import atomic_path, write_json
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.version import __version__
@@ -60,7 +59,7 @@ def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
 
 def write_open_label(path: Path, recording: str, passes: Sequence[PassLabel]) -> None:
     """Write the document, whole or not at all."""
-    write_text(path, json.dumps(open_label(recording, passes), allow_nan=False) + "\n")
+    write_json(path, open_label(recording, passes))
 
 
 def window_rows(

@@ -18,7 +18,7 @@ from worldstate.ground.extras import check_extra, has_extra
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import nanoseconds, seconds
 from worldstate.measurement.measurement import Bearing
-from worldstate.smoothing.fixed_lag_smoother import FixedLagSmoother
+from worldstate.smoothing.fixed_lag_smoother import FixedLagSmoother, rts_track
 from worldstate.smoothing.observations import (
     AngularHeight,
     FirstSight,
@@ -26,7 +26,6 @@ from worldstate.smoothing.observations import (
     SmoothedTrack,
     SmoothingSettings,
 )
-from worldstate.smoothing.rts import rts_track
 from worldstate.state.context import blind_corner
 
 # A vehicle three metres ahead at 10 m/s turns by a fifth of a radian from image to image; boxes of two
