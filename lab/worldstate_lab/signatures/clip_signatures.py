@@ -7,7 +7,7 @@ problems", 1936.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -52,8 +52,9 @@ class ClipSignatures:
         cls, name: str, rows: Sequence[tuple[ClipLabels, FloatArray]], *, left_out: tuple[str, ...] = ()
     ) -> "ClipSignatures":
         """Put clips one below the other."""
-        labels = [np.array([getattr(one, column) for one, _ in rows]) for column in _OF_A_CLIP]
-        return cls(name, np.array([energy for _, energy in rows]), *labels, left_out=left_out)
+        singles = zip(_COLUMNS[1:], _OF_A_CLIP, strict=True)
+        labels: dict[str, Any] = {to: np.array([getattr(one, of) for one, _ in rows]) for to, of in singles}
+        return cls(name, np.array([energy for _, energy in rows]), left_out=left_out, **labels)
 
     @property
     def background(self) -> BoolArray:
