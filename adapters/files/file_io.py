@@ -12,7 +12,7 @@ import os
 import shutil
 import uuid
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -74,6 +74,14 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, value: object, indent: int | None = None) -> None:
     """Write a value as strict JSON, whole or not at all."""
     write_text(path, json.dumps(value, allow_nan=False, indent=indent) + "\n")
+
+
+def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write CSV with a header, whole or not at all."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 @contextmanager
