@@ -323,4 +323,4 @@ def test_results_are_merged_by_the_words_that_change_a_figure(tmp_path, capsys):
     assert found["bench --seed 3"]["seeds"] == [3] and "commit" in found["bench --seed 3"]
     path.write_text("{")
     assert main(["place", "none.csv", "--results", str(path)]) == 2
-    assert "expected results" in capsys.readouterr().err
+    assert "results of worldstate-lab: expected JSON" in capsys.readouterr().err
