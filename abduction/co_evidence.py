@@ -1,19 +1,78 @@
-"""Answers of a co-evidence channel, present, absent or unqueried, and its miss rate.
+"""Sectors that a co-evidence channel is asked about, its answers and its miss rate.
 
-Absence is a measurement and has a type of its own. A sensor that was not asked gives neither presence nor
-absence: `Unqueried`, beta = 1. The miss rate beta_c(theta, d), over azimuth and degradation, never falls.
+Answers are present, absent or unqueried. Absence is a measurement and has a type of its own. A sensor that
+was not asked gives neither presence nor absence: `Unqueried`, beta = 1. The miss rate beta_c(theta, d), over
+azimuth and degradation, never falls.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, wrap_angle
 from worldstate.ground.checks import check_fields, in_range
 from worldstate.ground.serialisation import Layout
+
+
+@dataclass(frozen=True, slots=True)
+class Sector:
+    """A range of azimuths.
+
+    Parameters
+    ----------
+    centre_rad, half_width_rad : float
+        In `base_link`, left positive.
+
+    Examples
+    --------
+    >>> Sector(0.0, 0.2).touches(0.25, width_rad=0.12), Sector(0.0, 0.2).touches(0.3)
+    (True, False)
+    """
+
+    centre_rad: float
+    half_width_rad: float
+
+    def touches(self, azimuth_rad: float, width_rad: float = 0.0) -> bool:
+        """Tell whether an object of this width, centred there, reaches into the sector."""
+        return abs(wrap_angle(azimuth_rad - self.centre_rad)) <= self.half_width_rad + width_rad / 2
+
+    def overlap(self, other: "Sector") -> "Sector | None":
+        """Return the intersection with another sector, None where empty; less than a full turn together."""
+        offset = wrap_angle(self.centre_rad - other.centre_rad)
+        low = max(offset - self.half_width_rad, -other.half_width_rad)
+        high = min(offset + self.half_width_rad, other.half_width_rad)
+        if high <= low:
+            return None
+        return Sector(wrap_angle(other.centre_rad + (low + high) / 2), (high - low) / 2)
+
+    def midpoints(self, n: int) -> FloatArray:
+        """Return the centres of n equal parts, radians, shape (n,), not wrapped."""
+        return self.centre_rad + self.half_width_rad * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
+
+    @classmethod
+    def between(cls, right_rad: float, left_rad: float) -> "Sector":
+        """Return the sector that runs from `right_rad` to the left until `left_rad`."""
+        half = (left_rad - right_rad) % (2.0 * math.pi) / 2.0
+        return cls(wrap_angle(right_rad + half), half)
+
+    @classmethod
+    def in_sight(cls, edges_rad: Iterable[float]) -> "Sector":
+        """Return the directions ahead that occluders with these edges leave free.
+
+        Examples
+        --------
+        >>> sector = Sector.in_sight([0.56, -0.56])
+        >>> sector.touches(0.5), sector.touches(0.7)
+        (True, False)
+        """
+        edges = tuple(edges_rad)
+        left = min((edge for edge in edges if edge > 0), default=math.pi / 2)
+        right = max((edge for edge in edges if edge < 0), default=-math.pi / 2)
+        return cls.between(right, left)
 
 
 @dataclass(frozen=True, slots=True)

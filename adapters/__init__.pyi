@@ -1,5 +1,4 @@
 from .acoustic import AcousticAdapter as AcousticAdapter
-from .acoustic import AcousticSettings as AcousticSettings
 from .acoustic import Grounding as Grounding
 from .audio.sound_file import AudioSource as AudioSource
 from .audio.sound_file import RawPcm as RawPcm
@@ -10,12 +9,12 @@ from .camera.detections import DetectionLog as DetectionLog
 from .camera.detections import Detector as Detector
 from .camera.detections import read_any_detections as read_any_detections
 from .camera.detections import read_detections as read_detections
+from .camera.detectors import MotionDetector as MotionDetector
+from .camera.detectors import OnnxDetector as OnnxDetector
+from .camera.detectors import open_onnx as open_onnx
 from .camera.miss_rates import MissRates as MissRates
 from .camera.miss_rates import load_miss_rates as load_miss_rates
 from .camera.miss_rates import save_miss_rates as save_miss_rates
-from .camera.motion_detector import MotionDetector as MotionDetector
-from .camera.onnx_detector import OnnxDetector as OnnxDetector
-from .camera.onnx_detector import open_onnx as open_onnx
 from .camera.pinhole import PinholeCamera as PinholeCamera
 from .camera.pinhole import read_camera as read_camera
 from .camera.video import open_video as open_video

@@ -25,31 +25,29 @@ from worldstate.abduction.road_users import (
     SIREN,
     UNKNOWN,
     ClassShares,
+    DomainGuard,
+    DomainVerdict,
+    Foreign,
     RoadUserModel,
+    WarningSignal,
     likeliest,
+    neutral,
     with_siren,
 )
 from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
-from worldstate.abduction.signature.domain_guard import (
-    DomainGuard,
-    DomainVerdict,
-    Foreign,
-    ModelDomain,
-    WarningSignal,
-    neutral,
-)
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.adapters.camera.vision_query import SeveralCameras
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.health.channel_health import ArrayHealth
-from worldstate.frontend.levels import falling
+from worldstate.frontend.hop_spectra import falling
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground import NotUsable, OutOfDomainError, in_range, wrap_angle
+from worldstate.ground import NotUsable, OutOfDomainError, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.measurement.measurement import (
     Approach,
@@ -75,6 +73,9 @@ _DEAD, _CLIPPED = (0.5, 0.85), (0.1, 0.5)
 _LOUD_DB, _MOST_MASKED = (6.0, 15.0), 0.75
 # Above, nothing that is worth a reason.
 _SAID = 0.95
+# Of a bearing: with a larger one the whole side is searched for co-evidence instead of a sector. Up to there
+# nine of ten simulated vehicles in view lie in the sector that the camera is asked about.
+_COARSE_STD_RAD = math.radians(25.0)
 
 
 class Signature(Protocol):
@@ -92,38 +93,6 @@ class Signature(Protocol):
     def evidence(self, feature: FloatArray, /) -> SignatureEvidence:
         """Return log-likelihoods of one feature vector."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class AcousticSettings:
-    """When a bearing counts.
-
-    Parameters
-    ----------
-    min_prominence : float
-        A spatial spectrum whose peak-to-median ratio is not above this, >= 1, or not above what noise reaches
-        with this array (`AcousticFrame.least_prominence`), gives no bearing.
-    coarse_std_rad : float
-        With a larger standard deviation the whole side is searched for co-evidence instead of a sector.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
-    Examples
-    --------
-    >>> AcousticSettings(min_prominence=1.2).min_prominence
-    1.2
-    """
-
-    min_prominence: float = 1.0
-    # Up to there nine of ten simulated vehicles in view lie in the sector that the camera is asked about.
-    coarse_std_rad: float = math.radians(25.0)
-
-    def __post_init__(self) -> None:
-        in_range("min_prominence", self.min_prominence, 1.0, math.inf)
-        in_range("coarse_std_rad", self.coarse_std_rad, 0.0, math.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,8 +146,6 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         Asked once a hop; without one every answer is `Unqueried`.
     start_ns : int
         Stamp of the first sample on the stream's clock.
-    settings : AcousticSettings, optional
-        When a bearing counts.
     front_end_settings : FrontEndSettings, optional
         Of the front-end.
     grounding : Grounding, optional
@@ -232,7 +199,6 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         vision: CoEvidenceChannel | None = None,
         *,
         start_ns: int = 0,
-        settings: AcousticSettings | None = None,
         front_end_settings: FrontEndSettings | None = None,
         grounding: Grounding | None = None,
         guard: DomainGuard | None = None,
@@ -259,7 +225,6 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self.last_frame: AcousticFrame | None = None
         self._model = model
         self._vision = vision
-        self._settings = settings or AcousticSettings()
         self._grounding = grounding
         self._guard = guard
         self._road_users = road_users
@@ -317,7 +282,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             measured = self._read(frame, measured)
         elif isinstance(self._sequence, SequenceReader):
             self._sequence.miss()
-        return asked_again(measured, self._vision, self._settings)
+        return asked_again(measured, self._vision)
 
     def _unheard(self, frame: AcousticFrame, heard: Heard) -> Measurement:
         """Return the measurement of a hop that could not be heard, with even likelihoods."""
@@ -338,7 +303,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         """Return the measurement of a hop with what the models read in it."""
         heard = signature = self._model.evidence(frame.feature)
         self._directions = signature.directions
-        bearing, approach = _bearing(frame, self._settings), _approach(frame)
+        bearing, approach = _bearing(frame), _approach(frame)
         if isinstance(bearing, Bearing):
             direct = direct_probability(frame.peaks)
             signature = with_bearing_vote(signature, bearing.azimuth_rad, bearing.std_rad, direct)
@@ -412,36 +377,33 @@ def heard_of(frame: AcousticFrame) -> Heard:
     return Heard(share, reason if share < _SAID else None, frame.excess_db)
 
 
-def asked_again(
-    measurement: Measurement, vision: CoEvidenceChannel | None, settings: AcousticSettings | None = None
-) -> Measurement:
+def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:
     """Return a measurement with the answers of a camera, or of none; what was heard stays as it is."""
     if vision is None:
         return replace(measurement, co_evidence=Unqueried("no camera"), sightings=(), look=None, further=())
     stamp_ns = measurement.stamp_ns
     return replace(
         measurement,
-        co_evidence=_answer(measurement, vision, settings or AcousticSettings()),
+        co_evidence=_answer(measurement, vision),
         sightings=vision.sightings(stamp_ns),
         look=vision.last_look(stamp_ns),
         further=vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else (),
     )
 
 
-def _answer(measurement: Measurement, vision: CoEvidenceChannel, settings: AcousticSettings) -> CoEvidence:
+def _answer(measurement: Measurement, vision: CoEvidenceChannel) -> CoEvidence:
     bearing, labels = measurement.bearing, expected_labels(measurement.kinds)
-    if isinstance(bearing, Bearing) and bearing.std_rad <= settings.coarse_std_rad:
+    if isinstance(bearing, Bearing) and bearing.std_rad <= _COARSE_STD_RAD:
         return vision.ask(measurement.stamp_ns, bearing, labels)
     side = _likelier_side(measurement.signature)
     return vision.ask(measurement.stamp_ns, NotUsable("coarse bearing"), labels, side)
 
 
-def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotUsable:
+def _bearing(frame: AcousticFrame) -> Bearing | NotUsable:
     if not math.isfinite(frame.bearing_rad):
         return NotUsable("no peak in the spatial spectrum")
-    least = max(settings.min_prominence, frame.least_prominence)
-    if frame.prominence <= least:
-        ratio = f"{frame.prominence:.2f}, not above {least:.2f}"
+    if frame.prominence <= frame.least_prominence:
+        ratio = f"{frame.prominence:.2f}, not above {frame.least_prominence:.2f}"
         return NotUsable(f"peak-to-median ratio {ratio}")
     return Bearing(wrap_angle(frame.bearing_rad), frame.bearing_std_rad, frame.prominence)
 

@@ -16,8 +16,8 @@ from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.fixed_lag import Timed
-from worldstate.frontend.frame import AcousticFrame
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.frontend.stream import AcousticFrame
+from worldstate.ground.checks import one_of
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
@@ -167,9 +167,7 @@ class Listener:
         """
         vision = self._vision
         cameras = vision.cameras if isinstance(vision, SeveralCameras) else {SENSOR: vision}
-        if camera not in cameras:
-            raise InvalidArgumentError(f"camera: expected one of {', '.join(cameras)}, got {camera}")
-        cameras[camera].see(stamp_ns, frame)
+        cameras[one_of("camera", camera, cameras)].see(stamp_ns, frame)
 
     @property
     def checkpoint(self) -> Checkpoint:

@@ -6,20 +6,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypedDict, TypeVar
 
+from worldstate.abduction.co_evidence import Sector
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.road_users import RoadUserModel
+from worldstate.abduction.road_users import DomainGuard, RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import SidePatterns, StreetHearing, StreetListener
-from worldstate.abduction.signature.domain_guard import DomainGuard, ModelDomain
 from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.sound_file import SoundInput, SoundStream, as_sound, path_of
-from worldstate.adapters.camera.camera_channel import video_degradation, watched
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector, read_any_detections
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video, video_degradation, watched
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
 from worldstate.adapters.datasets.ovad import Recording, choose_array
 from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, heard_with, states_budget
@@ -33,7 +33,6 @@ from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, featu
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
-from worldstate.measurement.sector import Sector
 from worldstate.state import Context
 
 from .acoustic import Grounding, Signature

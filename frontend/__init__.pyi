@@ -22,8 +22,8 @@ from .direction.gcc_phat import gcc_delays as gcc_delays
 from .direction.music import count_sources as count_sources
 from .direction.music import music_spectrum as music_spectrum
 from .ego_noise.ego_noise import EgoNoiseSettings as EgoNoiseSettings
-from .frame import AcousticFrame as AcousticFrame
 from .health.channel_health import ArrayHealth as ArrayHealth
 from .health.channel_health import ChannelFault as ChannelFault
 from .settings import FrontEndSettings as FrontEndSettings
+from .stream import AcousticFrame as AcousticFrame
 from .stream import FrontEnd as FrontEnd

@@ -18,6 +18,14 @@ from .risk_map import PlattMap, RiskMap
 SECONDS_PER_HOUR = 3600.0
 # Odds of half a billion to one: beyond them a shift of the threshold means nothing.
 _EXTREME_LOGIT = 20.0
+# eta, the shift that one false alarm brings, and the bounds of the shift; downward it keeps quiet nights from
+# making every rustle an alarm.
+STEP_NATS, MOST_UP_NATS, MOST_DOWN_NATS = 0.25, 2.0, 1.0
+# Filtered P(none) from which on the street is believed empty, and P(visible) from which on something has
+# come: the alarm was right.
+_EMPTY, _CAME = 0.5, 0.5
+# An alarm this old without anything having come counts as false, and again after as long.
+_LONGEST_ALARM_S = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +43,7 @@ class AdaptiveBudget:
     .. math:: \lambda T + (x_{down} + x_{up}) / \eta + 1,
 
     as long as the shift stays below its upper bound. That bound is there so that the threshold can never go
-    deaf: the shift is at most `most_up_nats`, and the threshold never above `highest` unless it was
+    deaf: the shift is at most `MOST_UP_NATS`, and the threshold never above `highest` unless it was
     calibrated there. A hazard whose odds are e^{x_up} times those at the calibrated threshold, or whose
     statistic is at `highest`, is announced however many alarms went before; the budget gives way first.
 
@@ -43,18 +51,8 @@ class AdaptiveBudget:
     ----------
     rate_per_hour : float
         lambda, false alarms per hour of empty street, > 0.
-    step_nats : float
-        eta, the shift that one false alarm brings.
-    most_up_nats, most_down_nats : float
-        Bounds of the shift; downward it keeps quiet nights from making every rustle an alarm.
     highest : float
         Largest threshold that a shift may lead to, in (0, 1): one that most approaches reach.
-    empty_probability : float
-        Filtered P(none) from which on the street is believed empty.
-    seen_probability : float
-        Filtered P(visible) from which on an alarm is believed to have been right: something came.
-    longest_alarm_s : float
-        An alarm this old without anything having come counts as false, and again after as long.
 
     Raises
     ------
@@ -63,28 +61,16 @@ class AdaptiveBudget:
 
     Examples
     --------
-    >>> AdaptiveBudget(rate_per_hour=20.0).most_up_nats
-    2.0
+    >>> AdaptiveBudget(rate_per_hour=20.0).highest
+    0.99
     """
 
     rate_per_hour: float
-    step_nats: float = 0.25
-    most_up_nats: float = 2.0
-    most_down_nats: float = 1.0
     highest: float = 0.99
-    empty_probability: float = 0.5
-    seen_probability: float = 0.5
-    longest_alarm_s: float = 15.0
 
     def __post_init__(self) -> None:
         in_range("rate_per_hour", self.rate_per_hour, 0.0, 1e5, open_low=True)
-        in_range("step_nats", self.step_nats, 0.0, 10.0, open_low=True)
-        in_range("most_up_nats", self.most_up_nats, 0.0, _EXTREME_LOGIT)
-        in_range("most_down_nats", self.most_down_nats, 0.0, _EXTREME_LOGIT)
         in_range("highest", self.highest, 0.0, 1.0, open_low=True, open_high=True)
-        in_range("empty_probability", self.empty_probability, 0.0, 1.0, open_low=True)
-        in_range("seen_probability", self.seen_probability, 0.0, 1.0, open_low=True)
-        in_range("longest_alarm_s", self.longest_alarm_s, 0.0, 1e6, open_low=True)
 
     def gamma(self, calibrated: float, shift_nats: float) -> float:
         r"""Return the threshold at a shift; never above `highest` unless it was calibrated there.
@@ -143,22 +129,22 @@ class AdaptiveThreshold:
         """
         onset = alarm and not self.alarm
         pending_s = 0.0 if onset and self.pending_s is None else self.pending_s
-        empty = not alarm and none >= budget.empty_probability
+        empty = not alarm and none >= _EMPTY
         # False alarms less those that the budget allows; None where an alarm was right or is not judged yet.
         events: float | None = None
         if pending_s is None:
             events = -budget.rate_per_hour * (elapsed_s / SECONDS_PER_HOUR if empty else 0.0)
-        elif visible >= budget.seen_probability:
+        elif visible >= _CAME:
             pending_s = None
         elif empty:
             events, pending_s = 1.0, None
-        elif pending_s + elapsed_s >= budget.longest_alarm_s:
+        elif pending_s + elapsed_s >= _LONGEST_ALARM_S:
             events, pending_s = 1.0, 0.0
         else:
             pending_s += elapsed_s
         shift = self.shift_nats
         if events is not None:
-            shift = min(max(shift + budget.step_nats * events, -budget.most_down_nats), budget.most_up_nats)
+            shift = min(max(shift + STEP_NATS * events, -MOST_DOWN_NATS), MOST_UP_NATS)
         return AdaptiveThreshold(shift, pending_s, alarm)
 
 

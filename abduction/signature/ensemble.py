@@ -20,13 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import check_shape, finite_array, freeze_arrays, in_range
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
+from worldstate.ground.checks import check_shape, freeze_arrays, in_range, one_of
 from worldstate.ground.serialisation import ADDED, Layout, Via
 
-from .domain_guard import ModelDomain
-from .published_signature import SignatureModel
-from .site_reference import KINDS, SiteReference, log_levels
+from .published_signature import ModelDomain, SignatureModel
 from .window_classes import (
     CLASSES,
     EXPLANATION_COLUMNS,
@@ -36,6 +34,86 @@ from .window_classes import (
     mirrored_classes,
     window_evidence,
 )
+
+SMALLEST_LEVEL = 1e-4
+QUIET_SHARE = 0.35
+KINDS = ("mean", "median", "quiet")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteReference:
+    """Three unlabelled summaries of the log-levels at one site.
+
+    Examples
+    --------
+    >>> site_reference(np.log([[1.0, 2.0], [1.0, 4.0], [1.0, 8.0]])).median.round(2)
+    array([0.  , 1.39])
+    """
+
+    mean: FloatArray  # shape (features,): Over all windows
+    median: FloatArray
+    # shape (features,): Mean over the 35 % of the windows whose loudest feature is the least: close to what
+    # the site is like while no vehicle comes, whatever share of the windows that is.
+    quiet: FloatArray
+
+    @property
+    def row(self) -> FloatArray:
+        """The three summaries one after the other, shape (3 * features,): what stands behind a window."""
+        return np.concatenate([getattr(self, kind) for kind in KINDS])
+
+    @classmethod
+    def from_row(cls, row: ArrayLike) -> "SiteReference":
+        """Return the reference whose `row` this is.
+
+        Shapes: row (3 * features,).
+        """
+        values = finite_array("reference", row, (None,))
+        if values.size % len(KINDS):
+            raise InvalidArgumentError(f"reference: expected a multiple of three numbers, got {values.size}")
+        return cls(*values.reshape(len(KINDS), -1))
+
+    def shifted(self, offset: ArrayLike) -> "SiteReference":
+        """Return the reference of a site whose log-levels are higher by `offset`, shape (features,).
+
+        Shapes: offset (features,).
+        """
+        # `r' = r + offset` for each of the three.
+        return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
+
+
+def log_levels(X: ArrayLike) -> FloatArray:
+    r"""Return the natural logarithm of levels, silence held at 1e-4.
+
+    .. math:: x = \ln \max(X, 10^{-4})
+
+    Examples
+    --------
+    >>> log_levels([[1.0, 0.0]]).round(2)
+    array([[ 0.  , -9.21]])
+    """
+    return np.log(np.maximum(np.asarray(X, dtype=np.float64), SMALLEST_LEVEL))
+
+
+def site_reference(levels: ArrayLike) -> SiteReference:
+    r"""Return the reference of a site from its windows, shape (windows, features), natural logarithms.
+
+    .. math:: r = \big(\langle x \rangle,\; \mathrm{median}\, x,\;
+              \langle x \mid \max_a x_a \le q_{0.35} \rangle\big)
+
+    Shapes: levels (windows, features).
+
+    Examples
+    --------
+    >>> site_reference(np.array([[0.0, 1.0], [2.0, 3.0]])).row
+    array([1., 2., 1., 2., 0., 1.])
+    """
+    windows = finite_array("levels", levels, (None, None))
+    if not len(windows):
+        raise InvalidArgumentError("levels: expected at least one window")
+    loudest = windows.max(axis=1)
+    quiet = windows[loudest <= np.quantile(loudest, QUIET_SHARE)]
+    return SiteReference(windows.mean(axis=0), np.median(windows, axis=0), quiet.mean(axis=0))
+
 
 SEGMENTS = 2
 
@@ -123,8 +201,7 @@ class Expert:
     intercepts: FloatArray  # shape (classes,): Added to the weighted sums
 
     def __post_init__(self) -> None:
-        if self.view not in VIEWS:
-            raise InvalidArgumentError(f"view: expected one of {', '.join(VIEWS)}, got {self.view!r:.40}")
+        one_of("view", self.view, VIEWS)
         inputs, classes = np.size(self.mean), np.size(self.intercepts)
         freeze_arrays(self, mean=(inputs,), scale=(inputs,), weights=(classes, inputs), intercepts=(classes,))
         if (self.scale <= 0).any():

@@ -12,17 +12,18 @@ from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
 from .ensemble import (
+    KINDS,
     PRIOR_S,
     SEGMENTS,
     SHAPE,
     SHAPE_CHANGE,
     EnsembleModel,
     Expert,
+    SiteReference,
     expert_views,
     mirror_features,
     split_reference,
 )
-from .site_reference import KINDS, SiteReference
 from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, mirrored_classes
 
 # Of a simulated window beside a real one, and the part of it that says the other side. At weights from .5

@@ -7,7 +7,7 @@ the training set leaves likelihoods, which is what eq. (6) takes.
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.cueing.risk_map import sigmoid
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import finite_array, freeze_arrays
+from worldstate.ground.checks import finite_array, freeze_arrays, in_range
 from worldstate.ground.serialisation import ADDED, Layout
 
-from .domain_guard import ModelDomain
 from .window_classes import (
     CLASSES,
     EXPLANATION_COLUMNS,
@@ -26,6 +25,59 @@ from .window_classes import (
     evidence_of,
     explanation_ratios,
 )
+
+EgoMotion = Literal["standing", "moving", "any"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelDomain:
+    """Of what the windows were made that a model was trained on, or that a table holds.
+
+    Parameters
+    ----------
+    array : str
+        Name of the microphone array.
+    positions_m : ndarray, shape (M, 3)
+        Its microphones in the order of the channels, `base_link` axes, metres.
+    sample_rate_hz : (float, float)
+        Lowest and highest rate with frames of 512; lower ones with frames shorter by as much count as these.
+    band_hz : (float, float)
+        Band of the feature.
+    feature : str
+        Name and version of the feature.
+    ego_motion : {"standing", "moving", "any"}
+        What the ego vehicle did.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the positions are no (M, 3) array of finite numbers or an interval is empty.
+
+    Examples
+    --------
+    >>> ModelDomain("pair", [[0, 0.1, 0], [0, -0.1, 0]], (47e3, 49e3), (50, 1500), "f 1", "standing").extent_m
+    (0.0, 0.2, 0.0)
+    """
+
+    array: str
+    positions_m: FloatArray
+    sample_rate_hz: tuple[float, float]
+    band_hz: tuple[float, float]
+    feature: str
+    ego_motion: EgoMotion
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, positions_m=(None, 3))
+        for name in ("sample_rate_hz", "band_hz"):
+            low, high = getattr(self, name)
+            in_range(name, low, 0.0, high)
+
+    @property
+    def extent_m(self) -> tuple[float, float, float]:
+        """Extent of the array along x, y and z, metres."""
+        x, y, z = np.ptp(self.positions_m, axis=0).tolist()
+        return x, y, z
+
 
 # All pairs i < j in the order of a one-against-one machine.
 PAIRS = tuple(combinations(range(len(CLASSES)), 2))

@@ -28,9 +28,8 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
 
-from .domain_guard import ModelDomain
-from .ensemble import EnsembleModel
-from .site_reference import SiteReference, log_levels
+from .ensemble import EnsembleModel, SiteReference, log_levels
+from .published_signature import ModelDomain
 
 # Share of the difference in level that is carried over; all of the pattern is.
 _LEVEL_GAIN = 0.25
@@ -157,8 +156,6 @@ class SiteSignature:
         The one that is asked.
     settings : SiteEstimateSettings, optional
         Forgetting time.
-    hop_s : float
-        Seconds between two windows.
     estimate : SiteEstimate, optional
         From a checkpoint; a fresh one unless given.
 
@@ -175,7 +172,7 @@ class SiteSignature:
     Examples
     --------
     >>> from worldstate.abduction.signature.ensemble import Expert
-    >>> from worldstate.abduction.signature.site_reference import SiteReference
+    >>> from worldstate.abduction.signature.ensemble import SiteReference
     >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
     >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))), np.zeros(6))
     >>> signature = SiteSignature(model)
@@ -188,12 +185,10 @@ class SiteSignature:
         model: EnsembleModel,
         settings: SiteEstimateSettings | None = None,
         *,
-        hop_s: float = HOP_S,
         estimate: SiteEstimate | None = None,
     ) -> None:
         self._model = model
         self._settings = settings or SiteEstimateSettings()
-        self._hop_s = in_range("hop_s", hop_s, 0.0, np.inf, open_low=True, open_high=True)
         self.estimate = estimate or SiteEstimate.start(model.n_features)
         finite_array("estimate", self.estimate.level, (model.n_features,))
 
@@ -217,5 +212,5 @@ class SiteSignature:
         """
         window = finite_array("feature", feature, (self._model.n_features,))
         reference = self.estimate.reference(self._model)
-        self.estimate = self.estimate.updated(window, self._hop_s, self._settings)
+        self.estimate = self.estimate.updated(window, HOP_S, self._settings)
         return self._model.answer(log_levels(window)[None], reference.row[None])

@@ -14,6 +14,7 @@ import numpy as np
 import soundfile
 
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
+from worldstate.ground.checks import one_of
 from worldstate.ground.typing import Float32Array
 
 CONTAINERS = ("WAV", "WAVEX", "RF64", "W64", "FLAC")
@@ -373,9 +374,7 @@ class RawPcm(SoundStream):
     def __post_init__(self) -> None:
         in_range("sample_rate_hz", self.sample_rate_hz, 1, 10_000_000)
         in_range("channels", self.channels, 1, MAX_CHANNELS)
-        if self.encoding not in SUBTYPES:
-            known = ", ".join(SUBTYPES)
-            raise InvalidArgumentError(f"encoding: expected one of {known}, got {self.encoding!r}")
+        one_of("encoding", self.encoding, SUBTYPES)
 
     def open(self) -> "RawAudio":
         """Read its first second."""

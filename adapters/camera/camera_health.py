@@ -13,9 +13,9 @@ from scipy.ndimage import convolve, gaussian_filter, sobel
 from scipy.special import ndtri
 
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
+from worldstate.ground.checks import one_of
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
-
-from .video import opencv
 
 Family = Literal["blur", "darkness", "noise", "all"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
@@ -66,8 +66,7 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
     """
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3):
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
-    if family not in FAMILIES:
-        raise InvalidArgumentError(f"family: expected {', '.join(FAMILIES)}, got {family!r:.40}")
+    one_of("family", family, FAMILIES)
     if degradation == 0.0:
         return frame
     staged = tuple(STRENGTHS) if family == "all" else (family,)
@@ -78,7 +77,7 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
 
 def blurred(frame: ImageArray, sigma_px: float, rng: np.random.Generator) -> ImageArray:
     """Blur; a wide one on a reduced image, whose pixels are themselves a box of variance (f^2 - 1) / 12."""
-    cv2 = opencv()
+    cv2 = optional("cv2")
     if sigma_px < _NO_BLUR_PX:
         return frame
     height, width = frame.shape[:2]

@@ -1,31 +1,28 @@
-"""Frames of a video file, by OpenCV, which comes with the extra `vision`."""
+"""Frames of a video file, by OpenCV, which comes with the extra `vision`, and what is seen in them.
 
-from collections.abc import Iterator
+A detector with measured miss rates looks at every frame; its degradation is read from the same images.
+"""
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import ImageArray
+from worldstate.ground.values import nanoseconds
 
-from .detections import MAX_FRAMES
+from .camera_health import DegradationLog, HealthMonitor, image_quality
+from .detections import MAX_FRAMES, DetectionFilter, DetectionFrame, DetectionLog, Detector
+from .miss_rates import MissRates
 
 # OVAD's name for the video beside a recording's sound.
 VIDEO_NAME = "ueye_stereo_vid.mp4"
 # A bound on the memory of one decoded image: 200 MB.
 MAX_SIDE_PX = 8192
-
-
-def opencv() -> Any:
-    """Return the module `cv2`.
-
-    Examples
-    --------
-    >>> opencv().__name__
-    'cv2'
-    """
-    return optional("cv2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +85,7 @@ def open_video(path: str | Path) -> Video:
     name = Path(path)
     capture = _open(name)
     try:
-        cv2 = opencv()
+        cv2 = optional("cv2")
         width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         rate, count = (float(capture.get(p)) for p in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
     finally:
@@ -103,8 +100,63 @@ def open_video(path: str | Path) -> Video:
 def _open(path: Path) -> Any:
     if not path.is_file():
         raise InputFileError(path, "expected a video file, nothing is there")
-    capture = opencv().VideoCapture(str(path))
+    capture = optional("cv2").VideoCapture(str(path))
     if not capture.isOpened():
         capture.release()
         raise InputFileError(path, "expected a video file, it cannot be opened as one")
     return capture
+
+
+# Period of the degradation estimate: it costs as much as a detection, and dirt or dusk take longer.
+HEALTH_PERIOD_NS = 400_000_000
+
+
+class ImageHealth:
+    """Degradation d of a camera, read from its images once a period; 0 without a scale of its health."""
+
+    def __init__(self, rates: MissRates | None, period_ns: int = HEALTH_PERIOD_NS) -> None:
+        self._rates, self._period_ns = rates, period_ns
+        self._monitor = None if rates is None or rates.health is None else HealthMonitor(rates.health)
+        self._read_ns: int | None = None
+        self.level = 0.0
+
+    def read(self, stamp_ns: int, frame: ImageArray) -> float:
+        """Take the next image; return d as last read."""
+        due = self._read_ns is None or stamp_ns - self._read_ns >= self._period_ns
+        if due and self._monitor is not None and self._rates is not None:
+            self._read_ns = stamp_ns
+            self.level = self._rates.level(self._monitor.update(stamp_ns, image_quality(frame)))
+        return self.level
+
+
+def watched(video: Video, detector: Detector, rates: MissRates | None) -> tuple[DetectionLog, DegradationLog]:
+    """Return what a new detector finds in a video, each image decoded once, and d as last read from it.
+
+    Rates are those measured for this detector and camera; without the scale of its health d is 0.
+    """
+    health, found = ImageHealth(rates), list[DetectionFrame]()
+
+    def look(stamp_ns: int, image: ImageArray) -> float:
+        found.append(detector.detect(image))
+        return health.read(stamp_ns, image)
+
+    degradation = _levels(video, look)
+    return DetectionLog(tuple(found), degradation.stamps_ns, str(video.path)), degradation
+
+
+def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
+    """Estimate d from every image of a video that starts with the recording."""
+    return _levels(video, ImageHealth(rates, period_ns=0).read)
+
+
+def _levels(video: Video, read: Callable[[int, ImageArray], float]) -> DegradationLog:
+    stamps_ns, levels = list[int](), list[float]()
+    for number, image in enumerate(video.frames()):
+        stamps_ns.append(nanoseconds(number / video.frame_rate_hz))
+        levels.append(read(stamps_ns[-1], image))
+    return DegradationLog(np.array(stamps_ns, dtype=np.int64), np.array(levels))
+
+
+def any_motion() -> DetectionFilter:
+    """Return the filter that keeps all boxes of a motion detector, whose score is no confidence."""
+    return DetectionFilter(frozenset({"car"}), 0.0, 0.0)

@@ -12,6 +12,7 @@ from worldstate.abduction.co_evidence import (
     CoEvidence,
     MissRateTable,
     Present,
+    Sector,
     Unqueried,
     default_miss_rates,
 )
@@ -24,7 +25,6 @@ from worldstate.ground import (
     wrap_angle,
 )
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
-from worldstate.measurement.sector import WHOLE_SIDES, Sector
 
 from .detections import DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
 from .pinhole import PinholeCamera
@@ -46,6 +46,12 @@ _HALF_WIDTH_RAD, _CLUTTER_RATE = math.radians(10.0), 0.01
 MAX_IMAGE_AGE_S = 0.15  # At which an image is used: one and a half of OVAD's periods
 # Of a camera that runs, before its first image.
 NO_LOOKS = DetectionLog((), np.empty(0, dtype=np.int64), "the camera")
+# Ahead only: the front-end's default grid ends at 90 deg, and so do the views of the cameras asked.
+WHOLE_SIDES: dict[Side | None, Sector] = {
+    "left": Sector(math.pi / 4, math.pi / 4),
+    "right": Sector(-math.pi / 4, math.pi / 4),
+    None: Sector(0.0, math.pi / 2),
+}
 
 
 class VisionQuery:

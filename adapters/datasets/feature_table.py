@@ -5,7 +5,6 @@ ego, D.. moving ego), ``T0`` (frame number, may be empty) and ``Recording ID``. 
 degrees and grow to the right, as in the released data and in `frontend.direction.feature`.
 """
 
-import csv
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,9 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from worldstate.abduction.signature.domain_guard import ModelDomain
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES
-from worldstate.adapters.files.file_io import atomic_path, number, read_record, read_rows, write_json
+from worldstate.adapters.files.file_io import number, read_record, read_rows, write_json, write_rows
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
@@ -206,13 +205,9 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
     >>> again.labels.tolist(), again.t0_frames
     (['none', 'left'], (None, 70))
     """
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(FEATURE_COLUMNS + LABEL_COLUMNS)
-        names = (table.labels, table.ids, table.environments, table.t0_frames, table.recordings)
-        for feature, *labels in zip(table.features.tolist(), *names, strict=True):
-            writer.writerow([*feature, *labels])
-    # One of an earlier table would speak of other windows.
+    names = (table.labels, table.ids, table.environments, table.t0_frames, table.recordings)
+    rows = ([*feature, *labels] for feature, *labels in zip(table.features.tolist(), *names, strict=True))
+    write_rows(path, FEATURE_COLUMNS + LABEL_COLUMNS, rows)
     companion = Path(f"{path}.json")
     companion.unlink(missing_ok=True)
     if table.domain is not None:

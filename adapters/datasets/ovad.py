@@ -2,24 +2,27 @@
 
 ``<root>/DataLog.csv`` with the columns ID, Environment, Class and T0, and one folder a recording,
 ``<root>/<environment>/<class>/<ID>/``, with ``out_multi.wav`` and, for a standing ego, camera detections.
+Where the vehicles of a simulated recording really were stands in its ``truth.json``.
 """
 
+import json
 import logging
 import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, final, get_args
+from typing import Any, Literal, final, get_args
 
 import numpy as np
 
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
+from worldstate.adapters.files.acoustic_domain import array_difference, microphone_order
 from worldstate.adapters.files.array_file import read_array
-from worldstate.adapters.files.array_match import array_difference, microphone_order
 from worldstate.adapters.files.file_io import read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError, OutOfDomainError
+from worldstate.ground.typing import BoolArray, FloatArray
 
 LOG_NAME = "DataLog.csv"
 AUDIO_NAME = "out_multi.wav"
@@ -281,3 +284,38 @@ def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
     check_channels(path, array)
     _LOG.warning("%s: no array is named; taken as %s, %d microphones", path, array.name, array.n_microphones)
     return array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueTrack:
+    """True azimuth and place of one vehicle over time, and when it was in line of sight."""
+
+    time_s: FloatArray  # shape (n,): Camera frames, seconds from the start of the recording
+    azimuth_rad: FloatArray  # shape (n,): Left positive
+    in_view: BoolArray  # shape (n,): Line of sight between camera and vehicle
+    position_m: FloatArray  # shape (n, 2): Middle of its front, x ahead and y left of the array
+
+    @property
+    def visible_s(self) -> tuple[float, float] | None:
+        """First and last time in line of sight; None where the vehicle never is."""
+        seen = self.time_s[self.in_view]
+        return (float(seen[0]), float(seen[-1])) if seen.size else None
+
+
+def read_true_tracks(folder: Path) -> tuple[TrueTrack, ...]:
+    """Read the tracks of all vehicles, none where the recording is not a simulated one."""
+    path = folder / TRUTH_NAME
+    if not path.is_file():
+        return ()
+    try:
+        truth = json.loads(path.read_text(encoding="utf-8"))
+        vehicles = [rows for rows in (truth["frames"], *truth.get("others", ())) if rows]
+        return tuple(map(_track, vehicles))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputFileError(path, f"expected the truth of a simulated recording: {error!r}") from error
+
+
+def _track(rows: list[dict[str, Any]]) -> TrueTrack:
+    columns = [[row[key] for row in rows] for key in ("time_s", "azimuth_rad", "line_of_sight")]
+    time_s, azimuth_rad, in_view = np.array(columns, dtype=np.float64)
+    return TrueTrack(time_s, azimuth_rad, in_view > 0.5, np.array([row["position_m"] for row in rows]))

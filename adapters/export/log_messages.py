@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.files.file_io import atomic_path
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.extras import check_extra, optional
@@ -102,7 +102,7 @@ def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterato
     path = recording / VIDEO_NAME
     if not path.is_file():
         return lambda stamp_ns: iter(())
-    cv2, video = opencv(), open_video(path)
+    cv2, video = optional("cv2"), open_video(path)
     frames = enumerate(video.frames())
     ahead = next(frames, None)
 

@@ -1,4 +1,4 @@
-"""Files: text, JSON of one dataclass and rows of CSV read within bounds; written whole or not at all.
+"""Files: text, JSON of one dataclass, CSV rows and arrays, read within bounds; written whole or not at all.
 
 A reader never meets half a file, and a run that fails leaves nothing behind. A link is followed: what it
 points to is replaced, and the link stays. Devices, pipes and folders are never replaced.
@@ -11,11 +11,14 @@ import math
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Collection, Iterator
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
 
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.serialisation import decode, decode_json
@@ -71,6 +74,14 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, value: object, indent: int | None = None) -> None:
     """Write a value as strict JSON, whole or not at all."""
     write_text(path, json.dumps(value, allow_nan=False, indent=indent) + "\n")
+
+
+def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write CSV with a header, whole or not at all."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 @contextmanager
@@ -196,3 +207,72 @@ def _places(
         problem = f"expected columns {', '.join(columns)}, missing {', '.join(missing)}"
         raise InputFileError(path, problem)
     return {name: header.index(name) for name in (*columns, *optional) if name in header}
+
+
+Result = TypeVar("Result")
+
+# The end of a zip file: a record of 22 bytes, then a comment of at most 65,535.
+_END, _END_BYTES, _LONGEST_COMMENT = b"PK\5\6", 22, 65_535
+_MAX_DIRECTORY_BYTES = 1 << 16
+
+
+def save_npz(path: str | Path, values: Mapping[str, Any]) -> None:
+    """Write arrays by name."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **values)
+
+
+def load_npz(
+    path: str | Path, what: str, max_bytes: int, read: Callable[[dict[str, np.ndarray]], Result]
+) -> Result:
+    """Return what `read` makes of the arrays of a file, which take at most `max_bytes` when decoded.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_npz(Path(folder) / "a.npz", {"x": np.arange(3)})
+    ...     load_npz(Path(folder) / "a.npz", "numbers", 1 << 10, lambda values: values["x"].sum())
+    np.int64(3)
+    """
+    try:
+        with Path(path).open("rb") as file:
+            if _decoded_bytes(file) > max_bytes:
+                raise InputFileError(path, f"expected {what} of at most {max_bytes >> 20} MiB")
+            with np.load(file, allow_pickle=False) as arrays:
+                return read({name: arrays[name] for name in arrays.files})
+    except InputFileError:
+        raise
+    except OSError as error:
+        raise InputFileError(path, f"expected {what} as npz ({error.strerror or error})") from error
+    except InvalidArgumentError as error:
+        raise InputFileError(path, f"expected {what} ({error})") from error
+    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
+        raise InputFileError(path, f"expected {what} as npz, they do not read: {error}") from error
+
+
+def _decoded_bytes(file: BinaryIO) -> int:
+    """Return how much memory the arrays take, as numbers of 64 bits at least, from their headers alone."""
+    _check_directory(file)
+    total = 0
+    with zipfile.ZipFile(file) as archive:
+        for name in archive.namelist():
+            with archive.open(name) as member:
+                # The header of a later version may be 4 GiB long.
+                if np.lib.format.read_magic(member) != (1, 0):
+                    raise InvalidArgumentError(f"{name}: expected an array in version 1.0 of its format")
+                shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+                total += math.prod(shape) * max(dtype.itemsize, 8)
+    file.seek(0)
+    return total
+
+
+def _check_directory(file: BinaryIO) -> None:
+    """Refuse a zip file whose list of members would itself fill the memory."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - _END_BYTES - _LONGEST_COMMENT, 0))
+    tail = file.read()
+    at = tail.rfind(_END)
+    extended = tail[max(at - 20, 0) : at].startswith(b"PK\6\7")
+    if at < 0 or extended or int.from_bytes(tail[at + 12 : at + 16], "little") > _MAX_DIRECTORY_BYTES:
+        raise InvalidArgumentError("expected a zip file with a short list of members")

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
-from worldstate.abduction.road_users import RoadUserModel
+from worldstate.abduction.road_users import DomainGuard, RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
-from worldstate.abduction.signature.domain_guard import DomainGuard, ModelDomain
 from worldstate.abduction.signature.ensemble import AnySignature
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.ground.serialisation import ADDED, Layout, Via, encode
 
 from .file_io import read_record, write_text

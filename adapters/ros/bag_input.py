@@ -19,11 +19,11 @@ from worldstate.adapters.audio.sound_file import (
     check_finite,
     constant_channels,
 )
-from worldstate.adapters.camera.detections import MAX_BOXES_A_FRAME, MAX_FRAMES, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, seconds
+from worldstate.ground import InputFileError, WorldstateError, seconds
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.odometry import Odometry
 
@@ -406,15 +406,11 @@ def _detections(bag: BagReader, topic: str) -> DetectionLog:
 
 
 def _frame(found: Any) -> DetectionFrame:
-    if len(found) > MAX_BOXES_A_FRAME:
-        raise InvalidArgumentError(f"expected at most {MAX_BOXES_A_FRAME} boxes a frame, got {len(found)}")
-    boxes = np.array([_box(one.bbox) for one in found], dtype=np.float64).reshape(-1, 4)
+    """Return the boxes of an image, checked as those of a file."""
     best = [_best(one.results) for one in found]
-    scores = np.array([score for _, score in best], dtype=np.float64)
-    sound = np.isfinite(boxes).all() and (boxes[:, :2] <= boxes[:, 2:]).all()
-    if not (sound and ((scores >= 0.0) & (scores <= 1.0)).all()):
-        raise InvalidArgumentError("detections: expected finite boxes, sizes >= 0 and scores in [0, 1]")
-    return DetectionFrame(boxes, scores, tuple(label for label, _ in best))
+    labels, scores = [label for label, _ in best], [score for _, score in best]
+    boxes = [_box(one.bbox) for one in found]
+    return frame_of({"boxes": boxes, "scores": scores, "classes_str": labels}, "detections")
 
 
 def _box(box: Any) -> tuple[float, float, float, float]:

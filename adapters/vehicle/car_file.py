@@ -15,6 +15,7 @@ from worldstate.adapters.files.array_file import checked_array, read_array
 from worldstate.adapters.files.file_io import check_keys, read_json, read_record, refused_as_file, write_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, finite_array, in_range
+from worldstate.ground.checks import one_of
 from worldstate.ground.serialisation import ADDED, decode
 
 # No vehicle carries a sensor farther from its origin; such a number was written in millimetres.
@@ -136,9 +137,7 @@ class CarSensors:
         """
         if name is None:
             return next(iter(self.cameras.values()), None)
-        if name not in self.cameras:
-            raise InvalidArgumentError(f"camera: expected one of {', '.join(self.cameras)}, got {name}")
-        return self.cameras[name]
+        return self.cameras[one_of("camera", name, self.cameras)]
 
 
 def read_car(path: str | Path) -> CarSensors:

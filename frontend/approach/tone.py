@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
-from worldstate.frontend.spectra.decimator import Decimator
-from worldstate.frontend.spectra.stft import power
+from worldstate.frontend.spectra.stft import Decimator, power
 from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, ComplexArray, Float32Array, FloatArray
@@ -236,7 +235,7 @@ class ToneStage:
     r"""Keep the decimated band of one averaged channel over the window and fit a tone.
 
     A few microphones near the centre of the array are averaged: at engine frequencies they lie within a
-    fraction of a wavelength, so that a tone from any direction adds up. `decimator` keeps the band, at some
+    fraction of a wavelength, so that a tone from any direction adds up. a `Decimator` keeps the band, at some
     1200 samples per second. In the last second the peak with the highest ratio to the noise around it is
     searched under a Hann window, so that neither harmonics nor rumble leak into it, and refined as in `tone`.
 

@@ -17,10 +17,9 @@ import scipy.signal
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.array.steering import Steering, cross_spectra, one_blas_thread
 from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz, whiten
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array, FloatArray
 
 FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))

@@ -9,8 +9,15 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray
 
-from .channel_health import MASKED_FAULTS, ArrayHealth, ChannelFault, Fault, faults_where
-from .dropouts import Dropout, DropoutFinder
+from .channel_health import (
+    MASKED_FAULTS,
+    ArrayHealth,
+    ChannelFault,
+    Dropout,
+    DropoutFinder,
+    Fault,
+    faults_where,
+)
 from .geometry_check import GeometryCheck
 
 # Width of the interval below an extreme, in halves of the span: an unclipped sound has more samples there

@@ -15,8 +15,7 @@ from scipy.fft import next_fast_len, rfft
 
 from worldstate.ground import FloatArray, IntArray, NotUsable, in_range
 
-from .decimator import Decimator
-from .stft import power
+from .stft import Decimator, power
 
 HOPS_A_SECOND = 10
 EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)

@@ -15,8 +15,7 @@ from worldstate_lab.cli.ablations import (
 from worldstate_lab.metrics.stream_statistic import StatisticSwitches
 
 from worldstate.abduction.co_evidence import Absent, Present
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import abduce
+from worldstate.abduction.evidence import SignatureEvidence, abduce
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.recordings.hop_table import ABSENT, PRESENT
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from attempt_work import Levels, end_at_one, write_sounds
-from worldstate_lab.trials.attempts import Failed, attempted
+from worldstate_lab.trials.pass_cache import Failed, attempted
 
 from worldstate.ground.errors import WorldstateError
 
@@ -55,7 +55,7 @@ RUN = """
 import signal, sys
 from pathlib import Path
 from attempt_work import Levels
-from worldstate_lab.trials.attempts import attempted
+from worldstate_lab.trials.pass_cache import attempted
 def end(number, frame): raise SystemExit(128 + number)
 signal.signal(signal.SIGTERM, end)
 folder, pause_s = Path(sys.argv[1]), float(sys.argv[2])

@@ -9,8 +9,8 @@ from worldstate_lab.cli.bench.cost import AGAINST, EVERYTHING, FEATURE_CHAIN, _s
 from worldstate_lab.cli.main import main
 
 from worldstate import WorldFilter
+from worldstate.abduction.road_users import Foreign, WarningSignal
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56

@@ -17,21 +17,19 @@ from worldstate_lab.degradation.conditions import (
     FAMILIES,
     OFF,
     RAIN_DB,
+    READINGS,
     Condition,
     all_conditions,
+    degradation_in,
     degrade_reduced,
+    detections_in,
+    health_of,
     level_rms,
+    look,
+    motion_detectors,
     rained,
 )
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
-from worldstate_lab.degradation.looks import (
-    READINGS,
-    degradation_in,
-    detections_in,
-    health_of,
-    look,
-    motion_detectors,
-)
 from worldstate_lab.degradation.staged_filter import (
     STATES,
     by_condition,
@@ -46,18 +44,16 @@ from worldstate_lab.evaluation.report.degradation_section import (
     stream_table,
     sweep_tables,
 )
-from worldstate_lab.trials.attempts import Failed, attempted
-from worldstate_lab.trials.pass_cache import PassCache
+from worldstate_lab.trials.pass_cache import Failed, PassCache, attempted
 
 from worldstate.abduction.co_evidence import Absent, default_miss_rates
 from worldstate.adapters.audio.sound_file import open_sound
-from worldstate.adapters.camera.camera_channel import watched
 from worldstate.adapters.camera.camera_health import degrade, learn_health
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
+from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
-from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video, watched
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
 from worldstate.adapters.listener import listen_steps, measure_steps
 from worldstate.adapters.source import open_source

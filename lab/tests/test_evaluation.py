@@ -13,13 +13,20 @@ from hypothesis import strategies as st
 from made_up_trials import made_up
 from worldstate_lab.evaluation.evaluation import lacking_data
 from worldstate_lab.evaluation.front_end_study import front_end_study
-from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STATIC, ProtocolRun, run_protocol
+from worldstate_lab.evaluation.protocols import (
+    FIXED,
+    PROTOCOLS,
+    RETRAINED,
+    STATIC,
+    ProtocolRun,
+    methods_for,
+    refused_methods,
+    run_protocol,
+)
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
-from worldstate_lab.methods.table_rows import methods_for, refused_methods
-from worldstate_lab.metrics.bearing_gating import bearing_curve
+from worldstate_lab.metrics.track_measures import bearing_curve
 from worldstate_lab.streets.simulated_windows import simulated_window_pair
-from worldstate_lab.trials.attempts import Failed
 from worldstate_lab.trials.classification import (
     Classifiers,
     classified,
@@ -28,10 +35,9 @@ from worldstate_lab.trials.classification import (
     windows_from_simulation,
     windows_from_table,
 )
-from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import pass_time_s
-from worldstate_lab.trials.takes import Take, TakeList
-from worldstate_lab.trials.trial import Decisions, Trial
+from worldstate_lab.trials.pass_cache import Failed, Hearing
+from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
 
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features

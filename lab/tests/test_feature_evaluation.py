@@ -16,7 +16,7 @@ from worldstate_lab.features.published_classifier import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
-from worldstate.operations.training.folds import N_FOLDS, folds_by_recording, recording_labels
+from worldstate.operations.training.training import N_FOLDS, folds_by_recording, recording_labels
 
 JUNCTIONS = ("SA1", "SB1", "SB2")
 KEYS = {

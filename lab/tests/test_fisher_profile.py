@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import ttest_ind
-from worldstate_lab.signatures.fisher_profile import (
+from worldstate_lab.signatures.clip_signatures import (
     discriminative_range_hz,
     fisher_profile,
     level_invariant_shape,

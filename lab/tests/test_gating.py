@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from worldstate_lab.metrics.bearing_gating import bearing_curve, gated_median_deg, gating_curve
+from worldstate_lab.metrics.track_measures import bearing_curve, gated_median_deg, gating_curve
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, wrap_angle

@@ -8,12 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worldstate_lab.degradation.awareness import hazard_awareness
 from worldstate_lab.degradation.beta_curves import beta_curves, counts_of, counts_table
-from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, OFF, all_conditions
+from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, OFF, all_conditions, motion_detectors
 from worldstate_lab.degradation.degradation_study import DegradationSettings, sweep_data
-from worldstate_lab.degradation.looks import motion_detectors
 from worldstate_lab.evaluation.evaluation import whole_sweep
 from worldstate_lab.metrics.intervals import stratified_draws
-from worldstate_lab.trials.takes import Take, TakeList
+from worldstate_lab.trials.trial import Take, TakeList
 
 from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.adapters.camera.miss_rates import FamilyCounts

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, poisson
-from worldstate_lab.metrics.by_group import worst_group
 from worldstate_lab.metrics.intervals import (
     deal_folds,
     middle,
@@ -13,6 +12,7 @@ from worldstate_lab.metrics.intervals import (
     poisson_upper,
     random_detection,
     stratified_draws,
+    worst_group,
 )
 
 from worldstate.ground.errors import InvalidArgumentError

@@ -9,11 +9,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worldstate_lab.cli.streams import worst_of
-from worldstate_lab.passes.band_levels import above_place_db, added_db, level_db
-from worldstate_lab.passes.followed_stream import EVERYBODY, FollowedStream, PassedStream, followed
-from worldstate_lab.passes.pass_outcomes import pass_figures, sides_by_risk
-from worldstate_lab.passes.second_vehicle import hearing_allows, second_figures
-from worldstate_lab.passes.stream_camera import stream_detections
+from worldstate_lab.passes.followed_stream import (
+    EVERYBODY,
+    FollowedStream,
+    PassedStream,
+    followed,
+    stream_detections,
+)
+from worldstate_lab.passes.pass_outcomes import (
+    above_place_db,
+    added_db,
+    hearing_allows,
+    level_db,
+    pass_figures,
+    second_figures,
+    sides_by_risk,
+)
 
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter, nanoseconds
 from worldstate.abduction.co_evidence import Unqueried

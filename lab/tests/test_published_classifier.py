@@ -12,7 +12,7 @@ from sklearn.svm import SVC
 from worldstate_lab.features.published_classifier import PublishedClassifier, mirror_hazards
 
 from worldstate.abduction.co_evidence import Absent, Unqueried
-from worldstate.abduction.posterior import abduce, statistic
+from worldstate.abduction.evidence import abduce, statistic
 from worldstate.abduction.signature.ensemble import mirror_features
 from worldstate.abduction.signature.published_signature import PAIRS, SignatureModel, couple
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic

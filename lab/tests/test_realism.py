@@ -20,19 +20,17 @@ from worldstate_lab.streets.set_classifiers import (
 )
 from worldstate_lab.streets.simulated_windows import (
     DECIMATION,
+    MEASURES,
     NFFT,
     RATE_HZ,
     WindowPlan,
+    describe_windows,
     permuted_array,
+    set_figures,
     simulated_window_pair,
+    spread_values,
     window_features,
     windows_of_recording,
-)
-from worldstate_lab.streets.window_measures import (
-    MEASURES,
-    describe_windows,
-    set_figures,
-    spread_values,
 )
 
 from worldstate.abduction.signature.ensemble import mirror_features

@@ -24,17 +24,15 @@ from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate_lab.evaluation.figures import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.front_end_study import front_end_study
 from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, ProtocolRun
-from worldstate_lab.evaluation.report.approach_timeline import approach_figure
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.panels import roc_curve
+from worldstate_lab.evaluation.report.recording_panels import approach_figure
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.line_of_sight import VisionOnly
 from worldstate_lab.metrics.intervals import stratified_draws
-from worldstate_lab.report.pages import Document, Section, markdown_page, write_document
-from worldstate_lab.report.table import Figure, Table, Value
-from worldstate_lab.trials.takes import Take, TakeList
-from worldstate_lab.trials.trial import Decisions, Trial
+from worldstate_lab.report.table import Document, Figure, Section, Table, Value, markdown_page, write_document
+from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
 
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.metrics.approach_table import auroc
@@ -325,4 +323,4 @@ def test_results_are_merged_by_the_words_that_change_a_figure(tmp_path, capsys):
     assert found["bench --seed 3"]["seeds"] == [3] and "commit" in found["bench --seed 3"]
     path.write_text("{")
     assert main(["place", "none.csv", "--results", str(path)]) == 2
-    assert "expected results" in capsys.readouterr().err
+    assert "results of worldstate-lab: expected JSON" in capsys.readouterr().err

@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 from made_up_trials import alarmed, made_up, random_answer, random_study, tracked
 from scipy.stats import chi2
 from sklearn.metrics import brier_score_loss, roc_auc_score
-from worldstate_lab.evaluation.operating_curve import BASELINE, DETECTED, OURS, equal_detection
-from worldstate_lab.evaluation.scores import Score, paired
-from worldstate_lab.metrics.bearing_gating import gating_curve
+from worldstate_lab.evaluation.scores import BASELINE, DETECTED, OURS, Score, equal_detection, paired
 from worldstate_lab.metrics.intervals import calibration_error_sampling, stratified_draws
+from worldstate_lab.metrics.track_measures import gating_curve
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
-from worldstate.abduction.cueing.calibration_error import (
+from worldstate.abduction.cueing.risk_map import (
     expected_calibration_error,
 )
 from worldstate.ground.errors import InvalidArgumentError

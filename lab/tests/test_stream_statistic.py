@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from worldstate_lab.metrics.stream_statistic import StatisticSwitches, stream_statistic
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import statistic
+from worldstate.abduction.evidence import SignatureEvidence, statistic
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.recordings.hop_table import hop_stream

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from worldstate_lab.methods.line_of_sight import seen_early_s
-from worldstate_lab.trials.hearing import Hearing
-from worldstate_lab.trials.takes import Take, find_takes
+from worldstate_lab.trials.pass_cache import Hearing
+from worldstate_lab.trials.trial import Take, find_takes
 
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.cli.main import main

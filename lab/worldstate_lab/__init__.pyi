@@ -10,5 +10,5 @@ from .paper.identifiability import nearest_neighbour_information_bits as nearest
 from .paper.identifiability import reach_of_array as reach_of_array
 from .paper.identifiability import reach_on_data as reach_on_data
 from .paper.identifiability import sharp_fano_bound as sharp_fano_bound
-from .signatures.fisher_profile import fisher_profile as fisher_profile
+from .signatures.clip_signatures import fisher_profile as fisher_profile
 from .streets.realism import measure_realism as measure_realism

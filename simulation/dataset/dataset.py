@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import VIDEO_NAME, opencv
+from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import (
     ARRAY_NAME,
     AUDIO_NAME,
@@ -27,6 +27,7 @@ from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.file_io import atomic_path, write_json, write_text
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
 from worldstate.simulation.camera.street_view import View, paint_street
@@ -460,7 +461,7 @@ def write_video(path: str | Path, frames: Iterable[ImageArray]) -> None:
 
     Shapes: frames (height, width, 3).
     """
-    cv2 = opencv()
+    cv2 = optional("cv2")
     waiting = iter(frames)
     first = next(waiting, None)
     if first is None:

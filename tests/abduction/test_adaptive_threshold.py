@@ -13,6 +13,9 @@ from scipy.signal import lfilter
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.cueing.cueing_policy import (
+    MOST_DOWN_NATS,
+    MOST_UP_NATS,
+    STEP_NATS,
     AdaptiveBudget,
     AdaptiveThreshold,
     CueingPolicy,
@@ -31,9 +34,6 @@ NO_CAMERA = Unqueried("no camera")
 budgets = st.builds(
     AdaptiveBudget,
     rate_per_hour=st.floats(0.1, 500.0),
-    step_nats=st.floats(0.01, 1.0),
-    most_up_nats=st.floats(0.0, 5.0),
-    most_down_nats=st.floats(0.0, 3.0),
     highest=st.floats(0.5, 0.999),
 )
 beliefs = st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)).map(lambda p: (p[0] * (1 - p[1]), p[1]))
@@ -53,9 +53,9 @@ def play(budget, script, state=None):
 def test_it_never_goes_deaf_whatever_happens(budget, script, calibrated):
     for state in play(budget, script):
         gamma = budget.gamma(calibrated, state.shift_nats)
-        assert -budget.most_down_nats <= state.shift_nats <= budget.most_up_nats
+        assert -MOST_DOWN_NATS <= state.shift_nats <= MOST_UP_NATS
         assert gamma <= max(calibrated, budget.highest)
-        odds = calibrated / (1 - calibrated) * math.exp(budget.most_up_nats)
+        odds = calibrated / (1 - calibrated) * math.exp(MOST_UP_NATS)
         assert gamma <= odds / (1 + odds) + 1e-12
 
 
@@ -63,11 +63,11 @@ def test_it_never_goes_deaf_whatever_happens(budget, script, calibrated):
 def test_the_false_alarms_counted_keep_the_budget_unless_the_upper_bound_is_met(budget, script):
     """The bound of the docstring, on any sequence of beliefs and alarms."""
     states = play(budget, script)
-    if max(state.shift_nats for state in states) >= budget.most_up_nats:
+    if max(state.shift_nats for state in states) >= MOST_UP_NATS:
         return
     raised = sum(after.shift_nats > before.shift_nats for before, after in itertools.pairwise(states))
     hours = sum(elapsed_s for (_, none), alarm, elapsed_s in script if none >= 0.5 and not alarm) / 3600.0
-    allowed = budget.rate_per_hour * hours + (budget.most_down_nats + budget.most_up_nats) / budget.step_nats
+    allowed = budget.rate_per_hour * hours + (MOST_DOWN_NATS + MOST_UP_NATS) / STEP_NATS
     assert raised <= allowed + 1 + 1e-9
 
 
@@ -85,12 +85,12 @@ def test_an_alarm_after_which_something_comes_teaches_nothing():
     came = [((0.1, 0.1), True, 1.0), ((0.8, 0.1), False, 1.0), ((0.1, 0.1), False, 1.0)]
     assert play(budget, came)[-1].shift_nats == 0.0
     nothing = [((0.1, 0.1), True, 1.0), ((0.2, 0.2), False, 1.0), ((0.1, 0.9), False, 1.0)]
-    assert play(budget, nothing)[-1].shift_nats == pytest.approx(budget.step_nats)
+    assert play(budget, nothing)[-1].shift_nats == pytest.approx(STEP_NATS)
 
 
 def test_an_alarm_that_never_ends_counts_again_and_again():
     """A generator behind the fence: the rule stays in alarm, so no rising edge would ever come."""
-    states = play(AdaptiveBudget(10.0, longest_alarm_s=15.0), [((0.1, 0.1), True, 1.0)] * 46)
+    states = play(AdaptiveBudget(10.0), [((0.1, 0.1), True, 1.0)] * 46)
     assert states[-1].shift_nats == pytest.approx(3 * 0.25)
 
 
@@ -117,13 +117,13 @@ def drifting_street(budget, hours, drift_nats, seed):
 
 
 def test_it_keeps_the_budget_under_drift_where_a_fixed_threshold_does_not():
-    budget = AdaptiveBudget(rate_per_hour=20.0, most_up_nats=3.0)
+    budget = AdaptiveBudget(rate_per_hour=20.0)
     fixed, _ = drifting_street(None, 4, 2.0, seed=5)
     kept, state = drifting_street(budget, 4, 2.0, seed=5)
     assert fixed[-1] > 3 * budget.rate_per_hour
-    assert kept.sum() <= 4 * budget.rate_per_hour + (1.0 + 3.0) / 0.25 + 1
+    assert kept.sum() <= 4 * budget.rate_per_hour + (MOST_DOWN_NATS + MOST_UP_NATS) / STEP_NATS + 1
     assert kept[-1] < fixed[-1] / 2
-    assert 0.5 < state.shift_nats < budget.most_up_nats
+    assert 0.5 < state.shift_nats < MOST_UP_NATS
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_it_keeps_the_budget_under_drift_where_a_fixed_threshold_does_not():
         {"rate_per_hour": 0.0},
         {"rate_per_hour": math.nan},
         {"rate_per_hour": 1.0, "highest": 1.0},
-        {"rate_per_hour": 1.0, "step_nats": -1.0},
+        {"rate_per_hour": 1.0, "highest": -1.0},
     ],
 )
 def test_numbers_out_of_range_are_refused(bad):
@@ -173,8 +173,8 @@ def listen(world, log_odds, answer=NO_CAMERA):
     return onsets, world
 
 
-def adaptive_world(**settings):
-    policy = replace(uncalibrated_policy(), adaptive=AdaptiveBudget(rate_per_hour=20.0, **settings))
+def adaptive_world():
+    policy = replace(uncalibrated_policy(), adaptive=AdaptiveBudget(rate_per_hour=20.0))
     return WorldFilter(policy=policy)
 
 
@@ -193,7 +193,7 @@ def test_in_the_filter_false_alarms_raise_the_threshold_and_a_checkpoint_keeps_i
 
 
 def test_in_the_filter_a_loud_hazard_is_announced_after_any_number_of_false_alarms():
-    _, world = listen(adaptive_world(most_up_nats=1.0), BURST * 12)
+    _, world = listen(adaptive_world(), BURST * 12)
     heard, _ = listen(world, [4.6] * 10)
     assert heard == 1
 

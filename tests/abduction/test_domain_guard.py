@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import softmax
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.signature.domain_guard import (
+from worldstate.abduction.road_users import (
     DomainGuard,
     Familiar,
     Foreign,

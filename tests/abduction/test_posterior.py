@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import abduce, log_lambda, statistic
+from worldstate.abduction.evidence import SignatureEvidence, abduce, log_lambda, statistic
 from worldstate.ground.errors import InvalidArgumentError
 
 nats = st.floats(-300, 300)

@@ -12,9 +12,12 @@ from scipy.special import log_softmax
 from worldstate.abduction.signature.ensemble import (
     VIEWS,
     EnsembleModel,
+    SiteReference,
     expert_views,
+    log_levels,
     mirror_features,
     shape_features,
+    site_reference,
 )
 from worldstate.abduction.signature.ensemble_training import (
     OTHER_SIDE,
@@ -23,7 +26,6 @@ from worldstate.abduction.signature.ensemble_training import (
     SimulatedWindows,
     SiteEnsembleClassifier,
 )
-from worldstate.abduction.signature.site_reference import SiteReference, log_levels, site_reference
 from worldstate.abduction.signature.window_classes import CLASSES, WINDOW_CLASSES, mirrored_classes
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError

@@ -11,17 +11,15 @@ from released_data import FOLDER
 from released_data import TABLE as NAME
 
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.abduction.signature.ensemble import mirror_features
+from worldstate.abduction.signature.ensemble import mirror_features, site_reference
 from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings, SiteSignature
-from worldstate.abduction.signature.site_reference import site_reference
 from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
-from worldstate.operations.training.folds import folds_by_recording, out_of_fold
 from worldstate.operations.training.site_references import with_site_references
-from worldstate.operations.training.training import fit_ensemble
+from worldstate.operations.training.training import fit_ensemble, folds_by_recording, out_of_fold
 
 SETTINGS = SiteEstimateSettings()
 

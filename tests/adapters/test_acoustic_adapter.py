@@ -1,6 +1,7 @@
 """The acoustic adapter: block sizes do not matter, and sound, camera and signature meet at one stamp."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.adapters.acoustic import AcousticAdapter, AcousticSettings
+from worldstate.adapters import acoustic
+from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
@@ -118,13 +120,13 @@ def test_a_sound_beside_the_view_is_not_asked_about() -> None:
     assert {m.co_evidence for m in answers} == {Unqueried("sector outside the field of view")}
 
 
-def test_a_coarse_bearing_takes_its_side_from_the_signature() -> None:
+def test_a_coarse_bearing_takes_its_side_from_the_signature(monkeypatch: pytest.MonkeyPatch) -> None:
     vision = VisionQuery(PinholeCamera(), camera_log(0.4))
-    coarse = AcousticSettings(coarse_std_rad=0.0)
+    monkeypatch.setattr(acoustic, "_COARSE_STD_RAD", 0.0)
     # Two waves as strong: reflected sound, whose bearing does not vote.
     sound = plane_wave(-0.3, 1.0) + plane_wave(-1.1, 1.0, seed=4)
     for model, answer in ((Level(left=1.0), Present), (Level(right=1.0), Absent), (Level(), Present)):
-        (measured,) = AcousticAdapter(ARRAY, RATE_HZ, model, vision, settings=coarse).measure(sound)
+        (measured,) = AcousticAdapter(ARRAY, RATE_HZ, model, vision).measure(sound)
         assert isinstance(measured.co_evidence, answer)
 
 
@@ -146,8 +148,9 @@ def test_reflected_sound_has_the_side_of_the_signature() -> None:
 
 
 def test_without_prominence_there_is_no_bearing() -> None:
-    strict = AcousticSettings(min_prominence=1e6)
-    (measured,) = AcousticAdapter(ARRAY, RATE_HZ, Level(), settings=strict).measure(plane_wave(0.3, 1.0))
+    adapter = AcousticAdapter(ARRAY, RATE_HZ, Level())
+    (frame,) = adapter.front_end.process(plane_wave(0.3, 1.0))
+    measured = adapter.interpret(replace(frame, least_prominence=1e6))
     assert isinstance(measured.bearing, NotUsable)
     assert "1000000.00" in measured.bearing.reason
 
@@ -248,5 +251,3 @@ def test_refuses_what_does_not_fit() -> None:
         adapter.measure(np.zeros((100, 11), np.float32))
     with pytest.raises(InvalidArgumentError, match="finite"):
         adapter.measure(np.full((100, 12), np.nan, np.float32))
-    with pytest.raises(InvalidArgumentError, match="min_prominence"):
-        AcousticSettings(min_prominence=0.5)

@@ -9,7 +9,7 @@ import pytest
 import soundfile
 
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, count_boxes
-from worldstate.adapters.camera.motion_detector import MotionDetector
+from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.listener import listen

@@ -9,15 +9,21 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
 
-from worldstate.adapters.camera import motion_detector
+from worldstate.adapters.camera import detectors
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.detections import (
     read_any_detections,
     read_coco_results,
     read_yolo_text,
 )
-from worldstate.adapters.camera.motion_detector import MotionDetector, outlined_share
-from worldstate.adapters.camera.onnx_detector import OnnxDetector, decode_yolo, open_onnx, suppress
+from worldstate.adapters.camera.detectors import (
+    MotionDetector,
+    OnnxDetector,
+    decode_yolo,
+    open_onnx,
+    outlined_share,
+    suppress,
+)
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 boxes = st.lists(
@@ -93,7 +99,7 @@ def test_light_is_no_object_however_much_of_the_image_it_changes(background, mon
     down, across = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     found = {0.0: 0, 0.25: 0}
     for outlined in found:
-        monkeypatch.setattr(motion_detector, "OUTLINED", outlined)
+        monkeypatch.setattr(detectors, "OUTLINED", outlined)
         detector = MotionDetector(background)
         for number, frame in enumerate(street(25, car=False)):
             where = np.hypot((across - 40.0 * (number - 9)) / 60.0, (down - 250.0) / 40.0)

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.signature.domain_guard import DomainGuard, Familiar, Foreign, WarningSignal
+from worldstate.abduction.road_users import DomainGuard, Familiar, Foreign, WarningSignal
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray

@@ -13,7 +13,6 @@ from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
 
 from worldstate.abduction.co_evidence import Absent, Present
-from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.camera_health import (
     FAMILIES,
     LEVELS,
@@ -29,16 +28,17 @@ from worldstate.adapters.camera.camera_health import (
     strength,
 )
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates, save_miss_rates
-from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import open_video
+from worldstate.adapters.camera.video import open_video, video_degradation
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.serialisation import decode
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
+from worldstate.operations.detectors import miss_rate_measurement
 from worldstate.operations.detectors.miss_rate_measurement import (
     AbsenceSettings,
     LabelledVideo,
@@ -262,8 +262,9 @@ def scene(tmp_path_factory):
     return LabelledVideo(video, reference(26, 16.0), camera)
 
 
-def test_beta_rises_from_a_tenth_to_nine_tenths(scene):
-    settings_ = AbsenceSettings(families=("noise",), repeats=1.0)
+def test_beta_rises_from_a_tenth_to_nine_tenths(scene, monkeypatch):
+    monkeypatch.setattr(miss_rate_measurement, "REPEATS", 1.0)
+    settings_ = AbsenceSettings(families=("noise",))
     rates = measure_absence([scene], MotionDetector, np.random.default_rng(0), settings_)
     assert rates.table(0.0, 0.0) <= 0.10
     assert rates.table(0.0, 1.0) >= 0.90
@@ -274,7 +275,7 @@ def test_beta_rises_from_a_tenth_to_nine_tenths(scene):
     assert np.array(rates.families["noise"].sectors).min() > 0
 
 
-def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_clutter(scene):
+def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_clutter(scene, monkeypatch):
     class Blind:
         def detect(self, frame):
             return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
@@ -288,7 +289,8 @@ def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_cl
     video = SimpleNamespace(frames=lambda: iter(frames), frame_rate_hz=scene.video.frame_rate_hz)
     last = DetectionLog(scene.reference.frames[-8:], scene.reference.stamps_ns[:8])
     short = LabelledVideo(video, last, scene.camera)
-    chosen = AbsenceSettings(families=("darkness",), warm_up=2)
+    monkeypatch.setattr(miss_rate_measurement, "_WARM_UP", 2)
+    chosen = AbsenceSettings(families=("darkness",))
     for make, clutter in ((Blind, 0.0), (Raving, 1.0)):
         rates = measure_absence([short], make, np.random.default_rng(0), chosen)
         family = rates.families["darkness"]

@@ -13,12 +13,11 @@ from made_up_sequence import sequence_model
 
 from worldstate import Context, MicrophoneArray
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
+from worldstate.abduction.road_users import neutral
 from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
 from worldstate.abduction.sequence.sequence_model import SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.domain_guard import neutral
-from worldstate.abduction.signature.ensemble import EnsembleModel, Expert
-from worldstate.abduction.signature.site_reference import SiteReference
+from worldstate.abduction.signature.ensemble import EnsembleModel, Expert, SiteReference
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
 from worldstate.adapters.acoustic import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Absent
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.abduction.posterior import statistic
+from worldstate.abduction.evidence import statistic
+from worldstate.abduction.signature import site_estimate
+from worldstate.abduction.signature.ensemble import site_reference
 from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings, SiteSignature
-from worldstate.abduction.signature.site_reference import site_reference
 from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
@@ -156,13 +157,14 @@ def test_damaged_checkpoints_are_refused_by_name(tmp_path_factory, data):
 
 def decided(model, gamma, stream):
     """Decisions on a stream, site learned and not; the first is asked as the chain asks it."""
-    signature = SiteSignature(model, hop_s=1.0)
+    signature = SiteSignature(model)
     pairs = [(signature.evidence(window), model.evidence(window)) for window in stream]
     answer, prior = Absent(0.0), model.reference_prior
     return np.array([[statistic(one, answer, prior) >= gamma for one in pair] for pair in pairs])
 
 
-def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model):
+def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model, monkeypatch):
+    monkeypatch.setattr(site_estimate, "HOP_S", 1.0)  # Windows that do not overlap
     rng = np.random.default_rng(100)
     X, y = made_up_sites(rng)
     calm = hazard_statistic(model.predict_proba(X), 0.0)[y == "none"]

@@ -8,14 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.abduction.co_evidence import Absent, CoEvidence, MissRateTable, Present, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, MissRateTable, Present, Sector, Unqueried
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.values import NotUsable, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CoEvidenceChannel
-from worldstate.measurement.sector import Sector
 
 CENTRED = PinholeCamera(position_m=(-0.567, 0.0, -0.485))
 TABLE = MissRateTable((0.0, 20.0, 40.0), (0.0, 1.0), ((0.04, 0.9), (0.1, 0.95), (0.3, 1.0)))

@@ -8,9 +8,9 @@ import pytest
 
 from worldstate import Measurement, NotUsable, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.cli.main import main
 from worldstate.measurement import Look
 
@@ -124,7 +124,7 @@ def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, capsys
     [
         ("--time 7.5", "expected a time from 0.1 to 1.5 s, in which it has snapshots, got 7.5 s"),
         ("--time -1", "expected a time from 0.1 to 1.5 s"),
-        ("--time 1 --side up", "--side: expected one of left, right, got up"),
+        ("--time 1 --side up", "--side: expected one of left, right, got 'up'"),
         ("--time nan", "--time"),
     ],
 )

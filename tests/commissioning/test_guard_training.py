@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worldstate_lab.cli.foreign import guard_exam
 
-from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
+from worldstate.abduction.road_users import Foreign, WarningSignal
 from worldstate.commissioning.guard_training import (
     FLAGGED,
     FOREIGN,

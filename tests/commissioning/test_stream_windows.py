@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from worldstate.abduction.signature.ensemble import SMALLEST_LEVEL
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.abduction.signature.site_reference import SMALLEST_LEVEL
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES, side_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.model_file import read_model

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import abduce
+from worldstate.abduction.evidence import SignatureEvidence, abduce
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement

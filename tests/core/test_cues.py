@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from worldstate import Context, FilterSettings, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Look, Position, PositionScan, SearchedSector, Sector

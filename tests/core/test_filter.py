@@ -13,8 +13,7 @@ from worldstate import Approach, Bearing, Context, FilterSettings, Measurement, 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import statistic
+from worldstate.abduction.evidence import SignatureEvidence, statistic
 from worldstate.belief.site_geometry import HIDDEN_BIAS_STD
 from worldstate.belief.track import after_empty_look, after_sighting
 from worldstate.core.acoustic_update import acoustic_update

@@ -20,9 +20,9 @@ from worldstate import (
 )
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
+from worldstate.abduction.road_users import Familiar, Foreign, WarningSignal
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.domain_guard import Familiar, Foreign, WarningSignal
 from worldstate.measurement import Approach, Heard, Look, Position, PositionScan, SearchedSector, Sector
 from worldstate.measurement.odometry import EgoPose, Odometry
 from worldstate.state import Priors, Rates

@@ -18,7 +18,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.bearing import srp_phat
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.frontend.levels import BANDS, NoiseMeter
+from worldstate.frontend.hop_spectra import BANDS, NoiseMeter
 from worldstate.frontend.settings import ELEVATIONS_RAD, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame, FrontEnd

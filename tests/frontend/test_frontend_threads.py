@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from worldstate.frontend.array import steering as limits
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground import blas_threads as limits
-from worldstate.ground.blas_threads import one_blas_thread
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldstate.adapters.live.live_camera import image_channel
+from worldstate.adapters.live.live_sensors import image_channel
 from worldstate.adapters.live.live_sound import BoundedChannel
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 

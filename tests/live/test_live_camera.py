@@ -14,8 +14,7 @@ from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import NO_LOOKS, REMEMBERED, VisionQuery
-from worldstate.adapters.live.datagram_socket import DetectionSocket
-from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, image_channel
+from worldstate.adapters.live.live_sensors import CameraFeed, DetectionSocket, ImageLooks, image_channel
 from worldstate.adapters.live.live_sound import BoundedChannel, LiveSound
 from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.array.microphone_array import ovad_array
@@ -188,7 +187,7 @@ class Capture:
 @pytest.fixture
 def cameras(monkeypatch):
     monkeypatch.setattr(
-        "worldstate.adapters.live.live_camera.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
+        "worldstate.adapters.live.live_sensors.optional", lambda module: SimpleNamespace(VideoCapture=Capture)
     )
 
 

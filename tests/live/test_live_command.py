@@ -161,7 +161,7 @@ def looked_at(states):
 
 def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
-        "worldstate.adapters.live.live_camera.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
+        "worldstate.adapters.live.live_sensors.optional", lambda module: SimpleNamespace(VideoCapture=Capture)
     )
     lens, states = tmp_path / "lens.json", tmp_path / "states.jsonl"
     lens.write_text(json.dumps({"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}))

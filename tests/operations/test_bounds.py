@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.array.steering import Steering, one_blas_thread
 from worldstate.frontend.bounds.cramer_rao import (
     bearing_crb_rad2,
     broadside_rad,
@@ -26,7 +26,6 @@ from worldstate.frontend.bounds.cramer_rao import (
     tone_crb_hz2,
 )
 from worldstate.frontend.direction.bearing import find_peaks, srp_phat
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError
 
 SOUND_M_S = 343.0

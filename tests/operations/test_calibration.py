@@ -10,13 +10,15 @@ from sklearn.isotonic import IsotonicRegression
 from sklearn.metrics import brier_score_loss, r2_score, roc_auc_score
 from worldstate_lab.metrics.intervals import calibration_error_sampling
 
-from worldstate.abduction.cueing.calibration_error import (
+from worldstate.abduction.cueing.risk_map import (
     brier_score,
     brier_skill,
     expected_calibration_error,
+    fit_isotonic,
+    fit_platt,
+    fit_sigmoid,
     reliability_curve,
 )
-from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt, fit_sigmoid
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.approach_table import auroc
 

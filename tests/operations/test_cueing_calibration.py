@@ -16,8 +16,7 @@ from scipy.stats import poisson
 from worldstate.abduction.co_evidence import Absent, Unqueried
 from worldstate.abduction.cueing.cueing_policy import sustained_statistic
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap, fit_risk_map
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import statistic
+from worldstate.abduction.evidence import SignatureEvidence, statistic
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError

@@ -16,13 +16,12 @@ from passing_boxes import CAMERA, EDGE_RAD, LANE_M, passing
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
+from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
 from worldstate.operations.labelling.label_files import file_below, open_label, window_rows
-from worldstate.operations.labelling.pass_labels import label_passes
+from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks, label_passes
 from worldstate.operations.labelling.street_figure import draw_passes
-from worldstate.operations.recordings.true_track import TrueTrack
 
 
 def t0_s(start_s: float, speed: float) -> float:
@@ -73,7 +72,7 @@ import numpy as np
 from passing_boxes import CAMERA, passing
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.ground.errors import MissingExtraError
-from worldstate.operations.labelling.box_tracks import box_tracks
+from worldstate.operations.labelling.pass_labels import box_tracks
 from worldstate.operations.labelling.pass_labels import label_passes
 log = passing([(1.0, 1), (1.5, -1)], 5.0, np.random.default_rng(0))
 try:

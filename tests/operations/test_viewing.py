@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scripted_states import scripted_states
 
+from worldstate.adapters.datasets.ovad import TrueTrack, read_true_tracks
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.figure_style import with_gaps
-from worldstate.operations.recordings.true_track import TrueTrack, read_true_tracks
 from worldstate.operations.viewing import state_figure
 from worldstate.operations.viewing.state_figure import (
     SoundPower,

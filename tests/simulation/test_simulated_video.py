@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.camera_health import degrade
 from worldstate.adapters.camera.detections import read_detections
-from worldstate.adapters.camera.motion_detector import MotionDetector
+from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.frontend.array.microphone_array import MicrophoneArray

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 import soundfile
 from scipy.signal import welch
-from worldstate_lab.trials.takes import find_takes
+from worldstate_lab.trials.trial import find_takes
 
-from worldstate.adapters.datasets.ovad import Recording, choose_array
+from worldstate.adapters.datasets.ovad import Recording, choose_array, read_true_tracks
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.presets import site_ambience

@@ -70,7 +70,7 @@ def test_cameras_have_names_and_stand_relative_to_the_array(tmp_path):
     assert car.cameras["left"].position_m == pytest.approx((0.3, 0.8, -0.4))
     assert math.degrees(car.cameras["left"].yaw_rad) == pytest.approx(60.0)
     assert car.cameras["front"].stamp_offset_s == 0.25
-    with pytest.raises(InvalidArgumentError, match="expected one of front, left, got rear"):
+    with pytest.raises(InvalidArgumentError, match="expected one of front, left, got 'rear'"):
         car.camera("rear")
 
 
@@ -168,7 +168,7 @@ def test_a_car_file_alone_carries_all_that_a_vehicle_has(tmp_path):
     ("words", "said"),
     [
         (["--array", "mics.csv"], "--car: expected no --array with it"),
-        (["--camera", "lens.json"], "camera: expected one of front, left, got lens.json"),
+        (["--camera", "lens.json"], "camera: expected one of front, left, got 'lens.json'"),
         (
             ["--detections", "a.json", "--detections", "b.json", "--uncalibrated"],
             "--detections: expected one, or --car with",
@@ -217,7 +217,7 @@ def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path
         ),
         (
             ["--car", "CAR", "--detections", "rear=a.json"],
-            "camera: expected one of front, left, got rear",
+            "camera: expected one of front, left, got 'rear'",
         ),
         (["--car", "CAR", "--detections", "left=a.json"], "a.json"),
     ],

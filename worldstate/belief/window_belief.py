@@ -15,8 +15,7 @@ from typing import Annotated, TypeAlias
 import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import Posterior, posterior_of
+from worldstate.abduction.evidence import Posterior, SignatureEvidence, posterior_of
 from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground import InvalidArgumentError
 from worldstate.ground.serialisation import Keys, Via, written_as

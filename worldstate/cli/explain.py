@@ -18,14 +18,10 @@ import argparse
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from worldstate import ground
 from worldstate.cli.common import output
-from worldstate.ground.errors import InvalidArgumentError
-
-if TYPE_CHECKING:
-    from worldstate.state import WorldState
+from worldstate.ground.checks import one_of
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +50,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     else:
         stamp_ns = ground.nanoseconds(ground.in_range("--time", arguments.time, -9e9, 9e9))
     state = read_state_near(arguments.states, stamp_ns)
-    _check_side(state, arguments.side)
+    if arguments.side is not None:
+        one_of("--side", arguments.side, [cue.direction for cue in state.cues])
     reports = evidence_report(state, partial(read_state_near, arguments.states), arguments.side)
     now_s = ground.seconds(state.stamp_ns)
     written = state.to_dict()
@@ -66,10 +63,3 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         table={},
         lines=[*listed, f"time  {now_s:.2f} s", *lines, *common_lines(state)],
     )
-
-
-def _check_side(state: "WorldState", side: str | None) -> None:
-
-    sides = [cue.direction for cue in state.cues]
-    if side not in (None, *sides):
-        raise InvalidArgumentError(f"--side: expected one of {', '.join(sides)}, got {side}")

@@ -45,8 +45,8 @@ from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.adapters.listener import Listener
-    from worldstate.adapters.live.datagram_socket import DatagramSocket
     from worldstate.adapters.live.live_listening import LiveStep
+    from worldstate.adapters.live.live_sensors import DatagramSocket
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
 
     HandIn = Callable[[Listener], None]
@@ -161,7 +161,7 @@ def _with_cameras(
 ) -> "tuple[adapters.Source, HandIn, Losses]":
     """Return the source with the cameras that were asked for, what hands their looks in, and their losses."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS, SENSOR
-    from worldstate.adapters.live.datagram_socket import DetectionSocket
+    from worldstate.adapters.live.live_sensors import DetectionSocket
     from worldstate.operations.recordings.car_cameras import with_cameras
 
     if given.arguments.camera_device is not None:
@@ -189,7 +189,7 @@ def _with_device(
 ) -> "tuple[adapters.Source, HandIn, Losses]":
     """Return the source with a camera of this machine."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS
-    from worldstate.adapters.live.live_camera import CameraFeed, ImageLooks, image_channel
+    from worldstate.adapters.live.live_sensors import CameraFeed, ImageLooks, image_channel
 
     arguments, images = given.arguments, image_channel()
     detector = sensors.detector_maker(arguments.detector, given.setup.labels)()
@@ -204,7 +204,7 @@ def _odometry(
     arguments: argparse.Namespace, sound: "LiveSound", opened: ExitStack
 ) -> "tuple[HandIn, Losses]":
     """Return what hands the odometry in that was asked for, and its losses."""
-    from worldstate.adapters.live.datagram_socket import OdometrySocket
+    from worldstate.adapters.live.live_sensors import OdometrySocket
 
     if arguments.odometry is None:
         return lambda to: None, dict

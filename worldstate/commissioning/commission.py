@@ -11,10 +11,9 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel, SequencePosterior
-from worldstate.abduction.signature.domain_guard import ModelDomain
-from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.ensemble import KINDS, EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
-from worldstate.abduction.signature.site_reference import KINDS
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES, side_ratios, visible_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of

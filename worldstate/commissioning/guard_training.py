@@ -8,11 +8,11 @@ from typing import Self
 import numpy as np
 import scipy.signal
 
-from worldstate.abduction.signature.domain_guard import DomainGuard
+from worldstate.abduction.road_users import DomainGuard
 from worldstate.abduction.signature.ensemble_training import standardisation
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES, SoundCharacter
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.ground.values import NotUsable, significant

@@ -18,10 +18,9 @@ from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
-from worldstate.frontend.frame import AcousticFrame
-from worldstate.frontend.levels import NoiseMeter
+from worldstate.frontend.hop_spectra import NoiseMeter
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.stream import FrontEnd
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named

@@ -12,17 +12,16 @@ import numpy as np
 import scipy.signal
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.ensemble import KINDS, EnsembleModel, log_levels, site_reference
 from worldstate.abduction.signature.ensemble_training import OPEN_FIELD, SimulatedWindows
 from worldstate.abduction.signature.site_estimate import HOP_S, SiteEstimate, SiteEstimateSettings
-from worldstate.abduction.signature.site_reference import KINDS, log_levels, site_reference
 from worldstate.abduction.signature.window_classes import BOTH, DIRECT
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.operations.training.site_references import simulated_beside, with_site_references
 from worldstate.operations.training.training import fit_ensemble

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
+from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
 from worldstate.abduction.cueing.thresholds import risk_controlling
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (

@@ -12,11 +12,10 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import log_lambda, posterior_of
+from worldstate.abduction.evidence import SignatureEvidence, log_lambda, posterior_of
+from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
-from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.side_belief import TIE, SideBelief
 from worldstate.ground.values import seconds

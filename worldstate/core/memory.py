@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
-from worldstate.abduction.signature.domain_guard import DomainVerdict
+from worldstate.abduction.road_users import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Track

@@ -11,4 +11,4 @@ from .odometry import Odometry as Odometry
 from .position import Position as Position
 from .position import PositionScan as PositionScan
 from .position import SearchedSector as SearchedSector
-from .sector import Sector as Sector
+from .position import Sector as Sector

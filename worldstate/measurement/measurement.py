@@ -9,9 +9,8 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.road_users import ClassShares, class_shares
+from worldstate.abduction.road_users import ClassShares, DomainVerdict, class_shares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.checks import all_of, check_fields, named, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 from worldstate.ground.values import LEAST_HEARD, NotUsable, integer_ns

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.abduction.co_evidence import Sector as Sector
 from worldstate.abduction.road_users import ClassShares, class_shares
 from worldstate.ground import InvalidArgumentError, finite_array, in_range, integer_ns, named, nanoseconds
 from worldstate.ground.checks import all_of, check_fields, pair
-
-from .sector import Sector
 
 # Bounds of what is taken: farther away nothing matters within the times that the filter speaks of, and beyond
 # these deviations a covariance is singular to rounding or says nothing.

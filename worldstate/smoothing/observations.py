@@ -136,8 +136,6 @@ class SmoothingSettings:
         Scale of the Cauchy loss of the motion between two states, whose whitened norm is 2 in the mean.
         A driver then keeps the pace most of the time, and now and then brakes, accelerates or turns off,
         at a lower cost than as white acceleration. None for a Gaussian.
-    range_m, range_log_std : float
-        Prior of the distance at which an entity is first observed, and its deviation as a factor's logarithm.
     relinearize_every : int
         Updates between two relinearisations.
 
@@ -157,16 +155,13 @@ class SmoothingSettings:
     # 95 % as efficient as least squares where all residuals are Gaussian (Huber, 1981).
     robust_k: float = 1.345
     manoeuvre_k: float | None = None
-    range_m: float = 25.0
-    range_log_std: float = 0.7
     # Relinearising at every update costs four times as much and moves the result by less than a percent.
     relinearize_every: int = 10
 
     def __post_init__(self) -> None:
         in_range("lag_s", self.lag_s, 0.0, 600.0, open_low=True)
-        positive = ("acceleration_psd", "robust_k", "range_m", "range_log_std")
-        for name in positive:
-            in_range(name, getattr(self, name), 0.0, 1e6, open_low=True)
+        in_range("acceleration_psd", self.acceleration_psd, 0.0, 1e6, open_low=True)
+        in_range("robust_k", self.robust_k, 0.0, 1e6, open_low=True)
         if self.manoeuvre_k is not None:
             in_range("manoeuvre_k", self.manoeuvre_k, 0.0, 1e6, open_low=True)
         in_range("relinearize_every", self.relinearize_every, 1, 1000)

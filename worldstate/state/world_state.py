@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from worldstate.abduction.signature.domain_guard import DomainVerdict
+from worldstate.abduction.road_users import DomainVerdict
 from worldstate.ground import InvalidArgumentError, NotUsable
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout, decode, decode_json, encode

@@ -18,10 +18,10 @@ from unittest.mock import patch
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from worldstate.abduction.road_users import DomainGuard
 from worldstate.abduction.sequence.sequence_inputs import INPUTS
 from worldstate.abduction.sequence.sequence_model import GROUPS, BoostedTrees, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, SequenceReader
-from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters import acoustic
 from worldstate.adapters.acoustic import AcousticAdapter
@@ -29,12 +29,11 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.frontend import hop_spectra, stream
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import roof_array_56
-from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
-from worldstate.frontend.levels import LevelMeter
+from worldstate.frontend.hop_spectra import LevelMeter
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.frontend.spectra.stft import StreamingStft
-from worldstate.frontend.stream import FrontEnd
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.typing import Float32Array
 
 Milliseconds = list[float]

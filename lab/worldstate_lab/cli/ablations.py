@@ -21,12 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.cueing.calibration_error import (
+from worldstate.abduction.cueing.cueing_policy import sustained_alarm
+from worldstate.abduction.cueing.risk_map import (
     brier_score,
     expected_calibration_error,
+    fit_isotonic,
 )
-from worldstate.abduction.cueing.cueing_policy import sustained_alarm
-from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.inputs import add_array_options, given_array

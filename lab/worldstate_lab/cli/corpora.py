@@ -32,8 +32,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.figure_style import BLUE, ORANGE, RED, figure_file, legend_beside
 from worldstate_lab.report.table import plain
-from worldstate_lab.signatures.clip_signatures import ClipSignatures, hear_clips
-from worldstate_lab.signatures.fisher_profile import draw_band_profile
+from worldstate_lab.signatures.clip_signatures import ClipSignatures, draw_band_profile, hear_clips
 from worldstate_lab.signatures.signature_study import (
     IDMT,
     MELAUDIS,

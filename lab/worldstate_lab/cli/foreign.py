@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.signature.domain_guard import DomainGuard, Foreign, WarningSignal
+from worldstate.abduction.road_users import DomainGuard, Foreign, WarningSignal
 from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from worldstate.adapters.files.file_io import check_target, write_text
+from worldstate.adapters.files.file_io import check_target, read_json, write_text
 from worldstate.cli.common.command import CommandParser, Program, run_program
 from worldstate.cli.common.output import CommandResult
 from worldstate.ground.errors import InputFileError
@@ -95,10 +95,7 @@ def result_key(words: Sequence[str]) -> str:
 def read_results(path: Path) -> dict[str, Any]:
     """Return the results by key; none where there is no file yet."""
     check_target(path)
-    try:
-        found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    except ValueError as error:
-        raise InputFileError(path, f"expected results of worldstate-lab as JSON ({error})") from error
+    found = read_json(path, "results of worldstate-lab") if path.exists() else {}
     if not isinstance(found, dict):
         raise InputFileError(path, "expected results of worldstate-lab by key")
     return found

@@ -40,7 +40,7 @@ from worldstate.ground.checks import in_range
 from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData, reach_of_array, reach_on_table
 from worldstate_lab.report.table import plain
-from worldstate_lab.signatures.fisher_profile import BandProfile, band_profile, draw_band_profile
+from worldstate_lab.signatures.clip_signatures import BandProfile, band_profile, draw_band_profile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

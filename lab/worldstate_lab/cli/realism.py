@@ -41,8 +41,13 @@ from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import BLUE, RED, figure_file
 from worldstate_lab.streets.realism import Realism, measure_realism, realism_lines
 from worldstate_lab.streets.set_classifiers import FAR_AZIMUTHS_DEG
-from worldstate_lab.streets.simulated_windows import simulated_window_pair
-from worldstate_lab.streets.window_measures import CLASS_GROUPS, MEASURES, describe_windows, of_class
+from worldstate_lab.streets.simulated_windows import (
+    CLASS_GROUPS,
+    MEASURES,
+    describe_windows,
+    of_class,
+    simulated_window_pair,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -29,8 +29,7 @@ from worldstate.cli.common.progress import track
 from worldstate.operations.metrics.approach_table import Figures
 from worldstate.simulation.parallel import in_processes
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
-from worldstate_lab.passes.pass_outcomes import pass_figures, sides_by_risk
-from worldstate_lab.passes.second_vehicle import hearing_allows, second_figures
+from worldstate_lab.passes.pass_outcomes import hearing_allows, pass_figures, second_figures, sides_by_risk
 from worldstate_lab.report.table import figure_lines
 
 

@@ -43,8 +43,7 @@ import numpy as np
 
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, choose_array
-from worldstate.adapters.files.acoustic_domain import check_array
-from worldstate.adapters.files.array_match import microphone_order
+from worldstate.adapters.files.acoustic_domain import check_array, microphone_order
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar, track
@@ -54,8 +53,8 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.simulation.dataset.dataset import write_dataset
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES
+from worldstate_lab.degradation.conditions import StagedDetector, motion_detectors
 from worldstate_lab.degradation.degradation_study import DegradationSettings
-from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
 from worldstate_lab.evaluation.against import Comparison, compare, save_scores
 from worldstate_lab.evaluation.evaluation import (
     Evaluation,
@@ -72,13 +71,12 @@ from worldstate_lab.evaluation.report.degradation_section import (
     sweep_tables,
 )
 from worldstate_lab.evaluation.report.warning_sections import equal_table
-from worldstate_lab.report.pages import write_document
-from worldstate_lab.report.table import Cell, Table, Value, plain
+from worldstate_lab.report.table import Cell, Table, Value, plain, write_document
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
-from worldstate_lab.trials.hearing import Hearing
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.takes import Take, TakeList, find_takes
+from worldstate_lab.trials.pass_cache import Hearing
+from worldstate_lab.trials.trial import Take, TakeList, find_takes
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59

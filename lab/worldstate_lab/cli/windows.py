@@ -42,7 +42,7 @@ import numpy as np
 from joblib import Parallel, delayed
 from scipy.special import bdtrc
 
-from worldstate.abduction.cueing.calibration_error import (
+from worldstate.abduction.cueing.risk_map import (
     brier_score,
     expected_calibration_error,
 )
@@ -59,16 +59,19 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc
-from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
+from worldstate.operations.training.training import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
-from worldstate_lab.metrics.by_group import auroc_by_group, macro, rate, worst_rate
 from worldstate_lab.metrics.intervals import (
     DRAWS,
+    auroc_by_group,
     calibration_error_sampling,
+    macro,
     middle,
     paired_gains,
+    rate,
     recording_draws,
+    worst_rate,
 )
 
 # The floor belongs to the risks: another seed in every run would only add noise to it.

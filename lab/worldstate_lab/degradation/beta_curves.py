@@ -15,12 +15,11 @@ from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
-from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, AbsenceTally
+from worldstate.operations.detectors.miss_rate_measurement import REPEATS, AbsenceSettings, AbsenceTally
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.metrics.intervals import draw_weights, middle, ratio
 
-from .conditions import FAMILIES, at_level
-from .looks import detections_in, health_of
+from .conditions import FAMILIES, at_level, detections_in, health_of
 
 # How misses are counted in every sweep, so that rates are those of `measure-absence`.
 SETTINGS = AbsenceSettings(families=FAMILIES)
@@ -121,7 +120,7 @@ def pooled_rates(
             "recordings: expected moving objects in view, found none to measure beta on"
         )
     edges = SETTINGS.edges_deg(PinholeCamera())
-    return MissRates(edges, families, provenance, health_of(readings), SETTINGS.repeats)
+    return MissRates(edges, families, provenance, health_of(readings), REPEATS)
 
 
 def beta_curves(counts: Sequence[Counts], draws: IndexArray) -> BetaCurves:

@@ -19,7 +19,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.degradation import looks, staged_filter
+from worldstate_lab.degradation import conditions, staged_filter
 from worldstate_lab.metrics.intervals import deal_folds, stratified_draws
 
 from .awareness import Awareness, AwarenessRow, hazard_awareness
@@ -32,8 +32,7 @@ from .beta_curves import (
     counts_table,
     pooled_rates,
 )
-from .conditions import FAMILIES, RAIN_DB
-from .looks import READINGS, StagedDetector, look, motion_detectors
+from .conditions import FAMILIES, RAIN_DB, READINGS, StagedDetector, look, motion_detectors
 from .staged_filter import by_condition, cameras, filter_in_conditions
 
 # Of each kind: with fewer, no recording is left to set thresholds and miss rates on.
@@ -396,7 +395,7 @@ class _Passes:
 
     def _look_key(self, item: SweepItem) -> list[object]:
         chosen = self.settings
-        return [looks.VERSION, self.fingerprints[str(item)], self.names, chosen.width_px, chosen.seed]
+        return [conditions.VERSION, self.fingerprints[str(item)], self.names, chosen.width_px, chosen.seed]
 
     def _seed(self, item: SweepItem) -> tuple[int, int]:
         """No recording's noise depends on which others there are."""

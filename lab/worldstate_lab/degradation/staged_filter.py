@@ -29,7 +29,7 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import Source, open_source, unoccluded_sector
 from worldstate.core.filter import WorldFilter
-from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Measurement
@@ -39,8 +39,22 @@ from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stre
 from worldstate_lab.metrics.intervals import middle, poisson_upper, stratified_draws
 
 from .awareness import Estimate
-from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions, level_rms, rained
-from .looks import READINGS, StagedDetector, degradation_in, detections_in
+from .conditions import (
+    CLEAN,
+    LENS,
+    OFF,
+    RAIN,
+    RAIN_DB,
+    READINGS,
+    ROOF,
+    Condition,
+    StagedDetector,
+    all_conditions,
+    degradation_in,
+    detections_in,
+    level_rms,
+    rained,
+)
 
 # Changes whenever the same sound and looks would give other beliefs.
 VERSION = 5

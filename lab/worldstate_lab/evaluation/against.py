@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.files.npz_file import load_npz, save_npz
+from worldstate.adapters.files.file_io import load_npz, save_npz
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.serialisation import decode

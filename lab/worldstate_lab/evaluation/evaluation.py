@@ -30,20 +30,24 @@ from worldstate_lab.degradation.staged_filter import (
     states_told,
     stream_sweep,
 )
-from worldstate_lab.methods.table_rows import methods_for, refused_methods
+from worldstate_lab.evaluation.protocols import methods_for, refused_methods
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
-from worldstate_lab.trials.attempts import Failed, attempted
 from worldstate_lab.trials.classification import Classifiers
-from worldstate_lab.trials.hearing import Hearing, hear, within_hours
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.pass_cache import PassCache, fingerprint
-from worldstate_lab.trials.takes import Take, TakeList
-from worldstate_lab.trials.trial import Trial
+from worldstate_lab.trials.pass_cache import (
+    Failed,
+    Hearing,
+    PassCache,
+    attempted,
+    fingerprint,
+    hear,
+    within_hours,
+)
+from worldstate_lab.trials.trial import Take, TakeList, Trial
 
 from .front_end_study import FrontEndStudy, front_end_study
-from .operating_curve import EqualDetection, equal_detection
 from .protocols import PROTOCOLS, ProtocolRun, run_protocol
-from .scores import Score
+from .scores import EqualDetection, Score, equal_detection
 
 Item = TypeVar("Item")
 

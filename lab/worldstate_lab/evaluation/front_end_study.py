@@ -8,8 +8,8 @@ import numpy as np
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc
 from worldstate.operations.recordings.hop_table import HopTable, joined
-from worldstate_lab.metrics.bearing_gating import gated_median_deg
 from worldstate_lab.metrics.intervals import Interval, middle, pooled_draws, stratified_draws
+from worldstate_lab.metrics.track_measures import gated_median_deg
 from worldstate_lab.trials.trial import Trial
 
 # The paper's figure of looming is of the last three seconds before the pass.

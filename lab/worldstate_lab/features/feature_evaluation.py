@@ -24,13 +24,15 @@ from worldstate.adapters.files.model_file import Model
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
-from worldstate.operations.training.folds import folds_by_recording, junction_folds, out_of_fold
 from worldstate.operations.training.site_references import asked_while_listening, with_site_references
-from worldstate.operations.training.window_calibration import (
+from worldstate.operations.training.training import (
     MISS_RATES,
     WindowCalibration,
     between,
     calibrate_windows,
+    folds_by_recording,
+    junction_folds,
+    out_of_fold,
 )
 from worldstate_lab.features.published_classifier import Classifier
 

@@ -7,15 +7,15 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.abduction.signature.ensemble import log_levels
 from worldstate.abduction.signature.ensemble_training import (
     Recipe,
     SimulatedWindows,
     SiteEnsembleClassifier,
 )
-from worldstate.abduction.signature.site_reference import log_levels
 from worldstate.abduction.signature.window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE
+from worldstate.operations.training.training import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE
 from worldstate_lab.features.published_classifier import Classifier, PublishedClassifier
 
 from .feature_evaluation import Predictions, Protocol, Reference, WindowMethod

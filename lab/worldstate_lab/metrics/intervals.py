@@ -8,22 +8,23 @@ one kind. A figure is formed on every draw, by its rows or by `draw_weights`, an
 >>> [round(end, 2) for end in middle(drawn)]
 [0.53, 0.85]
 
-Exact intervals of counts and shares are in `worldstate.operations.metrics.approach_table`.
+Figures by group, such as a junction, have their mean and the worst of them. Exact intervals of counts and
+shares are in `worldstate.operations.metrics.approach_table`.
 """
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.cueing.calibration_error import BINS
+from worldstate.abduction.cueing.risk_map import BINS
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.approach_table import poisson_interval
-from worldstate.operations.training.folds import recording_labels
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
+from worldstate.operations.metrics.approach_table import auroc, poisson_interval
+from worldstate.operations.training.training import recording_labels
 
 # Twelve draws lie beyond each end of the interval.
 DRAWS = 500
@@ -280,3 +281,75 @@ def calibration_error_sampling(
     membership = (index[:, None] == np.arange(BINS)).astype(np.float64)
     errors = np.abs((labels - predicted) @ membership).sum(axis=1) / predicted.size
     return float(errors.mean()), float(errors.std())
+
+
+def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:
+    """Return the area of each group that has both labels, in the order of their names.
+
+    Shapes: scores, positive (n,), groups (n,).
+
+    Examples
+    --------
+    >>> auroc_by_group([0.1, 0.9, 0.5], [False, True, True], ["a", "a", "b"])
+    {'a': 1.0}
+    """
+    values, labels, names = np.asarray(scores), np.asarray(positive), np.asarray(groups)
+    areas = {str(name): auroc(values[names == name], labels[names == name]) for name in np.unique(names)}
+    return {name: area for name, area in areas.items() if area is not None}
+
+
+def macro(by_group: Mapping[str, float]) -> float:
+    """Return the mean over groups.
+
+    Examples
+    --------
+    >>> macro({"SA1": 1.0, "SB1": 0.5})
+    0.75
+    """
+    if not by_group:
+        raise InvalidArgumentError("groups: expected at least one with hazard and hazard-free windows")
+    return float(np.mean(list(by_group.values())))
+
+
+def rate(decisions: BoolArray, among: BoolArray) -> float | None:
+    """Return the share of decisions among the chosen rows, None where there are none.
+
+    Examples
+    --------
+    >>> rate(np.array([True, False, True]), np.array([True, True, False]))
+    0.5
+    """
+    return float(decisions[among].mean()) if among.any() else None
+
+
+def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> float:
+    r"""Return the share of hazard-free windows that are in alarm at the junction where it is largest.
+
+    .. math:: \max_s \frac{\sum_i a_i f_i [s_i = s]}{\sum_i f_i [s_i = s]}
+
+    Shapes: alarms, hazard_free, sites (n,).
+
+    Examples
+    --------
+    >>> free = np.ones(4, dtype=bool)
+    >>> worst_rate(np.array([True, False, False, False]), free, np.array([0, 0, 1, 1]))
+    0.5
+    """
+    rates = [rate(alarms, hazard_free & (sites == site)) for site in np.unique(sites[hazard_free])]
+    return max(one for one in rates if one is not None)
+
+
+def worst_group(values: Mapping[str, float], worse: Literal["low", "high"]) -> tuple[str, float]:
+    """Return name and figure of the worst group, the first of equals; ("", NaN) where none has a figure.
+
+    Examples
+    --------
+    >>> worst_group({"SA1": 0.9, "SB1": 0.6, "SC1": float("nan")}, worse="low")
+    ('SB1', 0.6)
+    """
+    # NaN compares as neither less nor greater, so that min and max would depend on the order.
+    known = {name: value for name, value in values.items() if not np.isnan(value)}
+    if not known:
+        return "", float("nan")
+    name = (min if worse == "low" else max)(known, key=known.__getitem__)
+    return name, known[name]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import entr
 
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable
@@ -59,8 +60,7 @@ def entropy_bits(probabilities: ArrayLike) -> float:
     p = finite_array("probabilities", probabilities, (None,))
     if not p.size or (p < 0.0).any() or not math.isclose(float(p.sum()), 1.0, abs_tol=1e-6):
         raise InvalidArgumentError("probabilities: expected probabilities that sum to one")
-    positive = p[p > 0.0]
-    return max(float(-(positive * np.log2(positive)).sum()), 0.0)
+    return float(entr(p).sum()) * _BITS
 
 
 def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Information:
@@ -279,10 +279,7 @@ def _fano_numbers(entropy: float, information: float, states: int) -> tuple[floa
 
 
 def _fano_function(error: float, states: int) -> float:
-    spread = 0.0
-    for p in (error, 1.0 - error):
-        spread -= p * math.log2(p) if p > 0.0 else 0.0
-    return spread + error * math.log2(states - 1) if states > 2 else spread
+    return entropy_bits((error, 1.0 - error)) + error * math.log2(states - 1)
 
 
 def _checked(posteriors: ArrayLike, states: ArrayLike) -> tuple[FloatArray, IndexArray]:

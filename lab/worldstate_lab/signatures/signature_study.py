@@ -8,11 +8,16 @@ import numpy as np
 
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 from worldstate.operations.metrics.approach_table import auroc
-from worldstate_lab.metrics.by_group import auroc_by_group
-from worldstate_lab.metrics.intervals import FOLDS, Interval, middle, pooled_draws
+from worldstate_lab.metrics.intervals import FOLDS, Interval, auroc_by_group, middle, pooled_draws
 
-from .clip_signatures import ClipSignatures, signature_edges_hz
-from .fisher_profile import BandProfile, discriminative_range_hz, level_invariant_shape, profile_of
+from .clip_signatures import (
+    BandProfile,
+    ClipSignatures,
+    discriminative_range_hz,
+    level_invariant_shape,
+    profile_of,
+    signature_edges_hz,
+)
 
 By = Literal["level", "shape"]
 # Fewer recordings of a class on either side tell nothing of the next one.

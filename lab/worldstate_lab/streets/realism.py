@@ -28,7 +28,7 @@ from .set_classifiers import (
     side_accuracy,
     two_sample_area,
 )
-from .window_measures import TOLERANCE, FigureKey, agreeing_medians, median_rows, set_figures
+from .simulated_windows import TOLERANCE, FigureKey, agreeing_medians, median_rows, set_figures
 
 Span = tuple[float, float]
 

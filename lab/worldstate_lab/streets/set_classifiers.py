@@ -20,11 +20,11 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc
-from worldstate.operations.training.folds import folds_by_recording
+from worldstate.operations.training.training import folds_by_recording
 from worldstate_lab.features.published_classifier import PublishedClassifier
 from worldstate_lab.metrics.intervals import Interval, middle, recording_draws
 
-from .window_measures import (
+from .simulated_windows import (
     AZIMUTHS_DEG,
     CLASS_GROUPS,
     DESCRIPTORS,

@@ -30,8 +30,7 @@ from worldstate_lab.features.published_classifier import PublishedClassifier
 from worldstate_lab.streets.simulated_windows import LAYOUT, simulated_window_pair
 
 from .pass_cache import origin_of
-from .takes import TakeList
-from .trial import Trial
+from .trial import TakeList, Trial
 
 # Hidden left and hidden right among the explanations.
 SIDE_COLUMNS = slice(0, 2)

@@ -15,29 +15,27 @@ from worldstate.adapters.acoustic import Grounding, observe
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
-from worldstate.adapters.files.acoustic_domain import feature_order
-from worldstate.adapters.files.array_match import TRAIN
+from worldstate.adapters.datasets.ovad import read_true_tracks
+from worldstate.adapters.files.acoustic_domain import TRAIN, feature_order
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import Step, listen_steps, measure_steps
 from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.approach.doppler import radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import BEARING_HOPS, HOP_RATE_HZ, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream
-from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.state import RiskCue, WorldState
 from worldstate_lab.metrics.stream_statistic import stream_statistic
 
-from .takes import Take
 from .trial import (
     BOX_COLUMNS,
     DECISION_COLUMNS,
@@ -47,6 +45,7 @@ from .trial import (
     TRACK_COLUMNS,
     TRUTH_COLUMNS,
     Decisions,
+    Take,
 )
 
 # Changes whenever a pass over the same recording would give other numbers.

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.feature import feature_nfft
-from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.stream import FrontEnd
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.typing import FloatArray
 
 RATE = 6000

@@ -19,8 +19,8 @@ from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.simulation.sound.ego_sound import ego_noise

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray, roof_array_56
-from worldstate.frontend.health.channel_health import ArrayHealth
+from worldstate.frontend.health.channel_health import ArrayHealth, DropoutFinder
 from worldstate.frontend.health.channel_monitor import ClippingCounter
-from worldstate.frontend.health.dropouts import DropoutFinder
 from worldstate.frontend.health.geometry_check import position_scores, position_weights
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd

@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
     from worldstate.adapters.vehicle.car_file import write_aligned
     from worldstate.operations.alignment.camera_alignment import LARGEST_OFFSET_S, align, heard_passes
-    from worldstate.operations.calibration.calibration_input import find_inputs
+    from worldstate.operations.calibration.cueing_calibration import find_inputs
 
     output.check_outputs(arguments, "out")
     if arguments.out is not None and arguments.car is None:

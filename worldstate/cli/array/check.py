@@ -41,9 +41,12 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from dataclasses import replace
 
-    from worldstate.operations.recordings.channel_report import rate_from_duration, write_array_figure
-
-    from .check_report import as_json, as_text
+    from worldstate.operations.recordings.channel_report import (
+        as_json,
+        as_text,
+        rate_from_duration,
+        write_array_figure,
+    )
 
     output.check_outputs(arguments, figures=("figure",))
     with inputs.opened_front_end(arguments) as (audio, front_end):
@@ -53,7 +56,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
                 audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
             )
             health = replace(health, sample_rate=rate)
-        report, lines = as_json(health, audio, array), list(as_text(health, audio, array))
+        heard = health, audio, array, inputs.stance(array)
+        report, lines = as_json(*heard), list(as_text(*heard))
     if arguments.figure is not None:
         write_array_figure(array, health, arguments.figure)
     return output.CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)

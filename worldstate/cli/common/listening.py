@@ -81,7 +81,7 @@ def checked_sensors(arguments: argparse.Namespace, sound: list[Path]) -> GivenSe
 
 def _check_array(given: "GivenSensors", made_for: "frontend.MicrophoneArray", sound: list[Path]) -> None:
     from worldstate.adapters.datasets.ovad import check_channels, named_array
-    from worldstate.adapters.files.array_match import WAY_OUT, matched_order
+    from worldstate.adapters.files.acoustic_domain import WAY_OUT, matched_order
 
     if any(named_array(path) is not None for path in sound):
         return
@@ -189,7 +189,7 @@ def read_streams(
     inputs: Iterable[Path], array: "frontend.MicrophoneArray | None", model: Path | None
 ) -> "list[operations.HopTable]":
     """Return the hop streams of data sets, recordings, sound files and what --save-streams wrote."""
-    from worldstate.operations.calibration.calibration_input import find_inputs, read_input
+    from worldstate.operations.calibration.cueing_calibration import find_inputs, read_input
 
     found = [item for path in inputs for item in find_inputs(path)]
     read = track(found, "listening", len(found))

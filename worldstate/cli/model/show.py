@@ -15,6 +15,10 @@ from pathlib import Path
 from worldstate import adapters
 from worldstate.cli.common import output
 
+# Of the coefficients that ship; the data that a user trains on has a licence of its own.
+LICENCE = "Apache-2.0 for the coefficients that ship; no row of the training data is in the file"
+UNNAMED = "names no array, sample rate or ego motion: no budget is stated with it"
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -24,8 +28,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.operations.training.model_card import model_card
-
     card = model_card(adapters.read_model(arguments.file))
     return output.CommandResult(card, table=_readable(card))
 
@@ -45,3 +47,72 @@ def _words(value: object) -> object:
     if isinstance(value, dict):
         return "  ".join(f"{key} {part:.4g}" for key, part in value.items())
     return value
+
+
+def model_card(model: "adapters.Model") -> dict[str, object]:
+    """Return the card of a model as JSON-able values.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.files.model_file import read_model
+    >>> card = model_card(read_model())
+    >>> card["microphones"], card["ego_motion"]
+    (56, 'standing')
+    """
+    origin = model.provenance
+    return {
+        "data": origin.dataset,
+        "group": origin.group,
+        "recordings": len(origin.training_recordings),
+        "sites": sorted({key.split("/")[0] for key in origin.training_recordings}),
+        "excluded_lists": list(origin.excluded_lists),
+        "classifier": origin.classifier,
+        **_made_for(model),
+        "thresholds": [
+            {
+                "alpha": policy.alpha,
+                "beta": policy.miss_rate,
+                "gamma": policy.gamma,
+                "sustain_hops": policy.sustain_hops,
+            }
+            for policy in model.policies.policies
+        ],
+        "figures": dict(origin.figures),
+        "limits": _limits(model),
+        "licence": LICENCE,
+    }
+
+
+def _made_for(model: "adapters.Model") -> dict[str, object]:
+    domain = model.domain
+    if domain is None:
+        return {"array": None}
+    return {
+        "array": domain.array,
+        "microphones": len(domain.positions_m),
+        "extent_m": [round(extent, 3) for extent in domain.extent_m],
+        "sample_rate_hz": [round(rate) for rate in domain.sample_rate_hz],
+        "band_hz": list(domain.band_hz),
+        "feature": domain.feature,
+        "ego_motion": domain.ego_motion,
+    }
+
+
+def _limits(model: "adapters.Model") -> list[str]:
+    """Say what the model was not made for."""
+    from worldstate.adapters.files.acoustic_domain import UNFIT
+
+    domain, unfit = model.domain, [] if model.provenance.fit_for_use else [f"{UNFIT}: no budget is stated"]
+    if domain is None:
+        return [*unfit, UNNAMED]
+    low, high = domain.sample_rate_hz
+    limits = [
+        "another array: refused; microphones more than 1 mm elsewhere count as another",
+        f"sample rates outside {low:.0f} to {high:.0f} Hz and their halves, quarters and eighths: refused",
+        "other sites than those named: thresholds were set on these; see worldstate model threshold",
+        "sound of anything but vehicles: the model does not know it",
+    ]
+    if domain.ego_motion != "any":
+        other = "moving" if domain.ego_motion == "standing" else "standing"
+        limits.insert(2, f"a {other} ego: no budget is stated")
+    return [*unfit, *limits]

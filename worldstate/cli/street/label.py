@@ -25,8 +25,7 @@ from worldstate.cli.common import inputs, output, progress, sensors
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from worldstate.operations.labelling.box_tracks import BoxTrack
-    from worldstate.operations.labelling.pass_labels import PassLabel
+    from worldstate.operations.labelling.pass_labels import BoxTrack, PassLabel
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -45,11 +44,10 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate.operations.labelling.box_tracks import box_tracks
+    from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.operations.labelling.label_files import file_below, write_open_label, write_window_labels
-    from worldstate.operations.labelling.pass_labels import label_passes
+    from worldstate.operations.labelling.pass_labels import box_tracks, label_passes
     from worldstate.operations.labelling.street_figure import write_pass_figure
-    from worldstate.operations.recordings.true_track import read_true_tracks
 
     output.check_outputs(arguments, "out", "windows", figures=("figure",))
     source, detections = sensors.camera_source(arguments, inputs.sound_of(arguments))

@@ -22,7 +22,7 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import InvalidArgumentError, wrap_angle
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import vertex
-from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
+from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks
 from worldstate.operations.recordings.bearing_track import track_bearings
 from worldstate.operations.recordings.hop_table import HopTable
 

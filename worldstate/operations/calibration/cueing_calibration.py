@@ -1,8 +1,14 @@
-"""Thresholds and risk maps from whole recordings: what `worldstate model threshold` does."""
+"""Thresholds and risk maps from whole recordings: what `worldstate model threshold` does.
 
+They come from data sets, recordings, sound files or hop streams that were saved.
+"""
+
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import Literal, get_args
+from zlib import crc32
 
 import numpy as np
 
@@ -18,11 +24,19 @@ from worldstate.abduction.cueing.thresholds import (
     neyman_pearson_threshold,
     recordings_needed,
 )
+from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
+from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.listener import measure_steps
+from worldstate.adapters.source import ListenSettings, open_source
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.checks import one_of
+from worldstate.ground.errors import InputFileError, OutOfDomainError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, caution, poisson_interval
-from worldstate.operations.recordings.hop_table import HOP_S, HopTable
-from worldstate.operations.training.window_calibration import MISS_RATES
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream, load_streams
+from worldstate.operations.training.training import MISS_RATES
 
 ThresholdKind = Literal["conformal", "plain"]
 
@@ -82,8 +96,7 @@ class CueingSettings:
         in_range("block_s", self.block_s, 1.0, 3600.0)
         if self.keep_per_hour is not None:
             AdaptiveBudget(self.keep_per_hour)
-        if self.method not in ("conformal", "plain"):
-            raise InvalidArgumentError(f"method: expected conformal or plain, got {self.method!r:.40}")
+        one_of("method", self.method, get_args(ThresholdKind))
 
     @property
     def block_hops(self) -> int:
@@ -352,3 +365,34 @@ def _warnings(
             f"the statistic is correlated over {correlation_s:.3g} s: pieces of {settings.block_s:g} s "
             "depend on each other, take longer ones"
         )
+
+
+def find_inputs(path: Path) -> list[Path]:
+    """Return the recordings of a data set, or the file or recording folder itself."""
+    if not path.exists():
+        raise InputFileError(path, "expected a data set, a recording folder or a sound file")
+    if path.is_dir() and (path / LOG_NAME).is_file():
+        return [recording.path for recording in OvadDataset(path).recordings]
+    return [path]
+
+
+def read_input(
+    path: Path, *, array: MicrophoneArray | None = None, model: Path | None = None
+) -> list[HopTable]:
+    """Listen to a recording or read streams; a sound file counts as hazard-free."""
+    chosen = read_model(model)
+    # What was heard are this signature's scores: another one's thresholds cannot be set on them.
+    about = {"signature": crc32(json.dumps(encode(chosen.signature)).encode())}
+    if path.suffix == ".npz":
+        streams = load_streams(path)
+        if any({**about, **stream.about} != about for stream in streams):
+            raise OutOfDomainError(f"{path}: heard with another model's signature; listen to the sound again")
+        return streams
+    source = open_source(path, array=array, model=chosen, settings=ListenSettings(alpha=None))
+    measured = (measurement for _, measurement in measure_steps(source))
+    if not path.is_dir():
+        return [hop_stream(measured, name=str(path)).replace(about=about)]
+    recording = Recording.open(path)
+    name = "/".join(filter(None, (recording.environment, recording.recording_id)))
+    stream = hop_stream(measured, name=name, label=recording.label or "none", t0_s=source.t0_s)
+    return [stream.replace(about=about)]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from worldstate.abduction.co_evidence import Sector
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.camera_health import (
     FAMILIES,
@@ -26,9 +27,8 @@ from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, Video
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
-from worldstate.ground import InputFileError, InvalidArgumentError, in_range
+from worldstate.ground import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
-from worldstate.measurement.sector import Sector
 from worldstate.operations.figure_style import figure_file, legend_beside
 
 MakeDetector = Callable[[], Detector]
@@ -41,6 +41,10 @@ MIN_OVERLAP = 0.3
 _HALF_WIDTH_RAD, _SECTOR_STEP_RAD = float(np.radians(10.0)), np.radians(5.0)
 # Clean frames that the scale of health is learned from, spread over the videos.
 _HEALTH_FRAMES = 10
+# First frames of each video that count for nothing: motion detectors learn the background in them.
+_WARM_UP = 10
+# Frames that say the same: at ten a second and a look every 0.3 s, three.
+REPEATS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,19 +55,14 @@ class AbsenceSettings:
     ----------
     families : tuple of str
         What is staged.
-    warm_up : int
-        First frames of each video that count for nothing: motion detectors learn the background in them.
-    repeats : float
-        Frames that say the same: at ten a second and a look every 0.3 s, three.
-    moving_only : bool
-        Leave parked reference boxes out: they are no co-evidence, and no motion detector sees them.
     keep : DetectionFilter
-        Which reference boxes count.
+        Which reference boxes count. Parked ones do not: they are no co-evidence, and no motion detector
+        sees them.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range.
+        If a family is not known.
 
     Examples
     --------
@@ -72,9 +71,6 @@ class AbsenceSettings:
     """
 
     families: tuple[Family, ...] = FAMILIES
-    warm_up: int = 10
-    repeats: float = 3.0
-    moving_only: bool = True
     keep: DetectionFilter = field(
         default_factory=lambda: DetectionFilter(frozenset({"car", "motorcycle", "truck", "bus"}), 0.5, 40.0)
     )
@@ -82,8 +78,6 @@ class AbsenceSettings:
     def __post_init__(self) -> None:
         if not self.families or not set(self.families) <= set(FAMILIES):
             raise InvalidArgumentError(f"families: expected some of {', '.join(FAMILIES)}")
-        in_range("warm_up", self.warm_up, 0, 100_000)
-        in_range("repeats", self.repeats, 1.0, 1000.0)
 
     def edges_deg(self, camera: PinholeCamera) -> tuple[float, ...]:
         """Return the bin edges of a camera; the last one lies a degree outside its view."""
@@ -144,19 +138,23 @@ def measure_absence(
 
     Examples
     --------
-    Twenty images with a white box on black, and a detector that finds whatever is bright:
+    Twenty images of a white box that moves on black, and a detector that finds what is bright:
 
     >>> from types import SimpleNamespace
-    >>> image = np.zeros((120, 160, 3), np.uint8)
-    >>> image[40:90, 60:110] = 255
-    >>> box = DetectionFrame(np.array([[60.0, 40.0, 110.0, 90.0]]), np.array([0.9]), ("car",))
+    >>> images = np.zeros((20, 120, 160, 3), np.uint8)
+    >>> lefts = 46 + np.arange(20)
+    >>> for image, left in zip(images, lefts): image[40:90, left : left + 50] = 255
+    >>> corners = np.column_stack([lefts, [40] * 20, lefts + 50, [90] * 20]).astype(float)
+    >>> boxes = [DetectionFrame(one[None], np.array([0.9]), ("car",)) for one in corners]
     >>> nothing = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     >>> class Bright:
-    ...     def detect(self, frame): return box if frame[40:90, 60:110].mean() > 100 else nothing
-    >>> video = SimpleNamespace(frames=lambda: iter([image] * 20), n_frames=20, frame_rate_hz=10.0)
-    >>> truth = DetectionLog.at_rate([box] * 20, 10.0)
+    ...     def detect(self, frame):
+    ...         row = frame[65, :, 0]
+    ...         return boxes[row.argmax() - 46] if row.max() > 100 else nothing
+    >>> video = SimpleNamespace(frames=lambda: iter(images), n_frames=20, frame_rate_hz=10.0)
+    >>> truth = DetectionLog.at_rate(boxes, 10.0)
     >>> scene = LabelledVideo(video, truth, PinholeCamera(width_px=160, height_px=120))
-    >>> settings = AbsenceSettings(families=("darkness",), moving_only=False)
+    >>> settings = AbsenceSettings(families=("darkness",))
     >>> rates = measure_absence([scene], Bright, np.random.default_rng(0), settings)
     >>> rates.families["darkness"].misses[0]
     (0.0, 0.0, 10.0, 10.0, 10.0)
@@ -180,7 +178,7 @@ def measure_absence(
         families=tally.counts(),
         provenance=provenance or {},
         health=_health(scenes, rng),
-        repeats=chosen.repeats,
+        repeats=REPEATS,
     )
 
 
@@ -204,12 +202,12 @@ class AbsenceTally:
         self, reference: DetectionLog, number: int, found: DetectionFrame, family: Family, level: int
     ) -> None:
         """Count what was found in a frame at a level; level 0 is the clean frame of every family."""
-        if not self._settings.warm_up <= number < len(reference):
+        if not _WARM_UP <= number < len(reference):
             return
         families = slice(None) if level == 0 else self._settings.families.index(family)
         there = reference.frames[number]
         kept, still = kept_and_parked(reference, number, self._settings.keep)
-        boxes = there.boxes_px[kept[~still] if self._settings.moving_only else kept]
+        boxes = there.boxes_px[kept[~still]]
         hit = overlaps(boxes, found.boxes_px) >= MIN_OVERLAP
         bins = self._bins(boxes)
         n_bins = len(self.edges_deg) - 1

@@ -1,7 +1,5 @@
 """Files of labels: trajectories in the layout of ASAM OpenLABEL, windows as `train --labels` reads them."""
 
-import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ import numpy as np
 
 from worldstate.adapters.datasets.feature_extraction import FRONT, window_ends_s
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.adapters.files.file_io import atomic_path, write_text
+from worldstate.adapters.files.file_io import write_json, write_rows
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.version import __version__
@@ -60,7 +58,7 @@ def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
 
 def write_open_label(path: Path, recording: str, passes: Sequence[PassLabel]) -> None:
     """Write the document, whole or not at all."""
-    write_text(path, json.dumps(open_label(recording, passes), allow_nan=False) + "\n")
+    write_json(path, open_label(recording, passes))
 
 
 def window_rows(
@@ -117,10 +115,7 @@ def file_below(sound: Path, labels: Path) -> str:
 
 def write_window_labels(path: Path, rows: Sequence[Sequence[object]]) -> None:
     """Write windows in the columns that `extract-features --labels` and `train --labels` read."""
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows(rows)
+    write_rows(path, COLUMNS, rows)
 
 
 def _placed(state: FloatArray, spread: FloatArray, in_sight: bool) -> dict[str, Any]:

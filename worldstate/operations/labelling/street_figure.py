@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.ground.typing import BoolArray
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, figure_file, legend_beside
-from worldstate.operations.recordings.true_track import TrueTrack
 from worldstate.smoothing.learned_street import LearnedStreet, context_of, with_pass
 from worldstate.smoothing.observations import SmoothedTrack
 from worldstate.state.context import Occluder

@@ -1,6 +1,5 @@
 """What the passes of a recording tell of its street, and what was heard of it meanwhile."""
 
-import json
 import logging
 import math
 import warnings
@@ -17,7 +16,7 @@ from worldstate.abduction.sequence.street_sides import PassSound, arrival_patter
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
-from worldstate.adapters.files.file_io import read_json, refused_as_file, write_text
+from worldstate.adapters.files.file_io import read_json, refused_as_file, write_json
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import Source, open_source
@@ -26,8 +25,7 @@ from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_pass
 
-from .box_tracks import box_tracks
-from .pass_labels import PassLabel, label_passes
+from .pass_labels import PassLabel, box_tracks, label_passes
 
 # No vehicle comes out of an arm nearer to the axis: one that turns there has overtaken, or was two.
 _LEAST_EDGE_RAD = math.radians(5.0)
@@ -132,7 +130,7 @@ def heard_street(source: Source, model: Model) -> HeardStreet | None:
 
 def write_street(path: str | Path, street: LearnedStreet) -> None:
     """Write a street to exactly this path, whole or not at all."""
-    write_text(path, json.dumps(encode(street), allow_nan=False) + "\n")
+    write_json(path, encode(street))
 
 
 def read_street(path: str | Path) -> LearnedStreet:

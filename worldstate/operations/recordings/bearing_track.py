@@ -7,9 +7,8 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.frontend.direction.music import count_sources
-from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins
-from worldstate.frontend.stream import FrontEnd
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import seconds
 from worldstate.operations.figure_style import figure_file

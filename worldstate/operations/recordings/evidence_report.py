@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Literal, TypeAlias
 
-from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
+from worldstate.abduction.road_users import Foreign, WarningSignal
 from worldstate.ground.values import seconds
 from worldstate.state import Entity, RiskCue, WorldState
 

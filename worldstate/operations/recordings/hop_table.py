@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
-from worldstate.adapters.files.npz_file import load_npz, save_npz
+from worldstate.adapters.files.file_io import load_npz, save_npz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, seconds
 from worldstate.ground.checks import check_shape, finite_array
 from worldstate.ground.typing import AnyArray, BoolArray

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.ensemble import EnsembleModel, log_levels, site_reference
 from worldstate.abduction.signature.ensemble_training import OTHER_SIDE, SIMULATED_WEIGHT, SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
-from worldstate.abduction.signature.site_reference import log_levels, site_reference
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray

@@ -1,35 +1,160 @@
-"""Training of a model: classifier on all windows, thresholds and risk maps on out-of-fold scores."""
+"""Training of a model: classifier on all windows, thresholds and risk maps on out-of-fold scores.
+
+Folds keep a recording whole. Thresholds and risk maps are of single windows, one hazard-free window a
+recording.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import expit, logit
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
-from worldstate.abduction.cueing.risk_map import fit_platt
+from worldstate.abduction.cueing.risk_map import RiskMap, fit_isotonic, fit_platt
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import RECIPES, SimulatedWindows, SiteEnsembleClassifier
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
 from worldstate.adapters.files.acoustic_domain import ego_motion_of
 from worldstate.adapters.files.model_file import Model, Provenance
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
-from worldstate.ground.typing import FloatArray, TextArray
+from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 from worldstate.operations.metrics.approach_table import auroc
 
-from .folds import N_FOLDS, folds_by_recording, junction_folds, out_of_fold
 from .site_references import asked_while_listening, with_site_references
-from .window_calibration import (
-    ABSENT_MISS_RATE,
-    MISS_RATES,
-    PUBLISHED_MISS_RATE,
-    WindowCalibration,
-    between,
-    calibrate_windows,
-)
+
+FitMap = Callable[[ArrayLike, ArrayLike], RiskMap]
+
+# The published statistic takes no account of vision; ours removes the visible explanation.
+PUBLISHED_MISS_RATE = 1.0
+ABSENT_MISS_RATE = 0.0
+_SMALLEST_GAMMA = 1e-12
+MISS_RATES = (PUBLISHED_MISS_RATE, ABSENT_MISS_RATE)
+
+
+@dataclass(frozen=True, slots=True)
+class WindowCalibration:
+    """What was learned on calibration windows and is applied unchanged to others."""
+
+    miss_rate: float  # beta at which the statistic is formed
+    gamma: float  # Threshold
+    risk_map: RiskMap  # From statistic to risk
+
+    def apply(self, probabilities: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return statistic, risk and decision of each window from posteriors, shape (n, 4)."""
+        score = hazard_statistic(probabilities, self.miss_rate)
+        return score, self.risk_map(score), score >= self.gamma
+
+
+def calibrate_windows(
+    probabilities: FloatArray,
+    hazards: BoolArray,
+    hazard_free: BoolArray,
+    *,
+    alpha: float,
+    miss_rate: float,
+    fit_map: FitMap = fit_isotonic,
+) -> WindowCalibration:
+    """Set threshold and risk map on posteriors of windows that the classifier was not trained on.
+
+    Shapes: probabilities (n, 4), hazards, hazard_free (n,).
+
+    Examples
+    --------
+    >>> posteriors = np.array([[0.1, 0.7, 0.1, 0.1], [0.1, 0.1, 0.7, 0.1], [0.0, 0.1, 0.8, 0.1]])
+    >>> hazards = np.array([True, False, False])
+    >>> calibration = calibrate_windows(posteriors, hazards, ~hazards, alpha=0.5, miss_rate=1.0)
+    >>> calibration.apply(posteriors)[2]
+    array([ True, False, False])
+    """
+    # The threshold is set for single windows. A sustained rule alarms on a part of those only, and so keeps
+    # the budget too.
+    if not hazards.any() or not hazard_free.any():
+        raise InvalidArgumentError("calibration: expected windows with and without a hazard")
+    score = hazard_statistic(probabilities, miss_rate)
+    scored = hazards | hazard_free
+    return WindowCalibration(
+        miss_rate=miss_rate,
+        gamma=neyman_pearson_threshold(list(score[hazard_free][:, None]), alpha),
+        risk_map=fit_map(score[scored], hazards[scored]),
+    )
+
+
+def between(levels: Sequence[WindowCalibration]) -> WindowCalibration:
+    """Return one calibration of several of the same statistic, from the most careful to the boldest."""
+    # A classifier at a junction that it never saw stands between two that can be measured on its training
+    # set: one that saw fewer junctions and not this one (leave one junction out), and one that saw this one
+    # too (leave recordings out). The first is too careful, the second too bold, so the threshold is taken
+    # half-way between them, in log-odds. The risk map is that of the boldest: statistics of windows that
+    # are compared with their site mean the same elsewhere, those of a classifier from too few junctions do
+    # not.
+    if not levels:
+        raise InvalidArgumentError("levels: expected at least one calibration")
+    if len(levels) == 1:
+        return levels[0]
+    gammas = np.clip([level.gamma for level in levels], _SMALLEST_GAMMA, 1.0 - _SMALLEST_GAMMA)
+    return replace(levels[-1], gamma=float(expit(logit(gammas).mean())))
+
+
+N_FOLDS = 5
+
+Trained = TypeVar("Trained")
+
+
+def recording_labels(table: FeatureTable) -> dict[str, str]:
+    """Return the label of each recording: that of its hazard window where it has one besides ``front``."""
+    labels: dict[str, str] = {}
+    for key, label in zip(table.recording_keys.tolist(), table.labels.tolist(), strict=True):
+        if key not in labels or label != "front":
+            labels[key] = label
+    return labels
+
+
+def folds_by_recording(table: FeatureTable, rng: np.random.Generator) -> TextArray:
+    """Deal recordings to folds so that each holds its share of every label at every junction."""
+    labels = recording_labels(table)
+    if len(labels) < N_FOLDS:
+        raise InvalidArgumentError(f"expected at least {N_FOLDS} recordings to split, got {len(labels)}")
+    strata: dict[tuple[str, str], list[str]] = {}
+    for key, label in labels.items():
+        strata.setdefault((key.split("/")[0], label), []).append(key)
+    # Dealing goes on where the last stratum stopped, or the first folds would collect every remainder.
+    dealt = [key for stratum in sorted(strata) for key in rng.permutation(sorted(strata[stratum])).tolist()]
+    fold_of = {key: str(position % N_FOLDS) for position, key in enumerate(dealt)}
+    return np.array([fold_of[key] for key in table.recording_keys.tolist()])
+
+
+def junction_folds(table: FeatureTable) -> TextArray:
+    """Return the junction of each window: leave one junction out."""
+    if len(np.unique(table.environments)) < 2:
+        raise InvalidArgumentError("expected at least two junctions to leave one out")
+    return table.environments
+
+
+def out_of_fold(
+    table: FeatureTable,
+    folds: TextArray,
+    fit: Callable[[FeatureTable], Trained],
+    ask: Callable[[Trained, BoolArray], FloatArray],
+) -> FloatArray:
+    """Return posteriors of each window from a classifier trained on the other folds, shape (n, 4).
+
+    `ask` returns those of the chosen rows of `table`, shape (rows, 4).
+    """
+    probabilities = np.empty((len(table), len(CLASSES)))
+    for fold in np.unique(folds):
+        held_out = folds == fold
+        probabilities[held_out] = ask(fit(table.select(~held_out)), held_out)
+    return probabilities
+
 
 # Budgets.
 ALPHAS = (0.01, 0.02, 0.05)

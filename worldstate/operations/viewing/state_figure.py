@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from worldstate.abduction.signature.domain_guard import Foreign
+from worldstate.abduction.road_users import Foreign
 from worldstate.adapters.audio.sound_file import Audio
+from worldstate.adapters.datasets.ovad import TrueTrack, read_true_tracks
 from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.file_io import atomic_path
 from worldstate.adapters.listener import Step
@@ -35,7 +36,6 @@ from worldstate.operations.figure_style import (
     name_rows,
     with_gaps,
 )
-from worldstate.operations.recordings.true_track import TrueTrack, read_true_tracks
 from worldstate.state import Entity, Occluder, RiskCue, WorldState
 
 if TYPE_CHECKING:

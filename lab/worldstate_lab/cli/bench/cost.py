@@ -27,9 +27,8 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import ovad_array, roof_array_56
-from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.stream import FrontEnd
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import nanoseconds

@@ -33,8 +33,7 @@ from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.state import WorldState
 from worldstate_lab.methods.oc_sort import OcSort
 from worldstate_lab.metrics.track_measures import gospa_bearing
-from worldstate_lab.passes.followed_stream import stream_measurements
-from worldstate_lab.passes.stream_camera import stream_detections
+from worldstate_lab.passes.followed_stream import stream_detections, stream_measurements
 
 SILENCE, WORLD, BOXES, UNHEARING = "silence", "world-state", "boxes as they are", "world-state without sound"
 OC_SORT, GM_PHD, JPDA = "OC-SORT on the boxes", "GM-PHD (Stone Soup)", "JPDA (Stone Soup)"
@@ -52,7 +51,7 @@ def stated(
 ) -> Iterator[tuple[int, Said]]:
     """Yield the number of every hop of a stream, in tenths of a second, and what every method states."""
     # Optional: only this benchmark needs Stone Soup.
-    from worldstate_lab.benchmarks.stone_soup_trackers import GmPhd, Jpda, scan_time, scans
+    from worldstate_lab.benchmarks.tracker_costs import GmPhd, Jpda, scan_time, scans
 
     taken = list(measured)
     view, boxes = _view(taken), _oc_sort(heard)

@@ -12,16 +12,13 @@ import sklearn
 from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
-from worldstate_lab.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STANDING, Protocol
-from worldstate_lab.methods.table_rows import GROUNDED
-from worldstate_lab.report.pages import Document, Section
-from worldstate_lab.report.table import Cell, Figure, Table, Value
-from worldstate_lab.trials.hearing import data_fingerprint
+from worldstate_lab.evaluation.protocols import FIXED, GROUNDED, PROTOCOLS, RETRAINED, STANDING, Protocol
+from worldstate_lab.report.table import Cell, Document, Figure, Section, Table, Value
+from worldstate_lab.trials.pass_cache import data_fingerprint
 
-from .approach_timeline import approach_section
 from .degradation_section import awareness_figures, degradation_section, sweep_values
 from .measured_values import PROPOSED, MeasuredValues, printed, site_values
-from .recording_panels import bearing_gating_figure, junction_figure
+from .recording_panels import approach_section, bearing_gating_figure, junction_figure
 from .warning_sections import (
     budget_section,
     cueing_section,

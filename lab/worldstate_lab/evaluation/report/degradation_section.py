@@ -11,8 +11,7 @@ from worldstate_lab.degradation.conditions import FAMILIES, OFF
 from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
 from worldstate_lab.degradation.staged_filter import StreamSweep
 from worldstate_lab.evaluation.figures import COMMANDS, paper_value
-from worldstate_lab.report.pages import Section
-from worldstate_lab.report.table import Cell, Figure, Table, Value, plain
+from worldstate_lab.report.table import Cell, Figure, Section, Table, Value, plain
 
 from .measured_values import Place
 from .recording_panels import awareness_figure, miss_rate_angle_figure, miss_rate_level_figure

@@ -14,8 +14,8 @@ from worldstate_lab.evaluation.front_end_study import FrontEndStudy
 from worldstate_lab.evaluation.protocols import RETRAINED, STANDING
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.line_of_sight import seen_early_s
-from worldstate_lab.metrics.bearing_gating import PUBLISHED_COVERAGE
 from worldstate_lab.metrics.intervals import middle, ratio
+from worldstate_lab.metrics.track_measures import PUBLISHED_COVERAGE
 from worldstate_lab.report.table import Cell, Table, Value
 
 Place = tuple[str, str, str]  # Group, row and figure, as in `PAPER_VALUES`

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.abduction.cueing.calibration_error import reliability_curve
+from worldstate.abduction.cueing.risk_map import reliability_curve
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
 from worldstate_lab.report.table import Figure, Value

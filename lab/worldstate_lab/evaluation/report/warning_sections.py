@@ -6,18 +6,15 @@ import numpy as np
 
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import FIGURES, paper_value, titles
-from worldstate_lab.evaluation.protocols import STANDING
+from worldstate_lab.evaluation.protocols import CURVE_ALPHAS, STANDING
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate_lab.evaluation.scores import paired
-from worldstate_lab.methods.table_rows import CURVE_ALPHAS
-from worldstate_lab.report.pages import Section
-from worldstate_lab.report.table import Cell, Figure, Table, Value
+from worldstate_lab.report.table import Cell, Figure, Section, Table, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
-from .approach_timeline import leads_s
 from .measured_values import PROPOSED, MeasuredValues, score_values
 from .panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
-from .recording_panels import lead_figure
+from .recording_panels import lead_figure, leads_s
 
 _BUDGETS = {f"proposed {text}": float(text) for text in (".01", ".02", ".05")}
 # The figures that a table shows of each method.

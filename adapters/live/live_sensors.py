@@ -1,15 +1,24 @@
-"""UDP datagrams of other programs: detections image by image, and odometry, each with its age."""
+"""Sensors that run beside the microphones, each read in a thread of its own.
+
+UDP datagrams of other programs, detections image by image and odometry, each with its age; a camera of this
+machine, and what a detector finds in its images.
+"""
 
 import socket
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
-from worldstate.adapters.camera.detections import DetectionFrame, frame_of
+from worldstate.adapters.camera.detections import DetectionFrame, Detector, frame_of
+from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.camera.video import ImageHealth
 from worldstate.adapters.files.odometry_file import OdometryRecord
-from worldstate.ground import InvalidArgumentError, WorldstateError, in_range
+from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range
+from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import decode, decode_json
+from worldstate.ground.typing import ImageArray
 
 from .live_sound import BoundedChannel
 
@@ -24,7 +33,28 @@ _POLL_S = 0.2
 _OLDEST_S = 10.0
 
 
-class DatagramSocket(Generic[T]):
+class ReaderThread(ABC):
+    """A thread that reads while the context lasts, and `close` at its end."""
+
+    def __init__(self, close: Callable[[], object]) -> None:
+        self._close, self._stopped = close, threading.Event()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+        self._close()
+
+    @abstractmethod
+    def _read(self) -> None:
+        """Read until `_stopped` is set."""
+
+
+class DatagramSocket(ReaderThread, Generic[T]):
     """Records that arrive as UDP datagrams of one JSON object, with ``"age_s"`` from capture to sending.
 
     Parameters
@@ -57,8 +87,7 @@ class DatagramSocket(Generic[T]):
         self._socket, self._stamp_ns = _bound_socket(address, option), stamp_ns
         self._decode = decode
         self._datagrams: BoundedChannel[tuple[float, bytes]] = BoundedChannel(WAITING_DATAGRAMS)
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._read, daemon=True)
+        super().__init__(self._socket.close)
         self.refused, self.problem = 0, ""
 
     @property
@@ -70,15 +99,6 @@ class DatagramSocket(Generic[T]):
     def port(self) -> int:
         """The port that is listened at, where 0 was given the one that was free."""
         return int(self._socket.getsockname()[1])
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
-        self._socket.close()
 
     def deliver(self, take: Callable[[int, T], None]) -> None:
         """Pass on what waits, each with the time of its capture on the stream's clock, nanoseconds.
@@ -148,3 +168,97 @@ def _bound_socket(address: str, option: str) -> socket.socket:
         problem = f"expected a free address, got {address} ({error})"
         raise InvalidArgumentError(f"{option}: {problem}") from error
     return listening
+
+
+# Images that wait at most: a detector that is slower than the camera looks at the newest ones.
+WAITING_IMAGES = 4
+
+StampedImages = BoundedChannel[tuple[float, ImageArray]]
+
+
+def image_channel() -> StampedImages:
+    """Return a channel of images, each with its time of capture on the clock of `time.monotonic`."""
+    return BoundedChannel(WAITING_IMAGES)
+
+
+class ImageLooks:
+    """What a detector finds in the images of a channel.
+
+    Parameters
+    ----------
+    images : StampedImages
+        Filled by a `CameraFeed`, or by a callback of one's own.
+    detector : Detector
+        Looks at them in the order of time.
+    stamp_ns : callable
+        From the time of capture to the stream's clock: `LiveSound.stamp_ns`.
+    size_px : (int, int)
+        Width and height that the lens was given for.
+    rates : MissRates, optional
+        Where they hold the camera's scale of health, its degradation is read from the images.
+    """
+
+    def __init__(
+        self,
+        images: StampedImages,
+        detector: Detector,
+        stamp_ns: Callable[[float], int],
+        size_px: tuple[int, int],
+        rates: MissRates | None = None,
+    ) -> None:
+        self._images, self._detector, self._stamp_ns, self._size_px = images, detector, stamp_ns, size_px
+        self._health = ImageHealth(rates)
+
+    def deliver(self, take: Callable[[int, DetectionFrame], None]) -> None:
+        """Pass on, such as to `Listener.look`, what is found in the images that wait, each with its stamp."""
+        for captured_s, image in self._images.take_all():
+            self._check_size(image)
+            stamp_ns = self._stamp_ns(captured_s)
+            self._health.read(stamp_ns, image)
+            take(stamp_ns, self._detector.detect(image))
+
+    def degradation(self, stamp_ns: int) -> float:
+        """Return d as last read, 0 where no scale of health is known."""
+        return self._health.level
+
+    def _check_size(self, image: ImageArray) -> None:
+        got = image.shape[1], image.shape[0]
+        if got != self._size_px:
+            width, height = self._size_px
+            problem = f"expected images of {width} x {height} px as its lens, got {got[0]} x {got[1]}"
+            raise InvalidArgumentError(f"--camera: {problem}: give the lens of this camera")
+
+
+class CameraFeed(ReaderThread):
+    """Read a camera of this machine into a channel until it is stopped.
+
+    Parameters
+    ----------
+    device : int
+        Number of the camera as OpenCV counts them.
+    images : StampedImages
+        Where the images go.
+
+    Raises
+    ------
+    MissingExtraError
+        If OpenCV is not installed.
+    InputFileError
+        If there is no such camera.
+    """
+
+    def __init__(self, device: int, images: StampedImages) -> None:
+        self._capture: Any = optional("cv2").VideoCapture(device)
+        self._name, self._images = f"camera {device}", images
+        if not self._capture.isOpened():
+            self._capture.release()
+            raise InputFileError(self._name, "expected a camera of this machine, it cannot be opened")
+        super().__init__(self._capture.release)
+
+    def _read(self) -> None:
+        while not self._stopped.is_set():
+            found, image = self._capture.read()
+            if not found:
+                self._images.close(InputFileError(self._name, "expected images, the camera gives no more"))
+                return
+            self._images.put((time.monotonic(), image))
