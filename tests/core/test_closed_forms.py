@@ -24,7 +24,7 @@ from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.track import born
+from worldstate.belief.track import TrackArrays, born
 from worldstate.core.acoustic_update import association_probability
 from worldstate.core.birth_death import hidden_on
 from worldstate.core.sequence_memory import ArrivalRate, SequenceMemory, carried, informed
@@ -328,7 +328,8 @@ def test_a_box_is_of_the_one_entity_there_or_of_a_new_one(apart, existence, miss
     variance, found = 0.05**2 + 0.02**2, 1.0 - miss_rate
     own = found * existence * math.exp(-0.5 * apart**2 / variance) / math.sqrt(2.0 * math.pi * variance)
     new = (1.0 - found * existence) * 0.05 / 1.2  # Unheard ones, anywhere in the view
-    whose = associated([seen(0.1, existence)], [detection], SITE)
+    known = [seen(0.1, existence)]
+    whose = associated(known, TrackArrays.of(known), [detection], SITE)
     assert whose.pairs[0, 0] == pytest.approx(own / (own + new), rel=1e-4)
 
 

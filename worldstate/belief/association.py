@@ -1,7 +1,7 @@
 """Association of detections with entities, in view and at the edge of an occluder, all at once."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -10,11 +10,11 @@ import numpy as np
 from worldstate.abduction.road_users import SEEN_AS
 from worldstate.belief.kinematics.cartesian import CartesianBelief, full_measurement
 from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, MotionBelief
-from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
+from worldstate.ground import BoolArray, FloatArray, wrap_angle
 
 from .detection import Detection
 from .site_geometry import HIDDEN_BIAS_STD, SiteGeometry, normal_share
-from .track import Track, side_weights
+from .track import Track, TrackArrays, side_weights
 
 # Of a pair outside the gate; below any sum of scores within it.
 FORBIDDEN = -1e6
@@ -23,8 +23,8 @@ FORBIDDEN = -1e6
 _PARKED_MISMATCH = -10.0
 _UNFORESEEN = 0.05  # Of a vehicle that comes into view, whatever the sound had said of the time
 _LEAST = 1e-300  # Keeps logarithms finite
-# All of five tracks and five measurements, or of three and twelve; their tables take .2 ms to read.
-_MOST_EVENTS = 2000
+# Of a table of events and pairs: all of five tracks and five measurements, or of three and twelve.
+_MOST_ENTRIES = 100_000
 _ROUNDS = 30  # After these messages of twenty tracks that stand abreast change by less than 1e-3
 _SETTLED = 1e-9  # Existence is stated in nine digits
 _MOST_NATS = 25.0  # Sums that leave one term out keep their digits
@@ -69,7 +69,9 @@ class Association:
         return chances
 
 
-def associated(tracks: Sequence[Track], detections: Sequence[Detection], site: SiteGeometry) -> Association:
+def associated(
+    tracks: Sequence[Track], arrays: TrackArrays, detections: Sequence[Detection], site: SiteGeometry
+) -> Association:
     r"""Return whose the detections of an instant are, all boxes or all positions.
 
     Every one is of an entity that was detected before, of a hidden one that comes past an edge, or of an
@@ -83,10 +85,9 @@ def associated(tracks: Sequence[Track], detections: Sequence[Detection], site: S
     not known. Entities in view and hidden ones compete: an entity that has left the view would else take
     the first detection of the next one.
     """
-    detected = np.array([track.detected for track in tracks], bool)
     if not tracks or not detections:
-        return joint_association(np.empty((len(detections), len(tracks))), detected)
-    return joint_association(_log_ratios(tracks, detections, detected, site), detected)
+        return joint_association(np.empty((len(detections), len(tracks))), arrays.detected)
+    return joint_association(_log_ratios(tracks, arrays, detections, site), arrays.detected)
 
 
 def joint_association(log_ratios: FloatArray, detected: BoolArray) -> Association:
@@ -109,8 +110,8 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
 
     .. math:: p_{ij} = \sum_{a:\, a(i) = j} p(a), \qquad p(a) \propto \prod_i e^{l_{i a(i)}}
 
-    An event gives every track one measurement or none, and no measurement to two. For a group of tracks that
-    share measurements with more than 2,000 events the sum is approximated by belief propagation.
+    An event gives every track one measurement or none, and no measurement to two. For groups of tracks that
+    share measurements in some 2,000 events and more the sum is approximated by belief propagation.
 
     Examples
     --------
@@ -121,18 +122,18 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
     # Pairs that compete with no other, which most are, all at once.
     alone = gated & (gated.sum(axis=0) == 1) & (gated.sum(axis=1) == 1)[:, None]
     chances[alone] = np.exp(-np.logaddexp(0.0, -log_ratios[alone]))
-    for rows, columns in _groups(gated & ~alone):
-        events, pairs = _joint_events(len(rows), len(columns)), np.ix_(rows, columns)
-        if events is None:
-            chances[pairs] = propagated(log_ratios[pairs])
-            continue
-        # The last row is that of no measurement.
-        ratios = np.vstack([log_ratios[pairs], np.zeros(len(columns))])
-        logs = ratios[events, np.arange(len(columns))].sum(axis=1)
-        weights = np.exp(logs - logs.max())
-        total = weights.sum()
-        for column, given in zip(columns, events.T, strict=True):
-            chances[rows, column] = np.bincount(given, weights, len(rows) + 1)[:-1] / total
+    crowd = gated & ~alone
+    for rows, columns in _groups(crowd):
+        events = _joint_events(len(rows), len(columns))
+        if events is not None:
+            pairs = np.array(rows)[:, None], columns
+            logs = log_ratios[pairs].ravel() @ events
+            weights = np.exp(logs - logs.max())
+            total = weights.sum()
+            chances[pairs] = (events @ weights / total).reshape(len(rows), len(columns))
+            crowd[pairs] = False
+    if crowd.any():
+        chances[crowd] = propagated(np.where(crowd, log_ratios, FORBIDDEN))[crowd]
     return chances
 
 
@@ -150,7 +151,7 @@ def propagated(log_ratios: FloatArray) -> FloatArray:
     >>> propagated(np.log([[3.0, 1.0]])).round(3)
     array([[0.6, 0.2]])
     """
-    weight = np.where(log_ratios > FORBIDDEN, np.exp(np.clip(log_ratios, -_MOST_NATS, _MOST_NATS)), 0.0)
+    weight = np.exp(np.minimum(log_ratios, _MOST_NATS))
     free = np.ones_like(weight)
     for _ in range(_ROUNDS):
         given = weight * free
@@ -163,27 +164,29 @@ def propagated(log_ratios: FloatArray) -> FloatArray:
     return np.asarray(given / (1.0 + given.sum(axis=0)))
 
 
-def _groups(gated: BoolArray) -> Iterator[tuple[list[int], list[int]]]:
-    """Yield rows and columns of every group that shares no pair with another one."""
-    groups: list[tuple[set[int], list[int]]] = []
-    for column, gate in enumerate(gated.T.tolist()):
-        rows, columns = {row for row, inside in enumerate(gate) if inside}, [column]
+def _groups(gated: BoolArray) -> list[tuple[list[int], list[int]]]:
+    """Return rows and columns of every group that shares no pair with another one."""
+    groups: list[tuple[int, list[int]]] = []
+    # Rows as the bits of a number: two columns share one where their numbers have a bit in common.
+    for column, bits in enumerate(np.packbits(gated, axis=0, bitorder="little").T):
+        rows, columns = int.from_bytes(bits.tobytes(), "little"), [column]
         for group in [one for one in groups if rows & one[0]]:
             groups.remove(group)
             rows, columns = rows | group[0], columns + group[1]
         groups.append((rows, columns))
-    return ((sorted(rows), columns) for rows, columns in groups if rows)
+    every = range(len(gated))
+    return [([row for row in every if rows >> row & 1], columns) for rows, columns in groups if rows]
 
 
-@lru_cache(maxsize=256)
-def _joint_events(rows: int, columns: int) -> IntArray | None:
-    """Return the row of every column in all joint events, `rows` for none, shape (events, columns)."""
+@lru_cache(maxsize=64)
+def _joint_events(rows: int, columns: int) -> FloatArray | None:
+    """Return whether a joint event has a pair, shape (rows * columns, events); None of too many."""
     events: list[tuple[int, ...]] = [()]
     for _ in range(columns):
         events = [(*one, row) for one in events for row in range(rows + 1) if row == rows or row not in one]
-        if len(events) > _MOST_EVENTS:
+        if len(events) * rows * columns > _MOST_ENTRIES:
             return None
-    return np.array(events)
+    return np.array([np.eye(rows, rows + 1)[:, one].ravel() for one in map(list, events)]).T.copy()
 
 
 def _likeliest(scores: FloatArray) -> dict[int, int]:
@@ -194,70 +197,61 @@ def _likeliest(scores: FloatArray) -> dict[int, int]:
     >>> _likeliest(np.array([[4.0, 3.0], [3.5, FORBIDDEN]]))
     {1: 0, 0: 1}
     """
-    n, known = scores.shape
-    if not n or not known:
-        return {}
-    every = np.full((n, known + n), FORBIDDEN)
-    every[:, :known] = scores
-    np.fill_diagonal(every[:, known:], 0.0)
     # Imported where it is needed: scipy.optimize takes longer than all else that the core imports.
     from scipy.optimize import linear_sum_assignment
 
-    rows, columns = linear_sum_assignment(-every)
-    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-    return {column: row for row, column in pairs if column < known and every[row, column] > FORBIDDEN}
+    # A row without a partner that is worth more takes one that is worth nothing.
+    rows, columns = linear_sum_assignment(np.maximum(scores, 0.0), maximize=True)
+    worth = scores[rows, columns] > 0.0
+    return dict(zip(columns[worth].tolist(), rows[worth].tolist(), strict=True))
 
 
 def _log_ratios(
-    tracks: Sequence[Track], detections: Sequence[Detection], detected: BoolArray, site: SiteGeometry
+    tracks: Sequence[Track], arrays: TrackArrays, detections: Sequence[Detection], site: SiteGeometry
 ) -> FloatArray:
     """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
-    motion, in_sight = MotionBelief.stacked([one.motion for one in tracks]), detections[0].found is not None
+    in_sight, boxes = detections[0].found is not None, detections[0].position is None
     found = np.array([[one.found or 0.0] for one in detections])
-    existence = np.array([one.existence for one in tracks]).clip(LEAST_EXISTENCE, MOST_EXISTENCE)
-    boxes = detections[0].position is None
-    past = np.array([leaving(one, site) if boxes else 0.0 for one in tracks])
-    # What may have left the view is found as far as it may not, wherever the edge truly is.
-    found = found * np.maximum(1.0 - past, _UNFORESEEN)
+    existence = np.minimum(np.maximum(arrays.existence, LEAST_EXISTENCE), MOST_EXISTENCE)
+    if boxes:
+        # What may have left the view is found as far as it may not, wherever the edge truly is.
+        found = found * np.maximum(1.0 - leaving(arrays, site), _UNFORESEEN)
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
-    density = _azimuth_density(motion, detections, detected)
-    heard = np.flatnonzero(~detected) if in_sight else np.array([], int)
+    density = _azimuth_density(arrays, detections)
+    heard = np.flatnonzero(~arrays.detected) if in_sight else np.array([], int)
     if len(heard):
         # What was only heard is found where it comes into view.
         hidden = [tracks[i] for i in heard]
         density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), _LEAST))
         reached = np.array([reached_edge(one, site) for one in hidden])
         likely[:, heard] = np.log(existence[heard] * reached)
-    if detections[0].position is None:
-        density += _alike(tracks, detections, detected)
+    if boxes:
+        density += _alike(tracks, arrays, detections)
     else:
-        density = _density_m2(tracks, motion, detections, density)
+        density = _density_m2(tracks, arrays.motion, detections, density)
     log_new = np.array([[one.log_new] for one in detections])
     return np.where(density > 0.5 * FORBIDDEN, density + likely - log_new, FORBIDDEN)
 
 
-def _azimuth_density(
-    motion: MotionBelief, detections: Sequence[Detection], detected: BoolArray
-) -> FloatArray:
+def _azimuth_density(arrays: TrackArrays, detections: Sequence[Detection]) -> FloatArray:
     """Return the log density of every detection's azimuth, 1/rad, FORBIDDEN outside the gate of a box."""
     azimuth_rad, std_rad = np.array([(one.azimuth_rad, one.std_rad) for one in detections]).T[:, :, None]
-    residual = wrap_angle(azimuth_rad - motion.mean[:, AZIMUTH])
+    residual = wrap_angle(azimuth_rad - arrays.motion.mean[:, AZIMUTH])
     # The sound of a hidden one may come from the edge instead.
-    bias = np.where(detected, 0.0, HIDDEN_BIAS_STD)
-    variance = motion.covariance[:, AZIMUTH, AZIMUTH] + std_rad**2 + bias**2
+    bias = ~arrays.detected * HIDDEN_BIAS_STD**2
+    variance = arrays.motion.covariance[:, AZIMUTH, AZIMUTH] + std_rad**2 + bias
     squares = residual**2 / variance
     density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
-    if detections[0].position is not None:
-        return np.where(squares > _GATE, FORBIDDEN, density)
-    outside = (np.abs(residual) > GATE_RAD) | (squares > _GATE_SIGMA**2)
-    return np.where(outside, FORBIDDEN, density)
+    boxes = detections[0].position is None
+    most, farthest_rad = (_GATE_SIGMA**2, GATE_RAD) if boxes else (_GATE, math.pi)
+    return np.where((squares > most) | (np.abs(residual) > farthest_rad), FORBIDDEN, density)
 
 
-def _alike(tracks: Sequence[Track], detections: Sequence[Detection], detected: BoolArray) -> FloatArray:
+def _alike(tracks: Sequence[Track], arrays: TrackArrays, detections: Sequence[Detection]) -> FloatArray:
     """Return what motion and class say of every pair of a box and a track, nats."""
     moving = np.array([[bool(one.moving)] for one in detections])
-    alike = np.where(moving == np.array([one.moving for one in tracks]), 0.0, _PARKED_MISMATCH)
-    for i in np.flatnonzero(~detected).tolist():
+    alike = np.where(moving == arrays.moving, 0.0, _PARKED_MISMATCH)
+    for i in np.flatnonzero(~arrays.detected).tolist():
         classes = [math.log(_shared_class(tracks[i], one.classes[0][0])) for one in detections]
         alike[:, i] = np.where(moving[:, 0], classes, FORBIDDEN)
     return alike
@@ -309,13 +303,12 @@ def _shared_class(track: Track, label: str) -> float:
     return max(sum(share for matches, share in kinds if matches), _MISREAD)
 
 
-def leaving(track: Track, site: SiteGeometry) -> float:
-    """Return P(the leading end of an entity in view has passed the edge ahead of it)."""
-    if not (track.seen and track.moving):
-        return 0.0
-    way = float(np.sign(track.motion.mean[AZIMUTH_RATE]))  # Of a first sighting none
-    end_rad = track.motion.azimuth_rad + 0.5 * way * track.width_rad
-    return site.past_edge(end_rad, track.motion.azimuth_std_rad, way)
+def leaving(arrays: TrackArrays, site: SiteGeometry) -> FloatArray:
+    """Return P(the leading end of an entity in view has passed the edge ahead of it), shape (tracks,)."""
+    motion = arrays.motion
+    way = np.sign(motion.mean[:, AZIMUTH_RATE]) * (arrays.seen & arrays.moving)  # Of a first sighting none
+    end_rad = motion.mean[:, AZIMUTH] + 0.5 * way * arrays.width_rad
+    return site.past_edge(end_rad, np.sqrt(motion.covariance[:, AZIMUTH, AZIMUTH]), way)
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
-from worldstate.ground import BoolArray, wrap_angle
+from worldstate.ground import FloatArray, wrap_angle
 from worldstate.ground.serialisation import Probability
 from worldstate.measurement import CameraLook, Sector, Sighting
 from worldstate.measurement.position import Position, PositionScan
@@ -116,15 +116,15 @@ def _of_position(position: Position, log_new: float, found: float | None) -> Det
     )
 
 
-def fused(scans: Sequence[Scan]) -> tuple[list[Detection], BoolArray]:
-    r"""Return the detections of an instant, and by which looks each is, shape (detections, looks).
+def fused(scans: Sequence[Scan]) -> tuple[list[Detection], FloatArray]:
+    r"""Return the detections of an instant, and 1 for the looks that each is by, shape (detections, looks).
 
     Boxes of several cameras that are of one object are one detection, whatever the cameras are called:
 
     .. math:: \sigma^{-2} = \sum_s \sigma_s^{-2}, \qquad z = \sigma^2 \sum_s \sigma_s^{-2} z_s
     """
     if len(scans) == 1:
-        return list(scans[0].detections), np.ones((len(scans[0].detections), 1), bool)
+        return list(scans[0].detections), np.ones((len(scans[0].detections), 1))
     every = [(one, number) for number, scan in enumerate(scans) for one in scan.detections]
     every.sort(key=lambda pair: _BY_AZIMUTH(pair[0]))
     groups = [[pair] for pair in every]
@@ -134,9 +134,10 @@ def fused(scans: Sequence[Scan]) -> tuple[list[Detection], BoolArray]:
             one += other
             groups = [one if group is other else group for group in groups]
     parts = list({id(group): group for group in groups}.values())
-    looks = [[number for _, number in group] for group in parts]
-    by_look = np.array([[s in numbers for s in range(len(scans))] for numbers in looks], bool)
-    return [_joined([one for one, _ in group]) for group in parts], by_look.reshape(len(parts), len(scans))
+    by_look = np.zeros((len(parts), len(scans)))
+    for i, group in enumerate(parts):
+        by_look[i, [number for _, number in group]] = 1.0
+    return [_joined([one for one, _ in group]) for group in parts], by_look
 
 
 def _near_pairs(detections: Sequence[Detection]) -> list[tuple[int, int]]:

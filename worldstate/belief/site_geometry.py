@@ -2,10 +2,13 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.ground.values import wrap_angle
+from worldstate.ground import FloatArray, wrap_angle
 from worldstate.measurement import CameraLook, Look, Sector
 
 from .settings import FilterSettings
@@ -61,7 +64,12 @@ class SideGeometry:
 
     def prior(self) -> MotionBelief:
         """Return the prior motion of a vehicle hidden here."""
-        return MotionBelief.around((self.azimuth_rad, *_HIDDEN_MEAN), (self.std_rad, *_HIDDEN_STD))
+        return _hidden_motion(self.azimuth_rad, self.std_rad)
+
+
+@lru_cache(maxsize=64)
+def _hidden_motion(azimuth_rad: float, std_rad: float) -> MotionBelief:
+    return MotionBelief.around((azimuth_rad, *_HIDDEN_MEAN), (std_rad, *_HIDDEN_STD))
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,14 +92,13 @@ class SiteGeometry:
         side = max(range(len(chances)), key=chances.__getitem__)
         return side if chances[side] >= 0.5 else None
 
-    def past_edge(self, azimuth_rad: float, std_rad: float, way: float) -> float:
-        """Return the chance that an azimuth lies past the edge on this way, 1 to the left and -1."""
-        past = [
-            way * (azimuth_rad - one.edge_azimuth_rad) / math.hypot(std_rad, one.edge_std_rad)
-            for one in self.sides
-            if way * one.edge_azimuth_rad > 0.0
-        ]
-        return normal_share(max(past)) if past else 0.0
+    def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
+        """Return the chances that azimuths lie past the edge on their way: 1 to the left, -1, 0 of none."""
+        edges = np.array([(one.edge_azimuth_rad, one.edge_std_rad) for one in self.sides])
+        edge_rad, edge_std = edges.T[:, :, None]
+        past = way * (azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
+        farthest = np.where(way * edge_rad > 0.0, past, -np.inf).max(axis=0)
+        return np.array([normal_share(one) for one in farthest.tolist()])
 
     def view(self, look: Look) -> Sector:
         """Return where a look has searched."""

@@ -14,8 +14,7 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.evidence import Posterior, SignatureEvidence, posterior_of
+from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground import InvalidArgumentError
 from worldstate.ground.serialisation import Keys, Via, written_as
@@ -62,10 +61,6 @@ def equilibrium(rates_hz: RatesHz, directions: int) -> FloatArray:
 # again.
 LOG_FLOOR = -600.0
 
-# The co-evidence enters through the prior here, with the evidence of the other sources, and must not count
-# again.
-_IN_PRIOR = Unqueried("already weighed into the prior")
-
 
 # No slots: the probabilities are computed once, and read some sixteen times a step.
 @dataclass(frozen=True)
@@ -108,10 +103,9 @@ class ExplanationBelief:
     @cached_property
     def sides(self) -> SideBelief:
         """The belief of the sides, which exclude each other here; whether and when one comes is not told."""
+        k, each = self.k, tuple(self.probabilities.tolist())
         # A sum of exponentials may exceed one by rounding, which readers of a snapshot refuse.
-        k, p = self.k, self.probabilities
-        hidden, visible, none = (min(float(one.sum()), 1.0) for one in (p[:k], p[k:-1], p[-1:]))
-        each = tuple(self.probabilities.tolist())
+        hidden, visible, none = (min(sum(one), 1.0) for one in (each[:k], each[k:-1], each[-1:]))
         return SideBelief(each[:k], each[k : 2 * k], each[:k], hidden, (hidden, visible, none))
 
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "ExplanationBelief":
@@ -120,18 +114,18 @@ class ExplanationBelief:
         return replace(self, log_probabilities=_logs(moved / moved.sum()))
 
     def update(self, evidence: SignatureEvidence, log_co_evidence: FloatArray) -> "ExplanationBelief":
-        """Return the belief after one window with its co-evidence.
+        r"""Return the belief after one window with its co-evidence.
+
+        .. math:: p_i \propto p_i\, \ell_{h(i)}\, p(V \mid h(i))
+
+        with the explanation h of a state: those in view share one.
 
         Shapes: log_co_evidence (K + 2,).
         """
-        k = self.k
-        parts = np.array(self.log_probabilities[k:-1])
-        visible = np.logaddexp.reduce(parts)
-        prior = np.array([*self.log_probabilities[:k], visible, self.log_probabilities[-1]])
-        seen: Posterior = posterior_of(prior + log_co_evidence, evidence, _IN_PRIOR)
-        posterior = np.array(seen.log_probabilities)
-        spread = np.concatenate([posterior[:k], parts + (posterior[-2] - visible), posterior[-1:]])
-        return replace(self, log_probabilities=tuple(np.clip(spread, LOG_FLOOR, 0.0).tolist()))
+        told = evidence.log_likelihoods + log_co_evidence
+        joint = np.array(self.log_probabilities) + np.repeat(told, [*[1] * self.k, self.k + 1, 1])
+        joint -= np.logaddexp.reduce(joint)
+        return replace(self, log_probabilities=tuple(np.minimum(np.maximum(joint, LOG_FLOOR), 0.0).tolist()))
 
     def emerge(self, direction: int, residual: float) -> "ExplanationBelief":
         """Return the belief after a hand-over: the vehicle that was hidden in a direction is in view."""

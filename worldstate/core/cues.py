@@ -4,9 +4,9 @@ An advisory stands by the rule, by the alarm or by messages, and by the risk bes
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
 
 import numpy as np
 
@@ -72,7 +72,7 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
             model.policy.adaptive,
             visible=visible,
             none=none,
-            alarm=_rule_ends_ns(memory, model.policy) is not None,
+            alarm=any(not sides for sides, _ in _alarms(memory, model.policy)),
             elapsed_s=max(seconds(stamp_ns - before_ns), 0.0),
         )
 
@@ -114,14 +114,17 @@ def standing(raised: tuple[SideAdvisory | None, ...], sides: SideBelief) -> tupl
 
 def raised_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
     """Return the advisory of each side at any risk: that by messages where what is heard raises none."""
-    ends_ns = (_rule_ends_ns(memory, model.policy, k) for k in range(len(memory.history)))
-    told = (None if end_ns is None else SideAdvisory(end_ns, announced=True) for end_ns in ends_ns)
-    pairs = zip(_heard_advisories(memory, model), told, strict=True)
-    return tuple(min(filter(None, pair), key=attrgetter("held"), default=None) for pair in pairs)
+    alarms = _alarms(memory, model.policy)
+    raised = list(_heard_advisories(memory, [end_ns for sides, end_ns in alarms if not sides]))
+    for k, end_ns in ((k, end_ns) for sides, end_ns in alarms for k in sides):
+        heard = raised[k]
+        if heard is None or heard.held or (heard.announced and heard.ends_ns < end_ns):
+            raised[k] = SideAdvisory(end_ns, announced=True)
+    return tuple(raised)
 
 
-def _heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
-    """Return the advisory of each side by what is heard and seen.
+def _heard_advisories(memory: Memory, rule_ends_ns: Sequence[int]) -> tuple[SideAdvisory | None, ...]:
+    """Return the advisory of each side by what is heard and seen; `rule_ends_ns` of the rules in alarm.
 
     None before the first sequence: the first second of single windows was counted in no budget.
     """
@@ -134,9 +137,8 @@ def _heard_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory 
         return tuple(
             None if end_ns is None else SideAdvisory(end_ns, decided < threshold) for end_ns, decided in pairs
         )
-    rule, least = _rule_ends_ns(memory, model.policy), max(hidden) * (1.0 - TIE)
-    named = None if rule is None else SideAdvisory(rule)
-    return tuple(named if p >= least else None for p in hidden)
+    least = max(hidden) * (1.0 - TIE)
+    return tuple(SideAdvisory(max(rule_ends_ns)) if rule_ends_ns and p >= least else None for p in hidden)
 
 
 def decided_log_odds(memory: Memory, policy: CueingPolicy) -> float:
@@ -171,19 +173,20 @@ def bounded_log_odds(probability: float) -> float:
     return math.log(inside) - math.log1p(-inside)
 
 
-def _rule_ends_ns(memory: Memory, policy: CueingPolicy, announced: int | None = None) -> int | None:
-    """Return when the last rule in alarm ends, of those that hear or of those that announce for a side.
+def _alarms(memory: Memory, policy: CueingPolicy) -> list[tuple[tuple[int, ...], int]]:
+    """Return of every rule in alarm the sides that it announces, none of one that hears, and when it ends.
 
     That of a source that is silent for a second has ended.
     """
     gamma, hops = policy.gamma_at(memory.threshold.shift_nats), policy.sustain_hops
-    # A rule that announces no vehicle hears, which is asked for with None.
-    rules = (one for one in memory.rules.values() if announced in (one.announced or (None,)))
-    alarmed = (one for one in rules if len(one.statistic) >= hops and one.sustained(hops) >= gamma)
-    # What cannot be heard is no news.
-    news_ns = (one.stamp_ns if one.heard.usable else one.heard_ns for one in alarmed)
-    ends_ns = (ns + NEWS_HOLDS_NS for ns in news_ns)
-    return max((end_ns for end_ns in ends_ns if end_ns >= memory.stamp_ns), default=None)
+    alarms = []
+    for one in memory.rules.values():
+        # What cannot be heard is no news.
+        end_ns = NEWS_HOLDS_NS + (one.stamp_ns if one.heard.usable else one.heard_ns)
+        is_over = len(one.statistic) >= hops and one.sustained(hops) >= gamma
+        if is_over and end_ns >= memory.stamp_ns:
+            alarms.append((one.announced, end_ns))
+    return alarms
 
 
 _Times = tuple[dict[str, float] | None, tuple[float, float, float] | None]
@@ -214,13 +217,11 @@ def _cue(
     evidence: EvidenceTerms,
 ) -> RiskCue:
     track = hidden_on(memory.tracks, k)
-    motion = model.site.sides[k].prior() if track is None else track.motion
     azimuth_rad, std_rad, source = hidden_azimuth(k, track, memory.sequence, model.site)
-    if track is not None and track.place is not None:
-        azimuth_rad, std_rad, source = motion.azimuth_rad, motion.azimuth_std_rad, "measured"
     within, interval_s = times
-    closing_hz = motion.inverse_tta_hz if track is not None and track.approach_heard else None
-    arrival_s = time_to_arrival(closing_hz, motion.inverse_tta_std_hz)
+    arrival_s = None
+    if track is not None and track.approach_heard:
+        arrival_s = time_to_arrival(track.motion.inverse_tta_hz, track.motion.inverse_tta_std_hz)
     # Distance and speed of an announced vehicle tell more than the sound.
     interval_s = (track and visible_in(track, model.site)) or interval_s
     since_ns, entity_id = memory.history[k].advised_ns, None if track is None else track.id

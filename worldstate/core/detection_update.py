@@ -22,6 +22,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry, normal_share
 from worldstate.belief.track import (
     Track,
+    TrackArrays,
     after_empty_look,
     after_sighting,
     born,
@@ -29,7 +30,7 @@ from worldstate.belief.track import (
     merged,
     relabelled,
 )
-from worldstate.ground import BoolArray, FloatArray, seconds, wrap_angle
+from worldstate.ground import FloatArray, seconds, wrap_angle
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
 from .birth_death import REOCCLUSION_NS, after_look
@@ -124,28 +125,33 @@ def detection_update(
     `asked` is what cameras answer of the sector of a sound; None of positions.
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
-    whose, unseen = associated(known, detections, site), [not one.seen for one in known]
+    arrays = TrackArrays.of(known)
+    whose = associated(known, arrays, detections, site)
     fresh = _born(memory, [detections[j] for j in whose.new], scans[0], stamp_ns, site)
     memory.tracks = tracks = (*known, *fresh)
+    if fresh:
+        arrays = TrackArrays.of(tracks)
     rows = whose.found | dict(enumerate(whose.new, start=len(known)))
     found = {i: detections[j] for i, j in rows.items()}
     if scans[0].sector is None:
         existence = [_told(one, found.get(i), scans[0]) for i, one in enumerate(tracks)]
     else:
-        existence = _existence(tracks, found, _hits(tracks, rows, whose, by_look), scans)
-    views, chances = _other_views(memory, scans), whose.chances + [1.0] * len(fresh)
-    _move(tracks, found)
-    for i, track in enumerate(tracks):
-        track.existence = existence[i]
-        if i in found:
-            _see(track, found[i], chances[i], scans, stamp_ns, site)
-        else:
-            _miss(track, scans, asked, views, stamp_ns, site)
+        existence = _existence(arrays, found, _hits(arrays, rows, whose, by_look), scans)
+    chances = whose.chances + [1.0] * len(fresh)
+    _move(tracks, arrays.motion, found)
+    for i, one in found.items():
+        _see(tracks[i], one, chances[i], scans, stamp_ns, site)
+    if len(found) < len(tracks):
+        views, past = _other_views(memory, scans), leaving(arrays, site).tolist()
+        for i in set(range(len(tracks))).difference(found):
+            _miss(tracks[i], past[i], scans, asked, views, stamp_ns, site)
+    for track, chance in zip(tracks, existence, strict=True):
+        track.existence = chance
     if scans[0].sector is None:
         for i in found:
             _announce(tracks[i], site)
     follow_places(tracks, site)
-    emerged = {i: chances[i] for i in whose.found if unseen[i] and tracks[i].seen}
+    emerged = {i: chances[i] for i in whose.found if not arrays.seen[i] and tracks[i].seen}
     after_look(memory, emerged, fresh, stamp_ns, site)
 
 
@@ -171,37 +177,32 @@ def _born(
 
 
 def _hits(
-    tracks: Sequence[Track], rows: Mapping[int, int], whose: Association, by_look: BoolArray
+    arrays: TrackArrays, rows: Mapping[int, int], whose: Association, by_look: FloatArray
 ) -> FloatArray:
     """Return P(a look has detected a track), certain of a first detection, shape (tracks, looks)."""
-    hits = np.zeros((len(tracks), by_look.shape[1]))
+    hits = np.zeros((len(arrays.seen), by_look.shape[1]))
     hits[: whose.pairs.shape[1]] = np.minimum(whose.pairs.T @ by_look, 1.0)
-    for i, j in rows.items():
-        if not tracks[i].seen:
-            hits[i] = by_look[j]
+    for i in np.flatnonzero(~arrays.seen).tolist():
+        if i in rows:
+            hits[i] = by_look[rows[i]]
     return hits
 
 
-def _existence(
-    tracks: Sequence[Track], found: _Found, hits: FloatArray, scans: Sequence[Scan]
-) -> list[float]:
+def _existence(arrays: TrackArrays, found: _Found, hits: FloatArray, scans: Sequence[Scan]) -> list[float]:
     r"""Return the existence after every look s of an instant, each with the chance c that it has detected it.
 
     .. math:: r_s = c_s\, r_+ + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
               p_s = p_D\, P_{range}\, (1 - P_{hidden}), \qquad
               \frac{r'}{1 - r'} = \frac{r}{1 - r} \prod_s \frac{r_s}{1 - r_s} \frac{1 - r}{r}
     """
-    if not tracks:
-        return []
-    first = {i: one.existence for i, one in found.items() if not tracks[i].seen}
-    before = np.array([max(one.existence, first.get(i, 0.0)) for i, one in enumerate(tracks)])
-    counts = np.array([one.detected or i in first for i, one in enumerate(tracks)])
+    seen, counts, before = arrays.seen, arrays.detected.copy(), arrays.existence.copy()
+    for i in (i for i in np.flatnonzero(~seen).tolist() if i in found):
+        counts[i], before[i] = True, max(before[i], found[i].existence)
     r = np.minimum(np.maximum(before, _ROUNDING), 1.0 - _ROUNDING)
-    seen = np.array([one.seen for one in tracks])
-    in_sight = np.where(seen, 1.0, 1.0 - np.array([one.behind for one in tracks]))
+    in_sight = np.where(seen, 1.0, 1.0 - arrays.behind)
     odds = ratio = _odds(r)
     for hit, scan in zip(hits.T, scans, strict=True):
-        detected = _searched(tracks, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
+        detected = _searched(arrays.motion, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
         missed = after_empty_look(r, 1.0 - detected)
         missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
         now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
@@ -215,18 +216,17 @@ def _odds(probabilities: FloatArray) -> FloatArray:
     return np.asarray(bounded / (1.0 - bounded))
 
 
-def _searched(tracks: Sequence[Track], scan: Scan) -> FloatArray:
+def _searched(motion: MotionBelief, scan: Scan) -> FloatArray:
     """Return P(a look covers it) of every track, by the range of the sensor in its sector."""
     if scan.sector is None or scan.miss_rate is None:
-        return np.zeros(len(tracks))
-    azimuth_rad = np.array([one.motion.azimuth_rad for one in tracks])
-    covers = np.abs(wrap_angle(azimuth_rad - scan.sector.centre_rad)) <= scan.sector.half_width_rad
+        return np.zeros(len(motion.mean))
+    from_centre_rad = np.abs(wrap_angle(motion.mean[:, AZIMUTH] - scan.sector.centre_rad))
+    covers = from_centre_rad <= scan.sector.half_width_rad
     if math.isinf(scan.range_m):
         return covers.astype(float)
-    farther = [math.log(scan.range_m) - one.motion.mean[LOG_RANGE] for one in tracks]
-    stds = [math.sqrt(one.motion.covariance[LOG_RANGE, LOG_RANGE]) for one in tracks]
-    shares = [normal_share(gap / std) for gap, std in zip(farther, stds, strict=True)]
-    return np.where(covers, shares, 0.0)
+    stds = np.sqrt(motion.covariance[:, LOG_RANGE, LOG_RANGE])
+    deviations = (math.log(scan.range_m) - motion.mean[:, LOG_RANGE]) / stds
+    return np.where(covers, [normal_share(one) for one in deviations.tolist()], 0.0)
 
 
 def _told(track: Track, told: Detection | None, scan: Scan) -> float:
@@ -239,7 +239,7 @@ def _told(track: Track, told: Detection | None, scan: Scan) -> float:
     return min(before * odds / (before * odds + 1.0 - before), MOST_EXISTENCE)
 
 
-def _move(tracks: Sequence[Track], found: _Found) -> None:
+def _move(tracks: Sequence[Track], motion: MotionBelief, found: _Found) -> None:
     """Update the motion or the place of the found tracks with what was measured of them."""
     usual = list[int]()
     for i, one in found.items():
@@ -251,10 +251,9 @@ def _move(tracks: Sequence[Track], found: _Found) -> None:
         else:
             track.motion = _motion_at(one, track.motion)
     if usual:
-        motion = MotionBelief.stacked([tracks[i].motion for i in usual])
-        azimuth_rad = np.array([found[i].azimuth_rad for i in usual])
-        std_rad = np.array([found[i].std_rad for i in usual])
-        after = update(motion, AZIMUTH, azimuth_rad, std_rad, weight=1.0).each()
+        azimuth_rad, std_rad = np.array([(found[i].azimuth_rad, found[i].std_rad) for i in usual]).T
+        before = MotionBelief(motion.mean[usual], motion.covariance[usual])
+        after = update(before, AZIMUTH, azimuth_rad, std_rad).each()
         for i, moved in zip(usual, after, strict=True):
             tracks[i].motion = moved
 
@@ -322,6 +321,7 @@ def _announce(track: Track, site: SiteGeometry) -> None:
 
 def _miss(
     track: Track,
+    past: float,
     scans: Sequence[Scan],
     asked: CoEvidence | None,
     views: Sequence[Sector],
@@ -333,7 +333,7 @@ def _miss(
         miss_rate = _miss_rate(scans, track.motion.azimuth_rad)
         # Where only other cameras have looked, or a radar elsewhere, the last answer holds.
         holds = asked is None or any(one.touches(track.motion.azimuth_rad) for one in views)
-        if miss_rate is not None and asked is not None and _has_left(track, miss_rate, stamp_ns, site):
+        if miss_rate is not None and asked is not None and _has_left(track, past, miss_rate, stamp_ns, site):
             miss_rate, holds = None, False
     else:
         # What is only heard was asked of in the sector of its sound.
@@ -353,7 +353,7 @@ def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
     return [Sector.between(*one.sector_rad) for one in asked if one.sector_rad is not None]
 
 
-def _has_left(track: Track, miss_rate: float, stamp_ns: int, site: SiteGeometry) -> bool:
+def _has_left(track: Track, past: float, miss_rate: float, stamp_ns: int, site: SiteGeometry) -> bool:
     r"""Tell whether the likelier reason of a miss is that its leading end has passed the edge ahead of it.
 
     .. math:: p \ge (1 - p)\, \beta^{\min(t / T, 1)}
@@ -361,7 +361,6 @@ def _has_left(track: Track, miss_rate: float, stamp_ns: int, site: SiteGeometry)
     with the chance p of that, the time t since its last box and the interval T of looks. Boxes end as soon as
     a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
     """
-    past = leaving(track, site)
     unseen_s = seconds(stamp_ns - (track.last_seen_ns or 0))
     missed = math.pow(miss_rate, min(unseen_s / site.settings.look_interval_s, 1.0))
     return 0.0 < past >= (1.0 - past) * missed

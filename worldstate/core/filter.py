@@ -163,7 +163,7 @@ class WorldFilter:
         if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
             return self
         # From the last measurement on, so that many small steps are one step to the bit.
-        return replace(self, memory=advanced(self._lag.latest, stamp_ns, self._model), lag=self._lag)
+        return self._with(advanced(self._lag.latest, stamp_ns, self._model), self._lag)
 
     def update(self, measurement: Timed) -> "WorldFilter":
         """Return the filter after a measurement or a scan, at its stamp or, if that has passed, the belief's.
@@ -189,7 +189,7 @@ class WorldFilter:
             return self._begun_anew(measurement)
         if left_out and lag.latest is not self._lag.latest:
             lag = lag.counted(boxes_left_out=left_out)
-        world = replace(self, memory=lag.latest, lag=lag)
+        world = self._with(lag.latest, lag)
         return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)
 
     def _step(self, memory: Memory, measurement: Timed) -> Memory:
@@ -202,6 +202,12 @@ class WorldFilter:
             draft = memory.draft()
         take_in(memory, draft, measurement, self.start_ns, self._model)
         return draft
+
+    def _with(self, memory: Memory, lag: FixedLag) -> "WorldFilter":
+        """Return the filter with another memory; what follows from its configuration is the same."""
+        world = replace(self, memory=memory, lag=lag)
+        vars(world)["_model"] = self._model
+        return world
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery

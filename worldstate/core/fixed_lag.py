@@ -35,11 +35,6 @@ class Arrival:
     measurement: Timed
     before: Memory
 
-    @property
-    def key(self) -> tuple[int, str]:
-        """What a delivery is known by; one source measures one thing at a time."""
-        return self.measurement.stamp_ns, self.measurement.source
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FixedLag:
@@ -63,8 +58,7 @@ class FixedLag:
         held back, and taken with the next one that is ahead of all others, too, and about as far.
         """
         stamp_ns, held = measurement.stamp_ns, self.held
-        key = (stamp_ns, measurement.source)
-        if any(key == one.key for one in self.arrivals) or (held and key == (held.stamp_ns, held.source)):
+        if any(_delivery(one) == _delivery(measurement) for one in (*self._at(stamp_ns), held) if one):
             return self.counted(repeated=1)
         if stamp_ns < max(self.latest.stamp_ns - LAG_NS, self.base.stamp_ns):
             return self._too_late(stamp_ns)
@@ -93,21 +87,22 @@ class FixedLag:
 
     def _taken(self, measurement: Timed, step: Step) -> "FixedLag":
         """Return the buffer with a measurement in its place, and those after it taken in once more."""
-        stamp_ns, stamps_ns = measurement.stamp_ns, [one.measurement.stamp_ns for one in self.arrivals]
-        at, end = bisect_left(stamps_ns, stamp_ns), bisect_right(stamps_ns, stamp_ns)
-        at += sum(_content(one.measurement) < _content(measurement) for one in self.arrivals[at:end])
-        memory = self.arrivals[at].before if at < len(stamps_ns) else self.latest
+        same = self._at(measurement.stamp_ns)
+        at = bisect_left(self.arrivals, measurement.stamp_ns, key=_STAMP_NS)
+        at += sum(_content(one) < _content(measurement) for one in same)
+        memory = self.arrivals[at].before if at < len(self.arrivals) else self.latest
         kept = list(self.arrivals[:at])
         for one in (measurement, *(later.measurement for later in self.arrivals[at:])):
             kept.append(Arrival(one, memory))
             memory = step(memory, one)
-        oldest_ns = memory.stamp_ns - LAG_NS
-        return replace(
-            self.counted(replayed=stamp_ns < self.latest.stamp_ns),
-            latest=memory,
-            arrivals=tuple(one for one in kept if one.measurement.stamp_ns >= oldest_ns),
-            late_since_ns=None,
-        )
+        oldest = bisect_left(kept, memory.stamp_ns - LAG_NS, key=_STAMP_NS)
+        counted = self.counted(replayed=1) if measurement.stamp_ns < self.latest.stamp_ns else self
+        return replace(counted, latest=memory, arrivals=tuple(kept[oldest:]), late_since_ns=None)
+
+    def _at(self, stamp_ns: int) -> list[Timed]:
+        """Return what was taken of one instant, in its order."""
+        first, end = (side(self.arrivals, stamp_ns, key=_STAMP_NS) for side in (bisect_left, bisect_right))
+        return [one.measurement for one in self.arrivals[first:end]]
 
     def counted(self, **more: int) -> "FixedLag":
         """Return the buffer with some counts of its delivery raised."""
@@ -119,6 +114,11 @@ class FixedLag:
         if stamp_ns - since_ns >= REANCHOR_NS:
             return None
         return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
+
+
+_STAMP_NS = attrgetter("measurement.stamp_ns")
+# What a delivery is known by; one source measures one thing at a time.
+_delivery = attrgetter("stamp_ns", "source")
 
 
 def _content(measurement: Timed) -> tuple[int, str]:

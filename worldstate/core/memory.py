@@ -1,7 +1,7 @@
 """The state that the filter carries from one call to the next."""
 
-from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from dataclasses import dataclass, field
+from typing import TypeAlias, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
@@ -22,6 +22,7 @@ NEWS_HOLDS_NS = nanoseconds(1.0)
 # Names come and go; without this, a checkpoint holds every one that was ever told.
 FORGOTTEN_NS = nanoseconds(3600.0)
 Belief: TypeAlias = WindowBelief | SequenceMemory
+ValueT = TypeVar("ValueT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,7 @@ class CountedLook:
     sector_rad: tuple[float, float] | None = None  # Where it searched; None for the view of the context
 
 
-@dataclass(slots=True)
+@dataclass
 class SideHistory:
     """What happened on one approach side so far."""
 
@@ -72,7 +73,7 @@ class Instant:
     heard_nats: float  # Log-odds of hidden by sound alone
 
 
-@dataclass(slots=True)
+@dataclass
 class LastSaid:
     """What the last measurements said, as a snapshot states it."""
 
@@ -85,7 +86,7 @@ class LastSaid:
     events: tuple[Event, ...] = ()
 
 
-@dataclass(slots=True)
+@dataclass
 class Counts:
     """How many there were so far."""
 
@@ -94,7 +95,7 @@ class Counts:
     left_out: Count = 0  # Entities beyond the most that are kept
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class Memory:
     """State of a filter, as checkpoints hold it; everything else in a filter is configuration.
 
@@ -127,15 +128,11 @@ class Memory:
 
     def draft(self) -> "Memory":
         """Return a copy that a step may write into."""
-        return replace(
-            self,
-            history=tuple(map(replace, self.history)),
-            tracks=tuple([track.copy() for track in self.tracks]),
-            counts=replace(self.counts),
-            last=replace(self.last),
-            rules=dict(self.rules),
-            looks=dict(self.looks),
-        )
+        own = draft_of(self)
+        own.history, own.tracks = tuple(map(draft_of, self.history)), tuple(map(draft_of, self.tracks))
+        own.counts, own.last = draft_of(self.counts), draft_of(self.last)
+        own.rules, own.looks = dict(self.rules), dict(self.looks)
+        return own
 
     def forget(self) -> None:
         """Drop sources and sensors that have been unheard for an hour."""
@@ -144,6 +141,14 @@ class Memory:
         self.looks = {name: one for name, one in self.looks.items() if one.stamp_ns >= since_ns}
         if isinstance(self.belief, WindowBelief):
             self.belief = self.belief.since(since_ns)
+
+
+def draft_of(value: ValueT) -> ValueT:
+    """Return a copy to write into; what its fields hold is not copied, it is replaced as a whole."""
+    # A copied dictionary takes a tenth of the time of `dataclasses.replace`: hence no slots.
+    own = object.__new__(type(value))
+    own.__dict__.update(value.__dict__)
+    return own
 
 
 def first_memory(context: Context, start_ns: int) -> Memory:

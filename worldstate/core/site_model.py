@@ -68,9 +68,9 @@ def from_here(model: FilterModel, ego: EgoBelief | None) -> FilterModel:
 
 def without_open_sides(measurement: Measurement, context: Context) -> Measurement:
     """Remove the evidence for hidden vehicles on sides without an occluder."""
-    is_open = np.array([not one.hides for one in context.occluders])
-    if not is_open.any():
+    if all(one.hides for one in context.occluders):
         return measurement
+    is_open = np.array([not one.hides for one in context.occluders])
     said, reading = measurement.signature, measurement.sequence
     hidden = np.where(is_open, LOG_FLOOR, said.hidden).tolist()
     measurement = replace(measurement, signature=replace(said, hidden=tuple(hidden)))

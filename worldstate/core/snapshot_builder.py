@@ -172,8 +172,10 @@ def hidden_azimuth(
 ) -> tuple[float, float, AzimuthSource]:
     """Return where a hidden vehicle is, how far that may be off, and what it rests on.
 
-    By its time to visible, or as heard.
+    By its place, its time to visible, or as heard.
     """
+    if track is not None and track.place is not None:
+        return track.motion.azimuth_rad, track.motion.azimuth_std_rad, "measured"
     if kept is not None:
         return *hidden_bearing(kept.coming[side], site.sides[side]), "context"
     heard = track if track is not None and track.side == side else None

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
 from typing import ClassVar
 
 from worldstate.ground import InvalidArgumentError, in_range
@@ -58,7 +59,11 @@ class Rates:
     @property
     def values_hz(self) -> tuple[float, ...]:
         """All six in the order of the fields."""
-        return tuple(getattr(self, field.name) for field in fields(self))
+        return _RATES_HZ(self)
+
+
+# Read at every step.
+_RATES_HZ = attrgetter(*(one.name for one in fields(Rates)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,16 +4,13 @@ Constant velocity seen from a standing ego has the state
 
 .. math:: x = (\theta,\; \dot\theta,\; \rho = \dot r / r = -1/\mathrm{TTA},\; \log r)
 
-Bearing and looming are linear in it, and the range, which neither of them tells, stands apart. From
+Bearing and looming are linear in it, and the range, which neither of them tells, stands apart. In complex
+numbers :math:`u = \log r + i\theta` and :math:`w = \rho + i\dot\theta`
 
-.. math:: \ddot\theta = -2\rho\dot\theta, \quad \dot\rho = \dot\theta^2 - \rho^2, \quad (\log r)^\cdot = \rho
+.. math:: \dot u = w, \quad \dot w = -w^2, \qquad\text{so that}\qquad
+          u' = u + \log z, \quad w' = w / z, \quad z = 1 + w t
 
-follows a closed form: in units of the first range the vehicle moves from (1, 0) to
-:math:`(a, b) = (1 + \rho t,\; \dot\theta t)`, and with :math:`q = a^2 + b^2`
-
-.. math::
-    \theta' = \theta + \operatorname{atan2}(b, a), \quad \dot\theta' = \dot\theta / q, \quad
-    \rho' = (a\rho + b\dot\theta) / q, \quad \log r' = \log r + \tfrac12 \log q.
+where z is where the vehicle stands after a time t, in units of the first range and from its bearing.
 
 References
 ----------
@@ -37,43 +34,27 @@ LEAST_Q = 1e-3
 _Numbers: TypeAlias = float | FloatArray  # Of one belief, or of each of many
 
 
-def propagate(state: FloatArray, step_s: float) -> FloatArray:
-    """Return states (theta, theta_dot, rho, log r) after `step_s`, theta not wrapped.
+def propagate(state: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]:
+    r"""Return states (theta, theta_dot, rho, log r) after `step_s`, theta not wrapped, and their Jacobians.
 
-    Shapes: state (..., 4), as what is returned.
+    .. math:: \frac{du'}{dw} = \frac{t}{z}, \qquad \frac{dw'}{dw} = \frac{1}{z^2}
+
+    Shapes: state (..., 4), as the first that is returned; (..., 4, 4).
     """
-    theta, omega, rho, log_range = np.moveaxis(state, -1, 0)
-    a, b = 1.0 + rho * step_s, omega * step_s
-    q = np.maximum(a * a + b * b, LEAST_Q)
-    after = np.empty_like(state)
-    after[..., AZIMUTH] = theta + np.arctan2(b, a)
-    after[..., AZIMUTH_RATE] = omega / q
-    after[..., RADIAL_RATE] = (a * rho + b * omega) / q
-    after[..., LOG_RANGE] = log_range + 0.5 * np.log(q)
-    return after
-
-
-def jacobian(state: FloatArray, step_s: float) -> FloatArray:
-    """Return d propagate / d state, shape (..., 4, 4).
-
-    Shapes: state (..., 4).
-    """
-    _, omega, rho, _ = np.moveaxis(state, -1, 0)
-    t = step_s
-    a, b = 1.0 + rho * t, omega * t
-    q = np.maximum(a * a + b * b, LEAST_Q)
-    radial = a * rho + b * omega
-    u, v = a / q, b / q
-    slope = np.zeros((*state.shape, 4))
-    slope[..., 0, 0] = slope[..., 3, 3] = 1.0
-    slope[..., 0, 1] = slope[..., 3, 2] = u * t
-    slope[..., 0, 2] = -v * t
-    slope[..., 3, 1] = v * t
-    slope[..., 1, 1] = (1.0 - 2.0 * b * v) / q
-    slope[..., 1, 2] = -2.0 * omega * u * t / q
-    slope[..., 2, 1] = 2.0 * (omega - radial * v) * t / q
-    slope[..., 2, 2] = (1.0 + 2.0 * (rho - radial * u) * t) / q
-    return slope
+    w = state[..., RADIAL_RATE] + 1j * state[..., AZIMUTH_RATE]
+    z = 1.0 + w * step_s
+    w, moved, by_rate, of_rate = w / z, np.log(z), step_s / z, z**-2
+    after, slope = state.copy(), np.zeros((*state.shape, 4))
+    after[..., AZIMUTH] += moved.imag
+    after[..., LOG_RANGE] += moved.real
+    after[..., AZIMUTH_RATE], after[..., RADIAL_RATE] = w.imag, w.real
+    # The derivative x + iy of a function of complex numbers turns (real, imaginary) by ((x, -y), (y, x)).
+    slope[..., AZIMUTH, AZIMUTH] = slope[..., LOG_RANGE, LOG_RANGE] = 1.0
+    slope[..., AZIMUTH, AZIMUTH_RATE] = slope[..., LOG_RANGE, RADIAL_RATE] = by_rate.real
+    slope[..., AZIMUTH, RADIAL_RATE], slope[..., LOG_RANGE, AZIMUTH_RATE] = by_rate.imag, -by_rate.imag
+    slope[..., AZIMUTH_RATE, AZIMUTH_RATE] = slope[..., RADIAL_RATE, RADIAL_RATE] = of_rate.real
+    slope[..., AZIMUTH_RATE, RADIAL_RATE], slope[..., RADIAL_RATE, AZIMUTH_RATE] = of_rate.imag, -of_rate.imag
+    return after, slope
 
 
 def process_noise(acceleration_psd: _Numbers, range_m: _Numbers, step_s: float) -> FloatArray:
@@ -106,8 +87,9 @@ class GaussianBelief:
 
     @classmethod
     def stacked(cls, beliefs: Sequence[Self]) -> Self:
-        """Return many beliefs as one with a leading axis."""
-        return cls(np.array([one.mean for one in beliefs]), np.array([one.covariance for one in beliefs]))
+        """Return many beliefs, or none, as one with a leading axis."""
+        mean, covariance = ([one.mean for one in beliefs], [one.covariance for one in beliefs])
+        return cls(np.array(mean).reshape(-1, 4), np.array(covariance).reshape(-1, 4, 4))
 
     def each(self) -> list[Self]:
         """Return the beliefs that were stacked."""
@@ -118,7 +100,6 @@ class GaussianBelief:
 # outside these limits the noise would vanish or throw the bearing.
 NEAREST_M, FARTHEST_M = 3.0, 200.0
 _LOG_NEAREST, _LOG_FARTHEST = math.log(NEAREST_M), math.log(FARTHEST_M)
-_IDENTITY = np.eye(4)
 # Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
 # array.
 _CLOSEST_SHARE = 0.5
@@ -173,9 +154,9 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: _Numbers) -> 
     # Clipped before exp: approach rates that contradict each other drive log r, which is not measured, so far
     # that exp overflows.
     range_m = np.exp(np.minimum(np.maximum(belief.mean[..., LOG_RANGE], _LOG_NEAREST), _LOG_FARTHEST))
-    flow = jacobian(start, step_s)
+    mean, flow = propagate(start, step_s)
     covariance = flow @ belief.covariance @ flow.mT + process_noise(acceleration_psd, range_m, step_s)
-    return _belief(propagate(start, step_s), covariance)
+    return _belief(mean, covariance)
 
 
 def relax(
@@ -195,7 +176,7 @@ def relax(
     phi[..., RADIAL_RATE:] = np.asarray(radial_kept)[..., None]
     offset = belief.mean - towards.mean
     offset[..., AZIMUTH] = wrap_angle(offset[..., AZIMUTH])
-    covariance = _outer(phi) * belief.covariance + (1.0 - phi**2)[..., None] * towards.covariance
+    covariance = _outer(phi, phi) * belief.covariance + (1.0 - phi**2)[..., None] * towards.covariance
     return _belief(towards.mean + phi * offset, covariance)
 
 
@@ -206,10 +187,13 @@ def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: fl
     return -0.5 * (residual**2 / variance + math.log(2.0 * math.pi * variance))
 
 
-def update(belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weight: _Numbers) -> MotionBelief:
-    r"""Return the belief after one component was measured, of this entity with probability `weight`.
+def update(
+    belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weight: _Numbers | None = None
+) -> MotionBelief:
+    r"""Return the belief after one component was measured, of this entity with probability w.
 
-    Probabilistic data association: a bearing is one of AZIMUTH, an approach rate -1/TTA one of RADIAL_RATE.
+    Probabilistic data association, of a certain one where no weight is given: a bearing is one of AZIMUTH, an
+    approach rate -1/TTA one of RADIAL_RATE.
 
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
@@ -220,16 +204,19 @@ def update(belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weigh
         residual = wrap_angle(residual)
     gain = belief.covariance[..., row] / (belief.covariance[..., row, row, None] + noise)
     # Joseph's form stays positive definite where P - K H P loses it to rounding: a sharp bearing on a belief
-    # that is sharp already.
-    keep = _IDENTITY - gain[..., None] * _IDENTITY[row]
-    updated = keep @ belief.covariance @ keep.mT + noise[..., None] * _outer(gain)
-    step, w = gain * np.asarray(residual)[..., None], np.asarray(weight)[..., None]
+    # that is sharp already. Of one component it is two outer products.
+    swept = belief.covariance - _outer(gain, belief.covariance[..., row])
+    updated = swept - _outer(swept[..., row], gain) + noise[..., None] * _outer(gain, gain)
+    step = gain * np.asarray(residual)[..., None]
+    if weight is None:
+        return _belief(belief.mean + step, updated)
+    w = np.asarray(weight)[..., None]
     covariance = w[..., None] * updated + (1.0 - w)[..., None] * belief.covariance
-    return _belief(belief.mean + w * step, covariance + (w * (1.0 - w))[..., None] * _outer(step))
+    return _belief(belief.mean + w * step, covariance + (w * (1.0 - w))[..., None] * _outer(step, step))
 
 
-def _outer(row: FloatArray) -> FloatArray:
-    return row[..., :, None] * row[..., None, :]
+def _outer(column: FloatArray, row: FloatArray) -> FloatArray:
+    return column[..., :, None] * row[..., None, :]
 
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> MotionBelief:
