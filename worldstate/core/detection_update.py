@@ -29,7 +29,7 @@ from worldstate.belief.track import (
     merged,
     relabelled,
 )
-from worldstate.ground import BoolArray, FloatArray, seconds, wrap_angle
+from worldstate.ground import BoolArray, FloatArray, nanoseconds, seconds, wrap_angle
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
 from .birth_death import REOCCLUSION_NS, after_look
@@ -315,8 +315,7 @@ def _announce(track: Track, site: SiteGeometry) -> None:
     assert track.place is not None
     x, y = track.place.mean[:2].tolist()
     side = site.hiding_side(math.atan2(y, x))
-    unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
-    if side is not None and (not track.seen or unseen_ns > REOCCLUSION_NS):
+    if side is not None and (not track.seen or track.unseen_ns(track.updated_ns) > REOCCLUSION_NS):
         track.side, track.seen, track.came_from = side, False, 1.0
 
 
@@ -362,6 +361,6 @@ def _has_left(track: Track, miss_rate: float, stamp_ns: int, site: SiteGeometry)
     a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
     """
     past = leaving(track, site)
-    unseen_s = seconds(stamp_ns - (track.last_seen_ns or 0))
-    missed = math.pow(miss_rate, min(unseen_s / site.settings.look_interval_s, 1.0))
+    unseen = track.unseen_ns(stamp_ns) / nanoseconds(site.settings.look_interval_s)
+    missed = math.pow(miss_rate, min(unseen, 1.0))
     return 0.0 < past >= (1.0 - past) * missed
