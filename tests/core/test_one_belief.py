@@ -278,6 +278,25 @@ def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_tha
     assert cue_of(after, "left").risk == pytest.approx(1.0 / 6.0, abs=0.03)
 
 
+def test_an_advisory_and_what_decided_end_with_the_news_and_with_the_vehicle_wherever_it_comes_from() -> None:
+    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    said = both_sides((0.8, 0.15), (0.15, 0.8), "coming_3s")
+    for number in range(1, 12):
+        one = Measurement(number * 10**8, quiet, Unqueried("-"), SILENT, SILENT, sequence=said)
+        world = world.update(one)
+    assert cue_of(world.state, "left").advisory is not None
+    silent = world.predict(1.5).state
+    assert cue_of(silent, "left").risk > 0.3
+    assert broken_laws(silent, world.state) == []
+    seen = Present(0.04, 0.01)
+    look, box = Look("camera", 1_200_000_000, seen), Sighting(-0.53, 0.02, "car", 0.9)
+    after = world.update(
+        replace(one, stamp_ns=1_200_000_000, co_evidence=seen, look=look, sightings=(box,), sequence=None)
+    ).state
+    assert [event.kind for event in after.events] == ["handed_over"]
+    assert broken_laws(after, world.state) == [] and cue_of(after, "left").advisory is None
+
+
 def test_high_risk_without_advisory_says_why() -> None:
     far = both_sides((0.9, 0.02), (0.02, 0.9), "coming_8s")
     world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)

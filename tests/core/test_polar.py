@@ -139,15 +139,16 @@ def test_the_covariance_stays_symmetric_and_positive(seed, looks):
 @given(st.integers(0, 2**32 - 1))
 def test_whatever_is_measured_and_however_long_it_is_silent_a_checkpoint_can_be_read(seed):
     """Deviations from a billionth up, absurd rates, thirty years of silence: a covariance stays one."""
-    rng, n = np.random.default_rng(seed), 200
+    rng, n = np.random.default_rng(seed), 500
     prior = MotionBelief(
         np.tile([0.9, 0.0, -0.2, 3.2], (n, 1)), np.tile(np.diag([0.1, 0.02, 0.06, 0.4]), (n, 1, 1))
     )
     belief = prior
     for _ in range(12):
         if rng.random() < 0.5:
-            step_s = float(rng.choice([1e-9, 0.1, 0.5, 2.0, 60.0, 1e6, 1e9]))
+            step_s = float(rng.choice([1e-9, 0.1, 0.5, 2.0, 3600.0, 1e6, 1e9]))
             belief = predict(belief, step_s, rng.choice([2.0, 1e-4], n))
+            assert np.linalg.eigvalsh(belief.covariance).min() > 0.0
             kept = np.exp(-step_s * rng.choice([0.0, 1e-9, 1.0], n))
             belief = relax(belief, prior, kept, np.full(n, np.exp(-step_s)))
         else:
