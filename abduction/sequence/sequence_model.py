@@ -144,7 +144,7 @@ class SequencePosterior:
         """
         mass = self.groups[..., :STATED]
         edges = np.array([0.0, *COMING_S[:STATED]])
-        share = mass / mass.sum(axis=-1, keepdims=True)
+        share = mass / np.maximum(mass.sum(axis=-1, keepdims=True), 1e-300)
         mean = share @ (0.5 * (edges[1:] + edges[:-1]))
         below = np.cumsum(share, axis=-1) - share
         # Of every bin the part that lies below the level, linear within the bin.

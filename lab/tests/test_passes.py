@@ -3,11 +3,13 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from snapshot_laws import broken_laws
 from worldstate_lab.cli.streams import worst_of
 from worldstate_lab.passes.followed_stream import (
     EVERYBODY,
@@ -15,6 +17,7 @@ from worldstate_lab.passes.followed_stream import (
     PassedStream,
     followed,
     stream_detections,
+    stream_measurements,
 )
 from worldstate_lab.passes.pass_outcomes import (
     above_place_db,
@@ -33,10 +36,20 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.listener import learn_passes
+from worldstate.adapters.source import street_listener
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.site_geometry import SideGeometry
-from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.commissioning.heard_stream import (
+    HeardStream,
+    StreamSettings,
+    hear_stream,
+    junction_named,
+    traffic_named,
+)
 from worldstate.commissioning.sequence_training import stream_truth
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.state import SideShare
@@ -279,3 +292,21 @@ def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_b
         hidden, visible = per_hop[tracker].sum(axis=1)
         # Without the sound nobody knows of whom no box has shown; a box, each of them follows.
         assert hidden >= 29.0 and visible < 20.0 and per_hop[tracker][1, 0] < 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
+def test_every_snapshot_of_a_stream_holds_to_the_laws(seed: int, tmp_path: Path) -> None:
+    """Of fifteen minutes each, two hours together."""
+    streets = [junction_named(name) for name in ("SA1", "SA2", "SB1", "SB2")]
+    settings = StreamSettings(streets[seed % 4], 15.0, seed, traffic_named("pairs"), sample_rate_hz=6000.0)
+    (heard,) = hear_stream(settings, ovad_array())
+    heard.save(tmp_path / "stream.npz")
+    model, world, before = read_model(), WorldFilter(), None
+    street = street_listener(model.domain, None, None)
+    for one in stream_measurements(tmp_path / "stream.npz", model, "all", seed, street)[1]:
+        world = world.update(one)
+        learn_passes(street, world.state)
+        assert broken_laws(world.state, before) == []
+        before = world.state
+    assert before is not None and before.stamp_ns > 890 * 10**9

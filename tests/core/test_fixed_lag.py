@@ -78,6 +78,29 @@ def test_the_order_of_arrival_does_not_matter_within_the_lag(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=3)
+def test_no_time_is_special(seed: int) -> None:
+    """Neither one before zero nor zero itself: a message places vehicles that a camera misses for certain."""
+    rng = np.random.default_rng(seed)
+    sure, told = Absent(0.0, 0.01), []
+    for one in script(rng):
+        if isinstance(one, Measurement) and isinstance(one.co_evidence, Absent):
+            one = replace(one, co_evidence=sure)
+        told.append(one)
+    found = []
+    for since_ns in (10**10, 0, -(10**9), -(10**10)):
+        world = filtered(
+            [replace(one, stamp_ns=one.stamp_ns + since_ns - 10**9) for one in told],
+            WorldFilter(start_ns=since_ns - 10**9),
+        )
+        rows = [
+            (one.id, one.status, one.existence_probability, one.azimuth_rad) for one in world.state.entities
+        ]
+        found.append((rows, [(cue.risk, cue.advisory is None) for cue in world.state.cues]))
+    assert found[0][0] and all(one == found[0] for one in found)
+
+
+@given(SEEDS)
+@settings(max_examples=3)
 def test_what_was_delivered_before_changes_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     once = script(rng)

@@ -20,6 +20,7 @@ from worldstate.belief.kinematics.motion import (
     relax,
     update,
 )
+from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import wrap_angle
 
 states = st.tuples(st.floats(-3.0, 3.0), st.floats(-0.8, 0.8), st.floats(-0.8, 0.8), st.floats(1.5, 4.5)).map(
@@ -131,6 +132,37 @@ def test_the_covariance_stays_symmetric_and_positive(seed, looks):
         assert (belief.covariance == belief.covariance.T).all()
         assert np.linalg.eigvalsh(belief.covariance)[0] > 0
         assert -math.pi < belief.azimuth_rad <= math.pi
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_whatever_is_measured_and_however_long_it_is_silent_a_checkpoint_can_be_read(seed):
+    """Deviations from a billionth up, absurd rates, thirty years of silence: a covariance stays one."""
+    rng, n = np.random.default_rng(seed), 500
+    prior = MotionBelief(
+        np.tile([0.9, 0.0, -0.2, 3.2], (n, 1)), np.tile(np.diag([0.1, 0.02, 0.06, 0.4]), (n, 1, 1))
+    )
+    belief = prior
+    for _ in range(12):
+        if rng.random() < 0.5:
+            step_s = float(rng.choice([1e-9, 0.1, 0.5, 2.0, 3600.0, 1e6, 1e9]))
+            belief = predict(belief, step_s, rng.choice([2.0, 1e-4], n))
+            assert np.linalg.eigvalsh(belief.covariance).min() > 0.0
+            kept = np.exp(-step_s * rng.choice([0.0, 1e-9, 1.0], n))
+            belief = relax(belief, prior, kept, np.full(n, np.exp(-step_s)))
+        else:
+            row, value = (
+                (AZIMUTH, rng.uniform(-3.1, 3.1, n))
+                if rng.random() < 0.5
+                else (RADIAL_RATE, rng.uniform(-1e3, 1e3, n))
+            )
+            belief = update(
+                belief, row, value, 10.0 ** rng.uniform(-9.0, 6.0, n), rng.choice([1.0, 0.5, 1e-12], n)
+            )
+        assert np.isfinite(belief.mean).all()
+        assert np.linalg.eigvalsh(belief.covariance).min() > 0.0
+    for one in belief.each()[:20]:
+        assert decode(MotionBelief, encode(one), "belief").covariance.tolist() == one.covariance.tolist()
 
 
 def test_it_tracks_across_the_cut_behind_the_car():

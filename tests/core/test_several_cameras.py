@@ -10,12 +10,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate import Absent, Measurement, NotUsable, Present, Sighting, SignatureEvidence, WorldFilter
+from worldstate import (
+    Absent,
+    Context,
+    Measurement,
+    NotUsable,
+    Present,
+    Sighting,
+    SignatureEvidence,
+    WorldFilter,
+)
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 from worldstate.measurement.measurement import CameraLook, Look
+from worldstate.state import blind_corner
 
 SILENT, EVEN = NotUsable("-"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 FRONT, LEFT, REAR = (-0.6, 0.6), (0.3, 1.5), (2.4, -2.4)
@@ -142,6 +152,35 @@ def test_a_look_counts_once_for_its_camera_whoever_carries_it() -> None:
     assert half.state.entities[0].existence_probability == pytest.approx(
         once.state.entities[0].existence_probability, rel=1e-9
     )
+
+
+def test_boxes_of_any_sharpness_and_answers_that_contradict_leave_numbers() -> None:
+    """Of deviations whose squares are zero, and of cameras that miss nothing, of which one has seen one."""
+    sharp = measured(
+        1.0, camera("front", 1.0, FRONT, car(0.45, 1e-300)), camera("left", 1.0, LEFT, car(0.45, 1e-300))
+    )
+    (entity,) = after(sharp).state.entities
+    assert entity.azimuth_rad == pytest.approx(0.45)
+    coming = np.full((2, len(GROUPS)), 1e-3)
+    coming[:, GROUPS.index("coming_2s")] = 0.9
+    said = SequenceReading(coming / coming.sum(axis=1, keepdims=True), SHARE, 0.2, SequenceAlarm(1.0, 20.0))
+    sure = (Present(0.0, 1e-12), Absent(0.0, 1e-12))
+    looks = [CameraLook(Look(f"camera {k}", 10**9, one)) for k, one in enumerate(sure)]
+    state = after(measured(1.0, *looks, sequence=said)).state
+    for cue in state.cues:
+        soon = cue.within["3"]
+        terms = sum(cue.evidence.terms_nats.values())
+        assert terms == pytest.approx(math.log(soon / (1.0 - soon)), abs=1e-6)
+
+
+@given(st.floats(0.3, 1.0), st.floats(0.0, 0.5), st.floats(0.0, 0.5))
+def test_a_camera_whose_view_is_all_of_the_line_of_sight_is_taken(edge_rad, right_rad, left_rad) -> None:
+    """The overlap of the two may be the whole and a rounding more."""
+    left, right = (replace(blind_corner(name, side), edge_azimuth_rad=side * edge_rad)
+                   for name, side in (("left", 1), ("right", -1)))  # fmt: skip
+    look = camera("front", 1.0, (-edge_rad - right_rad, edge_rad + left_rad), miss_rate=0.0)
+    state = WorldFilter(Context(occluders=(left, right))).update(measured(1.0, look)).state
+    assert state.searched[0].miss_rate == 0.0
 
 
 def test_who_drives_from_one_view_into_another_is_seen_on() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
+from worldstate.belief.kinematics.motion import LEAST_STD
 from worldstate.ground import FloatArray, wrap_angle
 from worldstate.ground.serialisation import Probability
 from worldstate.measurement import CameraLook, Sector, Sighting
@@ -82,7 +83,7 @@ def camera_scan(seen: CameraLook, view: Sector, weight: float) -> Scan:
 
 def _of_box(box: Sighting, log_new: float, found: float) -> Detection:
     classes = ((box.label, box.score),)
-    measured = box.azimuth_rad, box.std_rad, box.moving, classes
+    measured = box.azimuth_rad, max(box.std_rad, LEAST_STD), box.moving, classes
     return Detection(*measured, _FIRST_EXISTENCE, log_new, found, box.width_rad)
 
 

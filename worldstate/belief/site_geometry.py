@@ -117,7 +117,8 @@ class SiteGeometry:
             return look
         sight = Sector.in_sight(side.edge_azimuth_rad for side in self.sides)
         both = sight.overlap(self.view(look))
-        share = 0.0 if both is None else both.half_width_rad / sight.half_width_rad
+        # Rounding may take the overlap above the whole.
+        share = 0.0 if both is None else min(both.half_width_rad / sight.half_width_rad, 1.0)
         found = any(one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings)
         miss = share * answer.miss_rate + (1.0 - share)
         if not found:

@@ -80,6 +80,10 @@ class Track:
         """Tell whether it is, or may be, of a side."""
         return self.side == side if self.of_side is not None else self.side_shares[side] > 0.0
 
+    def unseen_ns(self, stamp_ns: int) -> float:
+        """Return how long before a time it was last seen; infinite where it never was."""
+        return math.inf if self.last_seen_ns is None else stamp_ns - self.last_seen_ns
+
     @property
     def detected(self) -> bool:
         """Whether a sensor or a message has told where it is: it was not only heard."""

@@ -150,7 +150,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
         ended.append(second)
         into[second.id] = first.id
     found = [one for one in tracks if one.seen and one.last_seen_ns == stamp_ns]
-    lost = [one for one in tracks if one.seen and stamp_ns - (one.last_seen_ns or 0) >= _ALONE_NS]
+    lost = [one for one in tracks if one.seen and one.unseen_ns(stamp_ns) >= _ALONE_NS]
     for other in lost:
         same = next((one for one in found if _at_one_place(one, other)), None)
         if same is not None:

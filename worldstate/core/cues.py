@@ -63,7 +63,8 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     rule = SourceRule(stamp_ns, fault=fault, heard=heard, heard_ns=since_ns)
     if not measurement.heard.usable and memory.last.instant is not None:
         # What could not be heard neither raises an alarm nor ends one: silence does, after a second.
-        memory.rules[source] = replace(rule, statistic=() if last is None else last.statistic)
+        is_news = last is not None and _news_ends_ns(last) >= stamp_ns
+        memory.rules[source] = replace(rule, statistic=last.statistic if last and is_news else ())
         return
     update_rule(memory, source, rule, measurement.signature, measurement.co_evidence, model)
     if model.policy.adaptive is not None:
@@ -133,7 +134,8 @@ def _heard_advisories(memory: Memory, rule_ends_ns: Sequence[int]) -> tuple[Side
         return (None,) * len(hidden)
     if sequence is not None and sequence.alarm is not None:
         ends_ns = sequence.alarm_ends_ns(memory.stamp_ns)
-        threshold, pairs = sequence.alarm.threshold_nats, zip(ends_ns, sequence.decided, strict=True)
+        decided_nats = sequence.decided_at(memory.stamp_ns)
+        threshold, pairs = sequence.alarm.threshold_nats, zip(ends_ns, decided_nats, strict=True)
         return tuple(
             None if end_ns is None else SideAdvisory(end_ns, decided < threshold) for end_ns, decided in pairs
         )
@@ -141,10 +143,10 @@ def _heard_advisories(memory: Memory, rule_ends_ns: Sequence[int]) -> tuple[Side
     return tuple(SideAdvisory(max(rule_ends_ns)) if rule_ends_ns and p >= least else None for p in hidden)
 
 
-def decided_log_odds(memory: Memory, policy: CueingPolicy) -> float:
-    """Return the largest sustained statistic of the sources that hear and are not silent, log-odds."""
-    heard = (one for one in memory.rules.values() if not one.announced)
-    fresh = (one for one in heard if one.stamp_ns + NEWS_HOLDS_NS >= memory.stamp_ns)
+def decided_log_odds(memory: Memory, policy: CueingPolicy, announced: int | None = None) -> float:
+    """Return the largest sustained statistic of what hears, or announces for a side, and is not silent."""
+    heard = (one for one in memory.rules.values() if announced in (one.announced or (None,)))
+    fresh = (one for one in heard if _news_ends_ns(one) >= memory.stamp_ns)
     return bounded_log_odds(max((one.sustained(policy.sustain_hops) for one in fresh), default=0.0))
 
 
@@ -157,6 +159,8 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
         return "less than a second of sound: no alarm is raised yet"
     if sequence is None or sequence.alarm is None:
         return f"the statistic has not stayed above its threshold for {model.policy.sustain_hops} hops"
+    if sequence.decided_at(memory.stamp_ns) is not sequence.decided:
+        return "nothing was measured for a second"
     log_odds = list(sequence.log_odds(model.context).values())
     learned, threshold = sequence.learned_nats(model.context)[side], sequence.alarm.threshold_nats
     if log_odds[-1][side] < threshold <= log_odds[-1][side] + learned:
@@ -181,12 +185,15 @@ def _alarms(memory: Memory, policy: CueingPolicy) -> list[tuple[tuple[int, ...],
     gamma, hops = policy.gamma_at(memory.threshold.shift_nats), policy.sustain_hops
     alarms = []
     for one in memory.rules.values():
-        # What cannot be heard is no news.
-        end_ns = NEWS_HOLDS_NS + (one.stamp_ns if one.heard.usable else one.heard_ns)
-        is_over = len(one.statistic) >= hops and one.sustained(hops) >= gamma
+        end_ns, is_over = _news_ends_ns(one), len(one.statistic) >= hops and one.sustained(hops) >= gamma
         if is_over and end_ns >= memory.stamp_ns:
             alarms.append((one.announced, end_ns))
     return alarms
+
+
+def _news_ends_ns(rule: SourceRule) -> int:
+    """Return when what a source said last has ended: what cannot be heard is no news."""
+    return (rule.stamp_ns if rule.heard.usable else rule.heard_ns) + NEWS_HOLDS_NS
 
 
 _Times = tuple[dict[str, float] | None, tuple[float, float, float] | None]
@@ -258,9 +265,9 @@ def _times(kept: SequenceMemory | None, advised: list[bool]) -> list[_Times]:
         return [(None, None)] * len(advised)
     posterior = kept.posterior
     within = posterior.within()[0].tolist()
-    soon = posterior.groups[0, :, :STATED].sum(axis=1) > 0.5
+    soon = posterior.groups[0, :, :STATED].sum(axis=1).tolist()
     # The times are those of a vehicle that comes: in an empty street they would say nothing.
-    stated = [told or likely for told, likely in zip(advised, soon.tolist(), strict=True)]
+    stated = [chance > (0.0 if told else 0.5) for told, chance in zip(advised, soon, strict=True)]
     intervals_s = posterior.time_to_visible_s()[0].tolist() if any(stated) else within
     names = [f"{end_s:g}" for end_s in HORIZONS_S]
     return [
@@ -277,8 +284,7 @@ def _evidence(
     by_message = [one is not None and one.announced for one in raised]
     if not any(by_message):
         return heard
-    told = _announced(memory, model)
-    return [told if named else own for own, named in zip(heard, by_message, strict=True)]
+    return [_announced(memory, model, k) if by_message[k] else own for k, own in enumerate(heard)]
 
 
 def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
@@ -295,7 +301,7 @@ def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
         terms = np.diff(list(after.values()), axis=0, prepend=0.0).T.tolist()
         return [
             EvidenceTerms("coming", dict(zip(after, own, strict=True)), decides, threshold)
-            for own, decides in zip(terms, kept.decided, strict=True)
+            for own, decides in zip(terms, kept.decided_at(memory.stamp_ns), strict=True)
         ]
     prior, threshold = _rule_log_odds(memory, model)
     looked_nats = math.inf if instant.log_lambda is None else instant.log_lambda
@@ -305,14 +311,15 @@ def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
     return [told] * len(model.site.sides)
 
 
-def _announced(memory: Memory, model: FilterModel) -> EvidenceTerms:
-    """Return what the rule of messages goes by, all sides together."""
+def _announced(memory: Memory, model: FilterModel, side: int) -> EvidenceTerms:
+    """Return what the rule of the messages that announce a side goes by, all sides together."""
     weights = model.policy.reference_prior[:-2]
     chances = announced(memory.tracks, model.site)
     odds = sum(w * math.exp(claimed_nats(p)) for w, p in zip(weights, chances, strict=True)) / sum(weights)
     prior, threshold = _rule_log_odds(memory, model)
     nats = math.log(odds)
-    return EvidenceTerms("announced", {"prior": prior, "messages": nats}, prior + nats, threshold)
+    decided = decided_log_odds(memory, model.policy, side)
+    return EvidenceTerms("announced", {"prior": prior, "messages": nats}, decided, threshold)
 
 
 def _rule_log_odds(memory: Memory, model: FilterModel) -> tuple[float, float]:

@@ -30,7 +30,7 @@ from worldstate.belief.track import (
     merged,
     relabelled,
 )
-from worldstate.ground import FloatArray, seconds, wrap_angle
+from worldstate.ground import FloatArray, nanoseconds, seconds, wrap_angle
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
 from .birth_death import REOCCLUSION_NS, after_look
@@ -314,8 +314,7 @@ def _announce(track: Track, site: SiteGeometry) -> None:
     assert track.place is not None
     x, y = track.place.mean[:2].tolist()
     side = site.hiding_side(math.atan2(y, x))
-    unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
-    if side is not None and (not track.seen or unseen_ns > REOCCLUSION_NS):
+    if side is not None and (not track.seen or track.unseen_ns(track.updated_ns) > REOCCLUSION_NS):
         track.side, track.seen, track.came_from = side, False, 1.0
 
 
@@ -361,6 +360,6 @@ def _has_left(track: Track, past: float, miss_rate: float, stamp_ns: int, site: 
     with the chance p of that, the time t since its last box and the interval T of looks. Boxes end as soon as
     a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
     """
-    unseen_s = seconds(stamp_ns - (track.last_seen_ns or 0))
-    missed = math.pow(miss_rate, min(unseen_s / site.settings.look_interval_s, 1.0))
+    unseen = track.unseen_ns(stamp_ns) / nanoseconds(site.settings.look_interval_s)
+    missed = math.pow(miss_rate, min(unseen, 1.0))
     return 0.0 < past >= (1.0 - past) * missed

@@ -4,7 +4,6 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter
 
 import numpy as np
 
@@ -93,7 +92,9 @@ class ArrivalRate:
 
 
 # In seconds what the alarm's threshold was set with in hops; less by the rounding of stamps.
-_SMOOTHED_NS, _HELD_NS, _SLACK_NS = 300_000_000, 1_000_000_000, 5_000_000
+_HOP_NS, _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 100_000_000, 300_000_000, 1_000_000_000, 5_000_000
+_WAY_NS = 10_000_000_000
+_UNDECIDED = (-math.log(1e9),) * len(SIDES)
 # A look says what is in view then, not what will be: multiplied into the belief hop by hop, looks at one
 # vehicle outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
 _LOOK_NS = 500_000_000
@@ -128,7 +129,7 @@ class SequenceMemory:
     # Stamps of the last .3 s with the log-odds of coming into view within three seconds, left and right.
     recent: tuple[tuple[int, float, float], ...] = ()
     # What was last held against the threshold, nats, and when each side was last above it.
-    decided: tuple[float, ...] = (-math.log(1e9),) * len(SIDES)
+    decided: tuple[float, ...] = _UNDECIDED
     over_ns: tuple[int | None, ...] = (None,) * len(SIDES)
     looks: tuple[Look, ...] = ()  # The last one of each sensor, for as long as it holds
     # When a vehicle last came into view from a side.
@@ -176,7 +177,7 @@ class SequenceMemory:
 
     @cached_property
     def _told(self) -> dict[str, FloatArray]:
-        """Log-likelihoods of the looks, in the order of their sensors, each (states,)."""
+        """Log-likelihoods of the looks, the oldest first, each (states,)."""
         return {f"look {look.sensor}": look_log_likelihoods(look.answer) for look in self.looks}
 
     @property
@@ -276,6 +277,7 @@ class SequenceMemory:
             emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
             masked_ns=(stamp_ns,) * len(SIDES),
             over_ns=tuple(None if k in kept else ns for k, ns in enumerate(self.over_ns)),
+            decided=tuple(_UNDECIDED[k] if k in kept else one for k, one in enumerate(self.decided)),
             unseen=tuple(unseen.tolist()),
             arrivals=tuple(
                 rate.after(gap_ns) if k in kept else rate for k, (rate, gap_ns) in enumerate(pairs)
@@ -291,6 +293,19 @@ class SequenceMemory:
         """Return by how much the log-odds of each side are moved by what was seen; a given prior stands."""
         usual_hz = float(self.share[: len(COMING_S)].sum() / self.share.sum()) / COMING_S[-1]
         return [0.0 if context.priors else one.shift_nats(usual_hz) for one in self.arrivals]
+
+    def decided_at(self, stamp_ns: int) -> tuple[float, ...]:
+        """Return what is held against the threshold, nothing without news for as long as an alarm."""
+        is_news = bool(self.recent) and stamp_ns <= self.recent[-1][0] + _HELD_NS + _SLACK_NS
+        return self.decided if is_news else _UNDECIDED
+
+    def not_held(self, sides: Collection[int]) -> "SequenceMemory":
+        """Return the memory without the alarms of some sides that are only held."""
+        least = math.inf if self.alarm is None else self.alarm.threshold_nats
+        pairs = enumerate(zip(self.over_ns, self.decided, strict=True))
+        return replace(
+            self, over_ns=tuple(None if k in sides and one < least else ns for k, (ns, one) in pairs)
+        )
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
         """Return for each side when its alarm ends: a second after it was last above the threshold."""
@@ -310,7 +325,9 @@ class SequenceMemory:
         told = np.cumsum([np.zeros_like(self.states.belief), *pieces.values()], axis=0)
         # States and groups count alike: a vehicle that comes soon behind another comes soon.
         before = states_of(self.prior(context), self.share)
-        weights = np.concatenate([before[None], self.states.belief * np.exp(told)])
+        # Looks that miss nothing would leave no weight above what keeps logarithms finite.
+        after = self.states.belief * np.exp(told - told.max(axis=-1, keepdims=True))
+        weights = np.concatenate([before[None], after / after.sum(axis=-1, keepdims=True)])
         soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
         return dict(zip(("prior", "sequence", *pieces), np.log(soon) - np.log(later), strict=True))
 
@@ -324,7 +341,19 @@ def _as_few(chances: FloatArray) -> FloatArray:
 
 
 def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context) -> SequenceMemory:
-    """Return the belief at a later time, with nothing heard."""
+    """Return the belief at a later time, with nothing heard.
+
+    When a vehicle may have come into view unseen is told by the way there: its last ten seconds are gone hop
+    by hop, so that one long step leads where many short ones do.
+    """
+    since_ns = stamp_ns - step_ns
+    first_ns = max(stamp_ns - _WAY_NS, since_ns + _HOP_NS)
+    for end_ns in (*range(first_ns, stamp_ns - _SLACK_NS, _HOP_NS), stamp_ns):
+        kept, since_ns = _one_step(kept, end_ns, end_ns - since_ns, context), end_ns
+    return kept
+
+
+def _one_step(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context) -> SequenceMemory:
     chain = np.array([state_transition(one, step_ns) for one in kept.prior(context)])
     looks = tuple(look for look in kept.looks if stamp_ns - look.stamp_ns <= _LOOK_NS)
     states, unseen = next_belief(kept.states, None, chain), _unseen(kept, step_ns)
@@ -369,11 +398,16 @@ def informed(
     kept = replace(
         kept,
         states=states,
-        looks=tuple(sorted(held.values(), key=attrgetter("sensor"))),
+        looks=tuple(sorted(held.values(), key=_by_content)),
         unseen=tuple(chance * missed for chance in kept.unseen),
         stamp_ns=measurement.stamp_ns,
     )
     return alerted(kept, context)
+
+
+def _by_content(look: Look) -> tuple[int, str, str]:
+    """Return what looks are in order of: each weighs given those before it, and names carry no meaning."""
+    return look.stamp_ns, str(look.answer), look.sensor
 
 
 def _as_heard(alone: FloatArray, said: FloatArray, share: float) -> FloatArray:
@@ -403,8 +437,11 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
     rows = [
-        [row[1 + k] for row in recent if ns is None or row[0] >= ns] for k, ns in enumerate(kept.emerged_ns)
-    ]
+        # Of each hop the last one: however many measurements there are, time counts.
+        list({(kept.stamp_ns - at_ns + _SLACK_NS) // _HOP_NS: row[k] for at_ns, *row in recent
+              if ns is None or at_ns >= ns}.values())
+        for k, ns in enumerate(kept.emerged_ns)
+    ]  # fmt: skip
     decided, over_ns, alarm = np.array([float(np.mean(row)) for row in rows]), kept.over_ns, kept.alarm
     if alarm is not None:
         decided = alarm.deciding(decided, kept.posterior.groups[0], np.array(kept.learned_nats(context)))

@@ -11,7 +11,16 @@ from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
 
 from .acoustic_update import acoustic_update
-from .birth_death import HIDDEN, birth_death, events_between, merge_tracks, past_edges, published, surviving
+from .birth_death import (
+    HIDDEN,
+    birth_death,
+    events_between,
+    hidden_on,
+    merge_tracks,
+    past_edges,
+    published,
+    surviving,
+)
 from .cues import SideAdvisory, advisories, update_advisories
 from .detection_update import new_looks, update_looks, update_positions
 from .fixed_lag import Timed
@@ -74,12 +83,15 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
     else:
         measurement = without_open_sides(measurement, model.context)
         _perceive(memory, measurement, start_ns, model)
+    gone = _announced_in_view(before, memory)
+    if gone and isinstance(memory.belief, SequenceMemory):
+        memory.belief = memory.belief.not_held(gone)
     named = advisories(memory, model)
     if isinstance(measurement, Measurement):
         birth_death(memory, [one is not None for one in named], measurement, model.site)
         _place_hidden(memory, model.site)
     _keep_likeliest(memory)
-    _note_advisories(memory, held, named)
+    _note_advisories(memory, [None if k in gone else one for k, one in enumerate(held)], named)
     into = merge_tracks(memory, model.site)
     known, now = (published(one.tracks, model.site.settings) for one in (before, memory))
     memory.last.events = events_between(known, now, memory.stamp_ns, into)
@@ -130,6 +142,13 @@ def _keep_likeliest(memory: Memory) -> None:
         order = sorted(range(len(tracks)), key=lambda i: (tracks[i].detected, -tracks[i].existence))
         memory.tracks = tuple(tracks[i] for i in sorted(order[:MOST_TRACKS]))
         memory.counts.left_out += len(tracks) - MOST_TRACKS
+
+
+def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
+    """Return the sides whose vehicle of before is in view now, from whichever side it came."""
+    seen = {one.id for one in memory.tracks if one.seen}
+    told = (hidden_on(before.tracks, k) for k in range(len(before.history)))
+    return [k for k, one in enumerate(told) if one is not None and one.id in seen]
 
 
 def _note_advisories(

@@ -24,7 +24,16 @@ from worldstate.ground import FloatArray, wrap_angle
 from worldstate.ground.serialisation import Via
 from worldstate.measurement import Odometry, Position
 
-from .motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE, GaussianBelief, MotionBelief
+from .motion import (
+    AZIMUTH,
+    AZIMUTH_RATE,
+    LARGEST_STD,
+    LOG_RANGE,
+    RADIAL_RATE,
+    GaussianBelief,
+    MotionBelief,
+    conditioned,
+)
 
 # A lane and a half: of a position that is less sure, a number would be taken for more than it says.
 _KNOWN_STD_M = 5.0
@@ -35,6 +44,7 @@ _NEAREST_M = 1.0
 # rad: no sensor knows a bearing better. Its square is added to polar variances, too: a sharp position far
 # away would leave a covariance that is singular to rounding, and its checkpoint would be refused.
 _LEAST_STD = 1e-4
+_LARGEST_PLACE_STD = 1e4  # m and m/s: ten times the least sure position that is taken
 _IDENTITY = np.eye(4)
 
 
@@ -156,7 +166,7 @@ def polar_motion(
     # Axes that turn with the ego vehicle see everything turn the other way.
     seen_turning = turning - ego_yaw_rate_rad_s
     mean = np.stack([np.arctan2(y, x), seen_turning, closing, 0.5 * np.log(square)], axis=-1)
-    return MotionBelief(mean, 0.5 * (covariance + covariance.mT))
+    return MotionBelief(mean, conditioned(covariance, LARGEST_STD))
 
 
 def _update(
@@ -171,7 +181,7 @@ def _update(
 
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> CartesianBelief:
-    return CartesianBelief(mean, 0.5 * (covariance + covariance.mT))
+    return CartesianBelief(mean, conditioned(covariance, _LARGEST_PLACE_STD))
 
 
 def _longest(covariance: FloatArray) -> float:

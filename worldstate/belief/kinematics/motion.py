@@ -74,6 +74,27 @@ def _checked_covariance(row: FloatArray) -> FloatArray:
     return covariance
 
 
+# Of the largest variance, what every one has at least, so that rounding, 1e-16 of it, leaves none below zero.
+_CONDITION = 1e-13
+
+
+def conditioned(covariance: FloatArray, largest_std: float) -> FloatArray:
+    r"""Return a covariance symmetric and positive definite, whatever rounding has left of it.
+
+    .. math:: P \leftarrow S P S + \kappa \max_i (S P S)_{ii}\, I, \qquad
+              s_i = \min(1,\ \sigma_{max} / \sigma_i)
+
+    A deviation above the largest one says nothing, but leaves no digits to the others.
+    """
+    covariance = 0.5 * (covariance + covariance.mT)
+    variance = np.einsum("...ii->...i", covariance)  # A view
+    if variance.max() > largest_std**2:
+        scale = np.minimum(largest_std / np.sqrt(np.maximum(variance, LEAST_STD**2)), 1.0)
+        covariance *= _outer(scale, scale)
+    variance += _CONDITION * variance.max(axis=-1, keepdims=True)
+    return covariance
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianBelief:
     """Mean and covariance of four coordinates.
@@ -105,7 +126,7 @@ _LOG_NEAREST, _LOG_FARTHEST = math.log(NEAREST_M), math.log(FARTHEST_M)
 _CLOSEST_SHARE = 0.5
 # No sensor knows a bearing to .006 degrees or an approach rate to 1e-4 1/s. Deviations below make a
 # covariance singular to rounding, and its checkpoint is refused; a hundred radians say nothing.
-_LEAST_STD, _LARGEST_STD = 1e-4, 1e2
+LEAST_STD, LARGEST_STD = 1e-4, 1e2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +141,7 @@ class MotionBelief(GaussianBelief):
         cls, mean: tuple[float, float, float, float], std: tuple[float, float, float, float]
     ) -> "MotionBelief":
         """Return independent components."""
-        return cls(np.array(mean), np.diag(np.square(np.clip(std, _LEAST_STD, _LARGEST_STD))))
+        return cls(np.array(mean), np.diag(np.square(np.clip(std, LEAST_STD, LARGEST_STD))))
 
     @property
     def azimuth_rad(self) -> float:
@@ -198,7 +219,7 @@ def update(
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
     """
-    noise = np.square(np.maximum(std, _LEAST_STD))[..., None]
+    noise = np.square(np.maximum(std, LEAST_STD))[..., None]
     residual = value - belief.mean[..., row]
     if row == AZIMUTH:
         residual = wrap_angle(residual)
@@ -221,4 +242,4 @@ def _outer(column: FloatArray, row: FloatArray) -> FloatArray:
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> MotionBelief:
     mean[..., AZIMUTH] = wrap_angle(mean[..., AZIMUTH])
-    return MotionBelief(mean, 0.5 * (covariance + covariance.mT))
+    return MotionBelief(mean, conditioned(covariance, LARGEST_STD))
