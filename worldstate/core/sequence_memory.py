@@ -436,12 +436,11 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     left, right = list(kept.log_odds(context).values())[-1].tolist()
     since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
+    # Of each hop the last one: however many measurements there are, time counts.
+    of_hop = {(kept.stamp_ns - one[0] + _SLACK_NS) // _HOP_NS: one for one in recent}.values()
     rows = [
-        # Of each hop the last one: however many measurements there are, time counts.
-        list({(kept.stamp_ns - at_ns + _SLACK_NS) // _HOP_NS: row[k] for at_ns, *row in recent
-              if ns is None or at_ns >= ns}.values())
-        for k, ns in enumerate(kept.emerged_ns)
-    ]  # fmt: skip
+        [one[1 + k] for one in of_hop if ns is None or one[0] >= ns] for k, ns in enumerate(kept.emerged_ns)
+    ]
     decided, over_ns, alarm = np.array([float(np.mean(row)) for row in rows]), kept.over_ns, kept.alarm
     if alarm is not None:
         decided = alarm.deciding(decided, kept.posterior.groups[0], np.array(kept.learned_nats(context)))
