@@ -17,8 +17,8 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
-from worldstate.adapters.files.acoustic_domain import array_difference, microphone_order
 from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.array_match import array_difference, microphone_order
 from worldstate.adapters.files.file_io import read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError, OutOfDomainError

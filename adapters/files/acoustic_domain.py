@@ -1,9 +1,8 @@
-"""Hold an array, in whatever order, and a sample rate against what a model or a data set was made for."""
+"""Hold an array and a sample rate against what a model was made for."""
 
 import hashlib
 import logging
 from collections.abc import Sequence
-from itertools import permutations, product
 
 import numpy as np
 
@@ -19,136 +18,10 @@ from worldstate.frontend.direction.feature import (
 )
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError
-from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.ground.typing import IndexArray
 
+from .array_match import TRAIN, WAY_OUT, matched_order
 from .model_file import Model
-
-# Array files give millimetres; half a wavelength at the top of the feature's band is 114 mm.
-TOLERANCE_M = 1e-3
-# Only `run` and `live` go on with a model of another array; the other commands have no such option to name.
-TRAIN = "Make a model for it (worldstate model make; of recordings model features, model fit)"
-WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
-_UNITS = {1.0: "", 1e-3: "looks like millimetres", 1e-2: "looks like centimetres"}
-_LEAST_TURN_DEG = 0.5
-
-
-def microphone_order(expected_m: FloatArray, array: MicrophoneArray) -> IndexArray | None:
-    """Return the channels of `array` in the order of the expected positions, None where they are elsewhere.
-
-    A displacement of the whole array does not count: plane waves show differences of delays only.
-
-    Parameters
-    ----------
-    expected_m : ndarray, shape (M, 3)
-        Positions in `base_link` axes, metres.
-    array : MicrophoneArray
-        To be compared, to 1 mm.
-
-    Returns
-    -------
-    ndarray of int, shape (M,), or None
-        ``array.positions_m[order]`` are the expected positions.
-
-    Examples
-    --------
-    >>> there = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, 0.3]])
-    >>> microphone_order(there, MicrophoneArray(there[[2, 0, 1]] + [2.0, 0.0, 1.5]))
-    array([1, 2, 0])
-    """
-    if array.n_microphones != len(expected_m):
-        return None
-    return _order(_centred(expected_m), array.centred_m)
-
-
-def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:
-    """Say how an array differs from the expected positions, (M, 3), and what is the likely cause.
-
-    Examples
-    --------
-    >>> there = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, 0.3], [0.0, 0.2, 0.2]])
-    >>> array_difference(there, MicrophoneArray(there * [1, -1, 1]))
-    'microphones up to 300 mm elsewhere; looks mirrored'
-    """
-    if array.n_microphones != len(expected_m):
-        return f"{array.n_microphones} microphones, expected {len(expected_m)}"
-    expected, found = _centred(expected_m), array.centred_m
-    largest_m = float(np.linalg.norm(found - expected, axis=1).max())
-    return "; ".join(
-        filter(None, (f"microphones up to {1e3 * largest_m:.0f} mm elsewhere", _cause(expected, found)))
-    )
-
-
-def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
-    """Return the channels of `array` in the order of the one that a model was made for.
-
-    Raises
-    ------
-    OutOfDomainError
-        If the microphones stand elsewhere; the message names the array, the difference and the way out.
-
-    Examples
-    --------
-    >>> pair = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
-    >>> matched_order(pair, pair)
-    array([0, 1])
-    """
-    order = microphone_order(made_for.positions_m, array)
-    if order is None:
-        difference = array_difference(made_for.positions_m, array)
-        model = f"{made_for.name}, {made_for.n_microphones} microphones"
-        raise OutOfDomainError(f"{array.name}: not the array of the model ({model}): {difference}. {way_out}")
-    return order
-
-
-def _centred(positions_m: FloatArray) -> FloatArray:
-    return np.asarray(positions_m - positions_m.mean(axis=0))
-
-
-def _order(expected: FloatArray, found: FloatArray) -> IndexArray | None:
-    """Return the nearest of `found` for each of `expected` if all are near and each is taken once."""
-    distance = np.linalg.norm(expected[:, None] - found[None], axis=-1)
-    # Channel by channel first, so that microphones closer than the tolerance keep their order.
-    if np.diagonal(distance).max() <= TOLERANCE_M:
-        return np.arange(len(expected))
-    nearest = distance.argmin(axis=1)
-    near = distance.min(axis=1).max() <= TOLERANCE_M
-    return nearest if near and len(np.unique(nearest)) == len(nearest) else None
-
-
-def _cause(expected: FloatArray, found: FloatArray) -> str:
-    """Return the first simple mistake that explains the difference, empty where none does."""
-    for unit, in_words in _UNITS.items():
-        for turn, how in _turns():
-            if _order(expected, unit * found @ turn.T) is not None:
-                return ", ".join(filter(None, (in_words, how)))
-    scale = np.sqrt((found**2).sum() / (expected**2).sum())
-    if _order(expected, found / scale) is not None:
-        return f"looks scaled by {scale:.3g}"
-    return _rotation(expected, found)
-
-
-def _turns() -> "list[tuple[FloatArray, str]]":
-    """Return the 48 ways to name and count three axes, the simple ones first."""
-    found = []
-    for axes, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        turn = np.diag(signs)[:, axes]
-        swapped, flipped = axes != (0, 1, 2), signs.count(-1.0)
-        # Two axes counted backwards are half a turn about the third.
-        how = "looks mirrored" if flipped % 2 else "looks turned by half a turn" if flipped else ""
-        found.append((6 * swapped + flipped, turn, "axes swapped" if swapped else how))
-    return [(turn, how) for _, turn, how in sorted(found, key=lambda item: item[0])]
-
-
-def _rotation(expected: FloatArray, found: FloatArray) -> str:
-    """Return the rotation that explains the difference channel by channel (Kabsch's solution)."""
-    left, _, right = np.linalg.svd(found.T @ expected)
-    proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    turn = left @ proper @ right
-    if _order(expected, found @ turn) is None:
-        return ""
-    angle_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0)))
-    return f"looks rotated by {angle_deg:.0f} deg" if angle_deg > _LEAST_TURN_DEG else ""
-
 
 UNFIT = "the model says that it is unfit for use"
 

@@ -86,8 +86,8 @@ def stream_truth(heard: HeardStream) -> StreamTruth:
 
 
 # Shallow trees of a third of the inputs each, and many of them: learned of 32 junctions, 60, 120 and 200
-# rounds detect .90, .92 and .94 of 511 approaches at junctions not learned, at 17 onsets an hour; sixty at half
-# the rate .87.
+# rounds detect .90, .92 and .94 of 511 approaches at junctions not learned, at 17 onsets an hour; sixty at
+# half the rate .87.
 ROUNDS, LEAVES, RATE, RIDGE, INPUTS_EACH = 200, 8, 0.2, 20.0, 0.3
 SMALLEST_LEAF = 300
 EVERY_HOPS = 3  # Neighbours say the same thing

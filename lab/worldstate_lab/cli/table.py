@@ -43,7 +43,8 @@ import numpy as np
 
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, choose_array
-from worldstate.adapters.files.acoustic_domain import check_array, microphone_order
+from worldstate.adapters.files.acoustic_domain import check_array
+from worldstate.adapters.files.array_match import microphone_order
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar, track

@@ -16,7 +16,8 @@ from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.datasets.ovad import read_true_tracks
-from worldstate.adapters.files.acoustic_domain import TRAIN, feature_order
+from worldstate.adapters.files.acoustic_domain import feature_order
+from worldstate.adapters.files.array_match import TRAIN
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import Step, listen_steps, measure_steps
 from worldstate.adapters.source import ListenSettings, Source, open_source

@@ -81,7 +81,7 @@ def checked_sensors(arguments: argparse.Namespace, sound: list[Path]) -> GivenSe
 
 def _check_array(given: "GivenSensors", made_for: "frontend.MicrophoneArray", sound: list[Path]) -> None:
     from worldstate.adapters.datasets.ovad import check_channels, named_array
-    from worldstate.adapters.files.acoustic_domain import WAY_OUT, matched_order
+    from worldstate.adapters.files.array_match import WAY_OUT, matched_order
 
     if any(named_array(path) is not None for path in sound):
         return
