@@ -16,10 +16,11 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.sound_file import SoundInput, SoundStream, as_sound, path_of
+from worldstate.adapters.camera.camera_channel import video_degradation, watched
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector, read_any_detections
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video, video_degradation, watched
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
 from worldstate.adapters.datasets.ovad import Recording, choose_array
 from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, heard_with, states_budget

@@ -1,23 +1,15 @@
-"""Frames of a video file, by OpenCV, which comes with the extra `vision`, and what is seen in them.
+"""Frames of a video file, by OpenCV, which comes with the extra `vision`."""
 
-A detector with measured miss rates looks at every frame; its degradation is read from the same images.
-"""
-
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import ImageArray
-from worldstate.ground.values import nanoseconds
 
-from .camera_health import DegradationLog, HealthMonitor, image_quality
-from .detections import MAX_FRAMES, DetectionFilter, DetectionFrame, DetectionLog, Detector
-from .miss_rates import MissRates
+from .detections import MAX_FRAMES, DetectionFilter
 
 # OVAD's name for the video beside a recording's sound.
 VIDEO_NAME = "ueye_stereo_vid.mp4"
@@ -105,56 +97,6 @@ def _open(path: Path) -> Any:
         capture.release()
         raise InputFileError(path, "expected a video file, it cannot be opened as one")
     return capture
-
-
-# Period of the degradation estimate: it costs as much as a detection, and dirt or dusk take longer.
-HEALTH_PERIOD_NS = 400_000_000
-
-
-class ImageHealth:
-    """Degradation d of a camera, read from its images once a period; 0 without a scale of its health."""
-
-    def __init__(self, rates: MissRates | None, period_ns: int = HEALTH_PERIOD_NS) -> None:
-        self._rates, self._period_ns = rates, period_ns
-        self._monitor = None if rates is None or rates.health is None else HealthMonitor(rates.health)
-        self._read_ns: int | None = None
-        self.level = 0.0
-
-    def read(self, stamp_ns: int, frame: ImageArray) -> float:
-        """Take the next image; return d as last read."""
-        due = self._read_ns is None or stamp_ns - self._read_ns >= self._period_ns
-        if due and self._monitor is not None and self._rates is not None:
-            self._read_ns = stamp_ns
-            self.level = self._rates.level(self._monitor.update(stamp_ns, image_quality(frame)))
-        return self.level
-
-
-def watched(video: Video, detector: Detector, rates: MissRates | None) -> tuple[DetectionLog, DegradationLog]:
-    """Return what a new detector finds in a video, each image decoded once, and d as last read from it.
-
-    Rates are those measured for this detector and camera; without the scale of its health d is 0.
-    """
-    health, found = ImageHealth(rates), list[DetectionFrame]()
-
-    def look(stamp_ns: int, image: ImageArray) -> float:
-        found.append(detector.detect(image))
-        return health.read(stamp_ns, image)
-
-    degradation = _levels(video, look)
-    return DetectionLog(tuple(found), degradation.stamps_ns, str(video.path)), degradation
-
-
-def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
-    """Estimate d from every image of a video that starts with the recording."""
-    return _levels(video, ImageHealth(rates, period_ns=0).read)
-
-
-def _levels(video: Video, read: Callable[[int, ImageArray], float]) -> DegradationLog:
-    stamps_ns, levels = list[int](), list[float]()
-    for number, image in enumerate(video.frames()):
-        stamps_ns.append(nanoseconds(number / video.frame_rate_hz))
-        levels.append(read(stamps_ns[-1], image))
-    return DegradationLog(np.array(stamps_ns, dtype=np.int64), np.array(levels))
 
 
 def any_motion() -> DetectionFilter:

@@ -11,9 +11,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Generic, Self, TypeVar
 
+from worldstate.adapters.camera.camera_channel import ImageHealth
 from worldstate.adapters.camera.detections import DetectionFrame, Detector, frame_of
 from worldstate.adapters.camera.miss_rates import MissRates
-from worldstate.adapters.camera.video import ImageHealth
 from worldstate.adapters.files.odometry_file import OdometryRecord
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range
 from worldstate.ground.extras import optional

@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
 
 from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.camera_health import (
     FAMILIES,
     LEVELS,
@@ -31,7 +32,7 @@ from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates, save_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import open_video, video_degradation
+from worldstate.adapters.camera.video import open_video
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
