@@ -9,7 +9,7 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import ImageArray
 
-from .detections import MAX_FRAMES, DetectionFilter
+from .detections import MAX_FRAMES
 
 # OVAD's name for the video beside a recording's sound.
 VIDEO_NAME = "ueye_stereo_vid.mp4"
@@ -97,8 +97,3 @@ def _open(path: Path) -> Any:
         capture.release()
         raise InputFileError(path, "expected a video file, it cannot be opened as one")
     return capture
-
-
-def any_motion() -> DetectionFilter:
-    """Return the filter that keeps all boxes of a motion detector, whose score is no confidence."""
-    return DetectionFilter(frozenset({"car"}), 0.0, 0.0)

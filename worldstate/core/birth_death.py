@@ -206,8 +206,8 @@ def _returning(tracks: Iterable[Track], k: int, stamp_ns: int, site: SiteGeometr
     candidates = [
         track
         for track in tracks
-        if track.seen and track.moving and track.last_seen_ns is not None
-        if REOCCLUSION_NS <= stamp_ns - track.last_seen_ns <= _REOCCLUSION_END_NS
+        if track.seen and track.moving
+        if REOCCLUSION_NS <= track.unseen_ns(stamp_ns) <= _REOCCLUSION_END_NS
         if side.distance_rad(track.motion.azimuth_rad) <= _REOCCLUSION_RAD
     ]
     return min(candidates, key=lambda track: side.distance_rad(track.motion.azimuth_rad), default=None)

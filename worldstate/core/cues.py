@@ -159,7 +159,7 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
         return "less than a second of sound: no alarm is raised yet"
     if sequence is None or sequence.alarm is None:
         return f"the statistic has not stayed above its threshold for {model.policy.sustain_hops} hops"
-    if sequence.decided_at(memory.stamp_ns) is not sequence.decided:
+    if not sequence.has_news(memory.stamp_ns):
         return "nothing was measured for a second"
     log_odds = list(sequence.log_odds(model.context).values())
     learned, threshold = sequence.learned_nats(model.context)[side], sequence.alarm.threshold_nats

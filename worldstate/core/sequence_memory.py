@@ -93,7 +93,7 @@ class ArrivalRate:
 
 # In seconds what the alarm's threshold was set with in hops; less by the rounding of stamps.
 _HOP_NS, _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 100_000_000, 300_000_000, 1_000_000_000, 5_000_000
-_WAY_NS = 10_000_000_000
+_WAY_NS = 10_000_000_000  # Longer than any vehicle that is expected takes
 _UNDECIDED = (-math.log(1e9),) * len(SIDES)
 # A look says what is in view then, not what will be: multiplied into the belief hop by hop, looks at one
 # vehicle outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
@@ -294,10 +294,13 @@ class SequenceMemory:
         usual_hz = float(self.share[: len(COMING_S)].sum() / self.share.sum()) / COMING_S[-1]
         return [0.0 if context.priors else one.shift_nats(usual_hz) for one in self.arrivals]
 
+    def has_news(self, stamp_ns: int) -> bool:
+        """Tell whether anything was measured for as long as an alarm holds."""
+        return bool(self.recent) and stamp_ns <= self.recent[-1][0] + _HELD_NS + _SLACK_NS
+
     def decided_at(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return what is held against the threshold, nothing without news for as long as an alarm."""
-        is_news = bool(self.recent) and stamp_ns <= self.recent[-1][0] + _HELD_NS + _SLACK_NS
-        return self.decided if is_news else _UNDECIDED
+        """Return what is held against the threshold, nothing without news."""
+        return self.decided if self.has_news(stamp_ns) else _UNDECIDED
 
     def not_held(self, sides: Collection[int]) -> "SequenceMemory":
         """Return the memory without the alarms of some sides that are only held."""
@@ -354,6 +357,7 @@ def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context)
 
 
 def _one_step(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context) -> SequenceMemory:
+    """Return the belief one step of the chain later."""
     chain = np.array([state_transition(one, step_ns) for one in kept.prior(context)])
     looks = tuple(look for look in kept.looks if stamp_ns - look.stamp_ns <= _LOOK_NS)
     states, unseen = next_belief(kept.states, None, chain), _unseen(kept, step_ns)

@@ -26,6 +26,7 @@ from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters import acoustic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.model_file import read_model
+from worldstate.commissioning.sequence_training import LEAVES, ROUNDS
 from worldstate.frontend import hop_spectra, stream
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import roof_array_56
@@ -138,7 +139,6 @@ def published_chain_times(sound: Float32Array) -> Milliseconds:
     return [elapsed_ms(one_hop) + shared_ms for _ in range(REPEATS)]
 
 
-ROUNDS, LEAVES = 60, 8  # A round is a tree for each group
 _FOREIGN, _SIGNALS, _CENTRES = 8, 4, 5
 _ROWS, _WINDOWS = 150, 40  # Few: the peers' cost does not depend on them either
 
@@ -178,6 +178,7 @@ def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
 
 def _sequence(rng: np.random.Generator) -> SequenceModel:
     """Grow trees leaf by leaf as boosting does: the deepest decides what a walk takes."""
+    # A round is a tree for each group.
     trees, nodes = ROUNDS * len(GROUPS), 2 * LEAVES - 1
     yes, no = np.tile(np.arange(nodes), (2, trees, 1))
     for tree in range(trees):

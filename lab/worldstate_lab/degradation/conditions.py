@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from worldstate.adapters.audio.sound_file import Audio, RawPcm, open_sound
+from worldstate.adapters.camera.camera_channel import any_motion
 from worldstate.adapters.camera.camera_health import (
     LARGEST_PX,
     LEVELS,
@@ -35,7 +36,7 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionFram
 from worldstate.adapters.camera.detectors import Background, MotionDetector
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import Video, any_motion
+from worldstate.adapters.camera.video import Video
 from worldstate.adapters.source import Source
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import optional

@@ -28,6 +28,7 @@ from .motion import (
     AZIMUTH,
     AZIMUTH_RATE,
     LARGEST_STD,
+    LEAST_STD,
     LOG_RANGE,
     RADIAL_RATE,
     GaussianBelief,
@@ -41,9 +42,6 @@ _KNOWN_STD_M = 5.0
 _UNKNOWN_SPEED_STD = 10.0
 # Polar coordinates are singular at the array itself, and no road user comes nearer than this.
 _NEAREST_M = 1.0
-# rad: no sensor knows a bearing better. Its square is added to polar variances, too: a sharp position far
-# away would leave a covariance that is singular to rounding, and its checkpoint would be refused.
-_LEAST_STD = 1e-4
 _LARGEST_PLACE_STD = 1e4  # m and m/s: ten times the least sure position that is taken
 _IDENTITY = np.eye(4)
 
@@ -137,7 +135,7 @@ def update_bearing(belief: CartesianBelief, azimuth_rad: float, std_rad: float) 
     square = max(x * x + y * y, _NEAREST_M**2)
     residual = wrap_angle(azimuth_rad - math.atan2(y, x))
     slope = np.array([[-y / square, x / square, 0.0, 0.0]])
-    return _update(belief, np.array([residual]), slope, np.array([[max(std_rad, _LEAST_STD) ** 2]]))
+    return _update(belief, np.array([residual]), slope, np.array([[max(std_rad, LEAST_STD) ** 2]]))
 
 
 def polar_motion(
@@ -162,7 +160,8 @@ def polar_motion(
     slope[..., RADIAL_RATE, 1] = vy / square - 2.0 * sine * closing
     slope[..., RADIAL_RATE, 2] = slope[..., LOG_RANGE, 0] = cosine
     slope[..., RADIAL_RATE, 3] = slope[..., LOG_RANGE, 1] = sine
-    covariance = slope @ belief.covariance @ slope.mT + _LEAST_STD**2 * _IDENTITY
+    # A sharp position far away would leave a covariance that is singular to rounding.
+    covariance = slope @ belief.covariance @ slope.mT + LEAST_STD**2 * _IDENTITY
     # Axes that turn with the ego vehicle see everything turn the other way.
     seen_turning = turning - ego_yaw_rate_rad_s
     mean = np.stack([np.arctan2(y, x), seen_turning, closing, 0.5 * np.log(square)], axis=-1)

@@ -100,7 +100,7 @@ class GivenSensors:
 
     def boxes(self) -> "adapters.DetectionFilter":
         """Return which boxes count: all of a motion detector's, whose score is no confidence."""
-        from worldstate.adapters.camera.video import any_motion
+        from worldstate.adapters.camera.camera_channel import any_motion
 
         return any_motion() if self.arguments.detector in MOVING else self.setup.boxes
 

@@ -65,8 +65,8 @@ SETTINGS = {
     "published_chain": "per hop: scipy.signal.stft of the file, channel by channel, its cost shared among "
     "the hops; pyroomacoustics SRP, 30 azimuths, 50-1500 Hz (bins 1-15), on each half of one second; against "
     "stft + phat + feature",
-    "scikit_learn_trees": "the two rows of a hop through 60 rounds of 15 trees of 8 leaves, as a histogram "
-    "classifier; against sequence_reader, its inputs included",
+    "scikit_learn_trees": "the two rows of a hop through as many trees as training makes, as a "
+    "histogram classifier; against sequence_reader, its inputs included",
     "scikit_learn_classifier": "the published linear machines on one window, without probabilities; against "
     "window_evidence: five experts, each on the window and its mirror image, the site learned",
     "jpda_1": "Stone Soup's JPDA on one vehicle in view; against the whole filter on the same boxes",
