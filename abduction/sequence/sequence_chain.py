@@ -37,13 +37,13 @@ SEEN = STATES.index("seen")
 COMES = np.array([state.startswith("coming") for state in STATES])
 BEHIND = np.array([state.endswith("_behind") for state in STATES])
 IN_VIEW = BEHIND | (np.arange(len(STATES)) == SEEN)
-# States of a vehicle that follows one just come into view: gaps of up to eight seconds, alike.
-FOLLOWS = np.concatenate(
-    [np.zeros(_COMING), np.diff((0.0, *COMING_S)) / COMING_S[-1], np.zeros(len(STATES) - 2 * _COMING)]
-)
+# States of a vehicle that follows one just come into view: gaps of up to six seconds, alike.
+FOLLOWS_S = 6.0
+_GAPS = np.diff(np.minimum((0.0, *COMING_S), FOLLOWS_S)) / FOLLOWS_S
+FOLLOWS = np.concatenate([np.zeros(_COMING), _GAPS, np.zeros(len(STATES) - 2 * _COMING)])
 # Mean seconds in a state before another one follows: passages, and births of .004 a hop.
 _PASSED_S = 3.0
-_FOLLOWS_S = {
+_FOLLOWED_BY_S = {
     ("seen", "past"): _PASSED_S,
     ("other", "seen"): 3.0,
     ("past", "none"): 4.0,
@@ -131,7 +131,7 @@ def _rates_hz(prior: tuple[float, ...]) -> FloatArray:
     spans_s = np.diff((0.0, *COMING_S))
     arrows = {(k, k - 1 if k else SEEN): span for k, span in enumerate(spans_s)}
     arrows |= {(_COMING + k, _COMING + k - 1 if k else SEEN): span for k, span in enumerate(spans_s)}
-    arrows |= {(STATES.index(one), STATES.index(to)): mean_s for (one, to), mean_s in _FOLLOWS_S.items()}
+    arrows |= {(STATES.index(one), STATES.index(to)): mean_s for (one, to), mean_s in _FOLLOWED_BY_S.items()}
     for (one, to), mean_s in arrows.items():
         hop[one, [one, to]] += [-HOP_S / mean_s, HOP_S / mean_s]
     loose = (1.0 - _LEAK) * hop + _LEAK * share

@@ -240,7 +240,8 @@ class StreetListener:
         left, right = (min(one + 1, HEARD_HOPS) for one in before.since)
         recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now[None]])
         self.hearing = StreetHearing(before.known, recent, (left, right))
-        if self._sides is None:
+        # So long after a vehicle came into view its sound, from wherever it is now, is of no arm.
+        if self._sides is None or min(left, right) < HEARD_HOPS:
             return groups
         return np.asarray(self._sides.turned(groups[None], feature[None])[0])
 

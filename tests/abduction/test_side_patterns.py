@@ -139,6 +139,25 @@ def test_who_comes_into_view_teaches_the_side_and_a_checkpoint_goes_on_to_the_bi
     assert listener.hearing.known == again.hearing.known
 
 
+def test_for_three_seconds_after_a_vehicle_its_sound_is_turned_to_no_arm():
+    rng = np.random.default_rng(5)
+    sound = {
+        arm: PassSound(
+            sign * np.linspace(1.0, -1.0, SECTORS) + rng.normal(0.0, 0.3, (30, SECTORS)), np.ones(30), "roof"
+        )
+        for arm, sign in (("left", 1.0), ("right", -1.0))
+    }
+    known = SidePatterns("roof")
+    for arm, one in sound.items():
+        known = known.with_pass(arm, one)
+    listener, left = StreetListener(StreetHearing(known)), np.exp(np.linspace(1.0, -1.0, 60))
+    even = np.full((2, len(GROUPS)), 1.0 / len(GROUPS))
+    assert (listener.turned(even, left) != even).any()
+    listener.passed("right")
+    turned = [bool((listener.turned(even, left) != even).any()) for _ in range(31)]
+    assert turned == [hop >= 29 for hop in range(31)]
+
+
 def test_in_the_company_of_the_other_arm_nobody_knows_whose_sound_it_is():
     rng = np.random.default_rng(9)
     listener = StreetListener(StreetHearing(SidePatterns("roof")))

@@ -248,6 +248,19 @@ def test_what_was_learned_of_the_traffic_moves_the_risk_and_not_the_alarm(seed) 
     np.testing.assert_allclose(moved[1] - moved[0], nats, atol=1e-6)
 
 
+@given(SEEDS, st.floats(0.2, 8.0))
+@settings(max_examples=10)
+def test_for_five_seconds_after_a_vehicle_the_traffic_moves_no_reading(seed, since_s) -> None:
+    # The reading has heard the vehicle: it knows by itself that vehicles come here.
+    groups, since = drawn(seed), {"emerged_ns": (10**8 - round(since_s * 1e9), None), "stamp_ns": 10**8}
+    quiet, busy = (
+        informed(memory_of(groups, arrivals=one, **since), said(1, groups), (), Context())
+        for one in ((ArrivalRate(),) * 2, (ArrivalRate(20.0, 100.0),) * 2)
+    )
+    moved = np.log(busy.comes) - np.log1p(-busy.comes) - np.log(quiet.comes) + np.log1p(-quiet.comes)
+    np.testing.assert_allclose(moved, 0.0 if since_s <= 5.0 else 0.5, atol=1e-6)
+
+
 @given(SEEDS, st.integers(-(10**4), -10))
 @settings(max_examples=5)
 def test_an_alarm_does_not_depend_on_what_its_clock_counts_from(seed, start_s) -> None:

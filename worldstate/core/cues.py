@@ -162,7 +162,7 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
     if not sequence.has_news(memory.stamp_ns):
         return "nothing was measured for a second"
     log_odds = list(sequence.log_odds(model.context).values())
-    learned, threshold = sequence.learned_nats(model.context)[side], sequence.alarm.threshold_nats
+    learned, threshold = sequence.read_nats(model.context)[side], sequence.alarm.threshold_nats
     if log_odds[-1][side] < threshold <= log_odds[-1][side] + learned:
         return "only by the traffic learned here, which is left out of the alarm"
     if log_odds[-1][side] < log_odds[-1].max():
