@@ -52,15 +52,17 @@ class Track:
     """Existence, motion, class and history of one entity."""
 
     id: str  # UUID for life
-    side: Count  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
-    seen: bool  # Whether vision has it; before that its existence is read from the explanation belief
     existence: Probability
-    motion: MotionBelief = field(metadata=FLAT)  # Azimuth, rates, log range
-    labels: tuple[Label, ...]  # Class probabilities, sorted by label
-    moving: bool  # False for what vision holds for parked
-    sources: tuple[str, ...]  # Modalities that contributed, sorted
     created_ns: int  # Birth and last measurement that moved it
     updated_ns: int
+    side: Count = (
+        0  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
+    )
+    seen: bool = False  # Whether vision has it; before that its existence is read from the explanation belief
+    motion: MotionBelief = field(default=IN_VIEW, metadata=FLAT)  # Azimuth, rates, log range
+    labels: tuple[Label, ...] = ((UNKNOWN, 1.0),)  # Class probabilities, sorted by label
+    moving: bool = True  # False for what vision holds for parked
+    sources: tuple[str, ...] = ()  # Modalities that contributed, sorted
     last_seen_ns: int | None = None  # Last sighting
     answer: Answer = "unqueried"  # Last answer of the co-evidence channel about it
     miss_rate: Probability | None = None  # beta of that answer
@@ -111,7 +113,7 @@ class Tracks:
     miss_rate: FloatArray  # NaN where it was not asked
     approach_heard: BoolArray
     came_from: FloatArray
-    placed: BoolArray  # Whether it has a place; zeros stand where it has none
+    placed: BoolArray  # Whether it has a place; where it has none the next two mean nothing
     place_mean: FloatArray
     place_covariance: FloatArray
     behind: FloatArray
@@ -149,7 +151,7 @@ class Tracks:
         columns["place"] = [one if is_placed else None for one, is_placed in zip(places, placed, strict=True)]
         return tuple(starmap(Track, zip(*(columns[name] for name in Track.__slots__), strict=True)))
 
-    def taken(self, where: "IntArray | BoolArray | list[int]") -> "Tracks":
+    def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":
         """Return the columns of some of them."""
         return Tracks(*(column[where] for column in vars(self).values()))
 
@@ -224,18 +226,7 @@ def entity_id(stream: str, kind: str, number: int) -> str:
 
 def born(kind: str, number: int, existence: float, stamp_ns: int, site: SiteGeometry) -> Track:
     """Return the n-th entity of a kind, of which nothing else is known: what has found it follows."""
-    return Track(
-        id=entity_id(site.settings.stream, kind, number),
-        side=0,
-        seen=False,
-        existence=existence,
-        motion=IN_VIEW,
-        labels=((UNKNOWN, 1.0),),
-        moving=True,
-        sources=(),
-        created_ns=stamp_ns,
-        updated_ns=stamp_ns,
-    )
+    return Track(entity_id(site.settings.stream, kind, number), existence, stamp_ns, stamp_ns)
 
 
 def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
@@ -260,12 +251,13 @@ def after_sighting(existence: NumbersT, miss_rate: float, clutter_rate: float) -
 
 def predict_tracks(tracks: Tracks, sides: SideBelief, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
-    shares = hidden_shares(tracks, sides)
+    shares, polar = hidden_shares(tracks, sides), np.ones(len(tracks), bool)
     if tracks.placed.any():
         _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
-    # Those that have just lost their place, too.
-    if not tracks.placed.all():
-        _relax(tracks, np.flatnonzero(~tracks.placed), shares, step_s, site)
+        polar = ~tracks.placed  # Those that have just lost their place, too
+    if polar.any():
+        # All of them are read and written where they stand.
+        _relax(tracks, slice(None) if polar.all() else polar, shares, step_s, site)
 
 
 def turn(tracks: Tracks, faster_rad_s: float) -> None:
@@ -293,7 +285,9 @@ def acceleration_psd(moving: BoolArray) -> FloatArray:
     return np.where(moving, _ACCELERATION, _PARKED_ACCELERATION)
 
 
-def _relax(tracks: Tracks, rows: IntArray, hidden: FloatArray, step_s: float, site: SiteGeometry) -> None:
+def _relax(
+    tracks: Tracks, rows: BoolArray | slice, hidden: FloatArray, step_s: float, site: SiteGeometry
+) -> None:
     """Move tracks without a place by a step, drawn to what is expected of vehicles in view or hidden."""
     seen = tracks.seen[rows]
     before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
@@ -339,6 +333,8 @@ def relabelled(
 
 def hidden_shares(tracks: Tracks, sides: SideBelief) -> FloatArray:
     """Return P(hidden | exists) of every track, 0 once it was seen."""
+    if tracks.seen.all():
+        return np.zeros(len(tracks))
     shares = np.where(tracks.seen, 0.0, tracks.behind)
     for i in np.flatnonzero(~tracks.detected).tolist():
         shares[i] = sides.hidden_share(tracks.of_side(i))

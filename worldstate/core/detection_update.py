@@ -196,7 +196,7 @@ def _existence(tracks: Tracks, found: _Found, hits: FloatArray, scans: Sequence[
         counts[rows], before[rows] = True, np.maximum(before[rows], told)
     r = np.minimum(np.maximum(before, _ROUNDING), 1.0 - _ROUNDING)
     in_sight = np.where(seen, 1.0, 1.0 - tracks.behind)
-    odds = ratio = _odds(r)
+    odds = ratio = r / (1.0 - r)
     for hit, scan in zip(hits.T, scans, strict=True):
         detected = _searched(tracks, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
         missed = after_empty_look(r, 1.0 - detected)
@@ -275,9 +275,7 @@ def _motion_at(boxes: Detections, by: int, mean: FloatArray, covariance: FloatAr
     if moving:
         expected[2:] = mean[RADIAL_RATE:].tolist()
         std[2:] = np.sqrt(np.diag(covariance)[RADIAL_RATE : LOG_RANGE + 1]).tolist()
-    return MotionBelief.around(
-        (expected[0], expected[1], expected[2], expected[3]), (std[0], std[1], std[2], std[3])
-    )
+    return MotionBelief.around(expected, std)
 
 
 def _see(

@@ -145,9 +145,7 @@ class MotionBelief(GaussianBelief):
     """
 
     @classmethod
-    def around(
-        cls, mean: tuple[float, float, float, float], std: tuple[float, float, float, float]
-    ) -> "MotionBelief":
+    def around(cls, mean: Sequence[float], std: Sequence[float]) -> "MotionBelief":
         """Return independent components."""
         return cls(np.array(mean), np.diag(np.square(np.clip(std, LEAST_STD, LARGEST_STD))))
 
