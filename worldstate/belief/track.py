@@ -147,8 +147,7 @@ class Tracks:
         columns["last_seen_ns"] = [None if ns == NEVER_NS else ns for ns in last_ns]
         columns["miss_rate"] = [None if math.isnan(rate) else rate for rate in rates]
         columns["motion"] = self.motion.each()
-        places = map(CartesianBelief, self.place_mean, self.place_covariance)
-        columns["place"] = [one if is_placed else None for one, is_placed in zip(places, placed, strict=True)]
+        columns["place"] = [self.place(row) if is_placed else None for row, is_placed in enumerate(placed)]
         return tuple(starmap(Track, zip(*(columns[name] for name in Track.__slots__), strict=True)))
 
     def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":

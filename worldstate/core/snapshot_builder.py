@@ -34,7 +34,6 @@ from .sequence_memory import SequenceMemory
 # Beyond two seconds vehicles at junctions have turned or braked.
 _AFTER_S = np.array([1.0, 2.0])
 _CUBES = _AFTER_S**3 / 3.0
-_NAMES = tuple(f"{after_s:g}" for after_s in _AFTER_S)
 Forecast: TypeAlias = dict[str, tuple[float, float]]
 
 
@@ -61,7 +60,9 @@ def forecasts(tracks: Tracks) -> list[Forecast]:
     azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
     # Full precision would take twice as long to write.
     rows = np.stack([azimuth_rad, np.sqrt(variance)], axis=-1)
-    return [dict(zip(_NAMES, map(tuple, row), strict=True)) for row in rows.round(6).tolist()]
+    return [
+        {"1": (mean, std), "2": (then, then_std)} for (mean, std), (then, then_std) in rows.round(6).tolist()
+    ]
 
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
@@ -137,7 +138,7 @@ def _entity(
 def _classes(track: Track) -> tuple[Classification, ...]:
     """Return the class probabilities of a track; what no label has is unknown, so that they sum to one."""
     classes = [Classification(label, share) for label, share in track.labels if label != UNKNOWN]
-    rest = 1.0 - sum(one.probability for one in classes)
+    rest = 1.0 - sum([one.probability for one in classes])
     return (*classes, Classification(UNKNOWN, round(rest, _DIGITS))) if rest > _ROUNDING else tuple(classes)
 
 
@@ -195,8 +196,10 @@ def _azimuth_source(track: Track | None, motion: MotionBelief, site: SiteGeometr
 
 def _side_shares(track: Track, memory: Memory, site: SiteGeometry) -> tuple[SideShare, ...]:
     """Return the parts of the azimuth density of an entity that may be on several sides."""
+    if track.of_side is not None:
+        return ()
     shares = {k: share for k, share in enumerate(track.side_shares) if share > 0.0}
-    if track.of_side is not None or len(shares) < 2:
+    if len(shares) < 2:
         return ()
     at = {k: hidden_azimuth(k, track, memory.sequence, site)[:2] for k in shares}
     return tuple(SideShare(site.sides[k].label, round(share, _DIGITS), *at[k]) for k, share in shares.items())
