@@ -5,8 +5,9 @@ done in nats, and a prior of zero is a log of -inf.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import add
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -210,7 +211,7 @@ class Posterior:
     @property
     def hidden_total(self) -> float:
         """P(hidden), all directions together."""
-        return float(self.probabilities[:-2].sum())
+        return sum(map(math.exp, self.log_probabilities[:-2]))
 
     @property
     def visible(self) -> float:
@@ -266,16 +267,16 @@ def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvi
     return posterior_of(_checked_log_prior(log_prior, len(evidence.directions)), evidence, co_evidence)
 
 
-def posterior_of(prior: FloatArray, evidence: SignatureEvidence, co_evidence: CoEvidence) -> Posterior:
+def posterior_of(prior: Sequence[float], evidence: SignatureEvidence, co_evidence: CoEvidence) -> Posterior:
     """Return what `abduce` does for the log prior of a belief, shape (K + 2,), which is not checked."""
     log_likelihood = _log_likelihood(evidence, co_evidence)
-    joint = prior + log_likelihood
+    joint = tuple(map(add, prior, log_likelihood))
     log_evidence = _log_sum(joint)
-    if log_evidence == -np.inf:
+    if log_evidence == -math.inf:
         raise InvalidArgumentError("log_prior: expected mass on an explanation that the co-evidence allows")
     return Posterior(
         evidence.directions,
-        tuple((joint - log_evidence).tolist()),
+        tuple(one - log_evidence for one in joint),
         _log_ratio(prior, log_likelihood),
         log_evidence,
     )
@@ -376,35 +377,35 @@ def statistic(
         return abduce(np.log(prior), evidence, co_evidence).hidden_total
 
 
-def _checked_log_prior(log_prior: ArrayLike, directions: int) -> FloatArray:
+def _checked_log_prior(log_prior: ArrayLike, directions: int) -> list[float]:
     prior = np.asarray(log_prior, dtype=np.float64)
     check_shape("log_prior", prior.shape, (directions + 2,))
     if not np.isfinite(prior.max()):
         raise InvalidArgumentError(f"log_prior: expected logs with some mass, got {prior.tolist()}")
-    return prior
+    checked: list[float] = prior.tolist()
+    return checked
 
 
-def _log_likelihood(evidence: SignatureEvidence, co_evidence: CoEvidence) -> FloatArray:
-    hidden, visible, none = co_evidence.log_likelihoods()
-    log_likelihood = evidence.log_likelihoods
-    log_likelihood[:-2] += hidden
-    log_likelihood[-2:] += visible, none
-    return log_likelihood
+# Of a handful of explanations: arrays of so few numbers take ten times as long.
+def _log_likelihood(evidence: SignatureEvidence, co_evidence: CoEvidence) -> list[float]:
+    hidden, visible, none = co_evidence.log_likelihoods().tolist()
+    return [*(one + hidden for one in evidence.hidden), evidence.visible + visible, evidence.none + none]
 
 
-def _log_ratio(prior: FloatArray, log_likelihood: FloatArray) -> float:
+def _log_ratio(prior: Sequence[float], log_likelihood: Sequence[float]) -> float:
     hidden, others = prior[:-2], prior[-2:]
-    if np.isneginf(hidden).all():
-        hidden = np.zeros_like(hidden)
-    if np.isneginf(others).all():
-        return float("inf")
-    hidden_mean = _log_sum(hidden + log_likelihood[:-2]) - _log_sum(hidden)
-    return hidden_mean - (_log_sum(others + log_likelihood[-2:]) - _log_sum(others))
+    if max(hidden) == -math.inf:
+        hidden = [0.0] * len(hidden)
+    if max(others) == -math.inf:
+        return math.inf
+    hidden_mean = _log_sum(map(add, hidden, log_likelihood)) - _log_sum(hidden)
+    return hidden_mean - (_log_sum(map(add, others, log_likelihood[-2:])) - _log_sum(others))
 
 
-def _log_sum(values: FloatArray) -> float:
+def _log_sum(values: Iterable[float]) -> float:
     """log(sum(exp(values))) without overflow; a sum of nothing possible is -inf."""
-    largest = float(values.max())
-    if largest == -np.inf:
+    every = tuple(values)
+    largest = max(every)
+    if largest == -math.inf:
         return largest
-    return largest + float(np.log(np.exp(values - largest).sum()))
+    return largest + math.log(sum(math.exp(one - largest) for one in every))

@@ -14,7 +14,7 @@ from worldstate.adapters.acoustic import AcousticAdapter, asked_again, expected_
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
-from worldstate.belief.track import heard_as
+from worldstate.belief.track import Tracks, heard_as
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
@@ -97,9 +97,9 @@ def test_what_is_heard_is_what_the_camera_is_asked_for_and_the_entity_is(
     assert said[-1][name] > 0.8
     # Once seen, a detector's word stands.
     assert world.memory is not None
-    (track,) = world.memory.tracks
-    seen = replace(track, last_seen_ns=1, labels=(("car", 0.9),))
-    assert heard_as(seen, measured[-1].kinds) == (("car", 0.9),)
+    (track,) = world.memory.tracks.rows()
+    seen = Tracks.of([replace(track, last_seen_ns=1, labels=(("car", 0.9),))])
+    assert heard_as(seen, 0, measured[-1].kinds) == (("car", 0.9),)
 
 
 def test_a_foreign_sound_is_of_no_kind_and_a_siren_is_of_its_own() -> None:

@@ -15,6 +15,7 @@ from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.belief.track import Tracks
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Look, Position, PositionScan, SearchedSector, Sector
 from worldstate.state import Event, Priors
@@ -239,8 +240,8 @@ def test_the_forecast_is_that_of_straight_lines(seed: int) -> None:
     assert world.memory is not None
     mean = rng.uniform((-0.5, -0.3, -0.3, math.log(15.0)), (0.5, 0.3, 0.1, math.log(40.0)))
     motion = MotionBelief.around(tuple(mean), (0.03, 0.04, 0.04, 0.01))
-    track = replace(world.memory.tracks[0], motion=motion)
-    (entity,) = replace(world, memory=replace(world.memory, tracks=(track,))).state.entities
+    tracks = Tracks.of([replace(world.memory.tracks.rows()[0], motion=motion)])
+    (entity,) = replace(world, memory=replace(world.memory, tracks=tracks)).state.entities
     assert entity.forecast is not None and entity.azimuth_covariance == pytest.approx((9e-4, 0.0, 1.6e-3))
     theta, omega, rho, log_r = rng.multivariate_normal(motion.mean, motion.covariance, 20_000).T
     place, rate = np.exp(log_r + 1j * theta), rho + 1j * omega

@@ -166,7 +166,7 @@ def test_an_old_approach_rate_fades():
 def test_a_hidden_azimuth_says_that_it_may_be_biased():
     peak = Bearing(0.6, 0.06, 1.4)
     world, _ = run(start(), [measured(t, LEFT, bearing=peak) for t in hops(1.0, 6.0)])
-    spread = world.memory.tracks[0].motion.azimuth_std_rad
+    spread = world.memory.tracks.azimuth_std_rad[0]
     assert world.state.entities[0].azimuth_std_rad == pytest.approx(math.hypot(spread, HIDDEN_BIAS_STD))
     assert world.state.cues[0].azimuth_std_rad == pytest.approx(math.hypot(spread, HIDDEN_BIAS_STD))
 
@@ -579,13 +579,14 @@ def test_overlapping_bearings_are_not_counted_twice():
     """
     world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
     m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
-    (track,) = world.memory.tracks
+    (track,) = world.memory.tracks.rows()
     once, often = world.memory.draft(), world.memory.draft()
     acoustic_update(once, m, 1.0)
     for _ in range(10):
         acoustic_update(often, m, 0.1)
     for row, most in ((0, 0.35), (2, 0.2)):
-        one, ten, none = (t.motion.covariance[row, row] for t in (once.tracks[0], often.tracks[0], track))
+        one, ten = (memory.tracks.covariance[0, row, row] for memory in (once, often))
+        none = track.motion.covariance[row, row]
         assert ten == pytest.approx(one, rel=most)
         assert one < 0.9 * none
 

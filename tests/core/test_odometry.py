@@ -43,7 +43,7 @@ def test_what_stands_is_where_the_pose_says(twists: list[tuple[float, float]]) -
     for hop, (speed, rate) in enumerate(twists):
         world = world.update(odometry(0.1 * hop, speed, rate)).predict(0.1)
         pose = pose.compose(gtsam.Pose2.Expmap(np.array([speed * 0.1, 0.0, rate * 0.1])))
-    ego, place = world.state.ego, world.memory.tracks[0].place
+    ego, place = world.state.ego, world.memory.tracks.place(0)
     assert ego is not None and place is not None
     assert [*ego.position_m, ego.yaw_rad] == pytest.approx([pose.x(), pose.y(), pose.theta()], abs=1e-7)
     assert place.mean[:2] == pytest.approx(pose.transformTo(np.array([20.0, 5.0])), abs=1e-6)

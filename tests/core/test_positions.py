@@ -17,6 +17,7 @@ from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, update_bearing
+from worldstate.belief.track import Tracks
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 
@@ -275,9 +276,9 @@ def test_a_message_joins_the_vehicle_that_is_heard() -> None:
 
 def test_a_message_of_next_to_no_existence_is_weighed_against_a_certain_entity() -> None:
     world = after(*(heard(0.1 * hop, left=500.0) for hop in range(1, 12)))
-    (certain,) = world.memory.tracks
+    (certain,) = world.memory.tracks.rows()
     there = replace(certain, existence=1.0)
-    world = replace(world, memory=replace(world.memory, tracks=(there,)), lag=None)
+    world = replace(world, memory=replace(world.memory, tracks=Tracks.of([there])), lag=None)
     x, y = 20.0 * math.cos(there.motion.azimuth_rad), 20.0 * math.sin(there.motion.azimuth_rad)
     denied = Position((x, y), diagonal(0.5, 0.5), existence_probability=1e-300)
     for entity in world.update(radio(1.2, denied)).state.entities:

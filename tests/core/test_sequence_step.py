@@ -22,7 +22,12 @@ from worldstate.abduction.sequence.sequence_model import (
     smoothed_log_odds,
 )
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.track import Tracks, born
+from worldstate.core.memory import first_memory
 from worldstate.core.sequence_memory import ArrivalRate
+from worldstate.core.site_model import site_geometry_of
+from worldstate.core.step import _announced_in_view
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Bearing, Look
@@ -193,6 +198,28 @@ def test_the_alarm_is_held_for_a_second_whatever_the_hop() -> None:
         # The mean of .3 s falls below the threshold at once where one hop brings down three.
         assert {tuple(one) for one in named} == {("left",), ()} and 14 <= off <= 17
     assert not any(cue.advisory for cue in world.predict(1.2).state.cues)
+
+
+def test_what_came_into_view_decides_no_alarm_of_its_side_any_more() -> None:
+    groups = np.full((2, len(GROUPS)), 1e-3)
+    groups[:, GROUPS.index("coming_2s")] = 1.0
+    said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, SequenceAlarm(-2.0, 20.0))
+    sequence = run(WorldFilter(), [heard(hop, said) for hop in range(8)])[-1].memory.sequence
+    after = sequence.handed_over({0: 0.02}, (), sequence.stamp_ns)
+    assert min(sequence.decided) > -2.0 and after.decided[0] < -20.0
+    assert after.decided[1] == sequence.decided[1] and after.over_ns == (None, sequence.over_ns[1])
+
+
+def test_a_vehicle_announced_on_one_side_is_in_view_from_whichever_it_came() -> None:
+    context = Context()
+    hidden = born("left", 0, 0.9, 0, site_geometry_of(context, FilterSettings()))
+    before, after = first_memory(context, 0), first_memory(context, 0)
+    before.tracks = Tracks.of([hidden])
+    for other in (hidden, replace(hidden, id="another", seen=True)):
+        after.tracks = Tracks.of([other])
+        assert _announced_in_view(before, after) == []
+    after.tracks = Tracks.of([replace(hidden, seen=True, side=1)])
+    assert _announced_in_view(before, after) == [0]
 
 
 def test_a_look_says_who_is_in_view_for_half_a_second_however_often() -> None:

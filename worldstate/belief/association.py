@@ -7,14 +7,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from worldstate.abduction.road_users import SEEN_AS
-from worldstate.belief.kinematics.cartesian import CartesianBelief, full_measurement
-from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, MotionBelief
+from worldstate.abduction.road_users import SEEN_AS, ClassShares
+from worldstate.belief.kinematics.cartesian import full_measurement
+from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE
 from worldstate.ground import BoolArray, FloatArray, wrap_angle
 
-from .detection import Detection
+from .detection import Detections
 from .site_geometry import HIDDEN_BIAS_STD, SiteGeometry, normal_share
-from .track import Track, TrackArrays, side_weights
+from .track import Track, Tracks, side_weights
 
 # Of a pair outside the gate; below any sum of scores within it.
 FORBIDDEN = -1e6
@@ -69,9 +69,7 @@ class Association:
         return chances
 
 
-def associated(
-    tracks: Sequence[Track], arrays: TrackArrays, detections: Sequence[Detection], site: SiteGeometry
-) -> Association:
+def associated(tracks: Tracks, detections: Detections, site: SiteGeometry) -> Association:
     r"""Return whose the detections of an instant are, all boxes or all positions.
 
     Every one is of an entity that was detected before, of a hidden one that comes past an edge, or of an
@@ -85,9 +83,10 @@ def associated(
     not known. Entities in view and hidden ones compete: an entity that has left the view would else take
     the first detection of the next one.
     """
-    if not tracks or not detections:
-        return joint_association(np.empty((len(detections), len(tracks))), arrays.detected)
-    return joint_association(_log_ratios(tracks, arrays, detections, site), arrays.detected)
+    detected = tracks.detected
+    if not len(tracks) or not len(detections):
+        return joint_association(np.empty((len(detections), len(tracks))), detected)
+    return joint_association(_log_ratios(tracks, detected, detections, site), detected)
 
 
 def joint_association(log_ratios: FloatArray, detected: BoolArray) -> Association:
@@ -123,7 +122,7 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
     alone = gated & (gated.sum(axis=0) == 1) & (gated.sum(axis=1) == 1)[:, None]
     chances[alone] = np.exp(-np.logaddexp(0.0, -log_ratios[alone]))
     crowd = gated & ~alone
-    for rows, columns in _groups(crowd):
+    for rows, columns in _groups(crowd) if crowd.any() else ():
         events = _joint_events(len(rows), len(columns))
         if events is not None:
             pairs = np.array(rows)[:, None], columns
@@ -207,86 +206,77 @@ def _likeliest(scores: FloatArray) -> dict[int, int]:
 
 
 def _log_ratios(
-    tracks: Sequence[Track], arrays: TrackArrays, detections: Sequence[Detection], site: SiteGeometry
+    tracks: Tracks, detected: BoolArray, detections: Detections, site: SiteGeometry
 ) -> FloatArray:
     """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
-    in_sight, boxes = detections[0].found is not None, detections[0].position is None
-    found = np.array([[one.found or 0.0] for one in detections])
-    existence = np.minimum(np.maximum(arrays.existence, LEAST_EXISTENCE), MOST_EXISTENCE)
+    boxes, found = not detections.positions, detections.found[:, None]
+    existence = np.minimum(np.maximum(tracks.existence, LEAST_EXISTENCE), MOST_EXISTENCE)
     if boxes:
         # What may have left the view is found as far as it may not, wherever the edge truly is.
-        found = found * np.maximum(1.0 - leaving(arrays, site), _UNFORESEEN)
+        found = found * np.maximum(1.0 - leaving(tracks, site), _UNFORESEEN)
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
-    density = _azimuth_density(arrays, detections)
-    heard = np.flatnonzero(~arrays.detected) if in_sight else np.array([], int)
-    if len(heard):
+    density = _azimuth_density(tracks, detected, detections)
+    if detections.in_sight and not detected.all():
         # What was only heard is found where it comes into view.
-        hidden = [tracks[i] for i in heard]
+        heard = np.flatnonzero(~detected)
+        hidden = tracks.taken(heard).rows()
         density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), _LEAST))
         reached = np.array([reached_edge(one, site) for one in hidden])
         likely[:, heard] = np.log(existence[heard] * reached)
     if boxes:
-        density += _alike(tracks, arrays, detections)
+        density += _alike(tracks, detected, detections)
     else:
-        density = _density_m2(tracks, arrays.motion, detections, density)
-    log_new = np.array([[one.log_new] for one in detections])
-    return np.where(density > 0.5 * FORBIDDEN, density + likely - log_new, FORBIDDEN)
+        density = _density_m2(tracks, detections, density)
+    return np.where(density > 0.5 * FORBIDDEN, density + likely - detections.log_new[:, None], FORBIDDEN)
 
 
-def _azimuth_density(arrays: TrackArrays, detections: Sequence[Detection]) -> FloatArray:
+def _azimuth_density(tracks: Tracks, detected: BoolArray, detections: Detections) -> FloatArray:
     """Return the log density of every detection's azimuth, 1/rad, FORBIDDEN outside the gate of a box."""
-    azimuth_rad, std_rad = np.array([(one.azimuth_rad, one.std_rad) for one in detections]).T[:, :, None]
-    residual = wrap_angle(azimuth_rad - arrays.motion.mean[:, AZIMUTH])
+    residual = wrap_angle(detections.azimuth_rad[:, None] - tracks.mean[:, AZIMUTH])
     # The sound of a hidden one may come from the edge instead.
-    bias = ~arrays.detected * HIDDEN_BIAS_STD**2
-    variance = arrays.motion.covariance[:, AZIMUTH, AZIMUTH] + std_rad**2 + bias
+    own = tracks.covariance[:, AZIMUTH, AZIMUTH] + ~detected * HIDDEN_BIAS_STD**2
+    variance = own + detections.std_rad[:, None] ** 2
     squares = residual**2 / variance
     density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
-    boxes = detections[0].position is None
-    most, farthest_rad = (_GATE_SIGMA**2, GATE_RAD) if boxes else (_GATE, math.pi)
+    most, farthest_rad = (_GATE, math.pi) if detections.positions else (_GATE_SIGMA**2, GATE_RAD)
     return np.where((squares > most) | (np.abs(residual) > farthest_rad), FORBIDDEN, density)
 
 
-def _alike(tracks: Sequence[Track], arrays: TrackArrays, detections: Sequence[Detection]) -> FloatArray:
+def _alike(tracks: Tracks, detected: BoolArray, detections: Detections) -> FloatArray:
     """Return what motion and class say of every pair of a box and a track, nats."""
-    moving = np.array([[bool(one.moving)] for one in detections])
-    alike = np.where(moving == arrays.moving, 0.0, _PARKED_MISMATCH)
-    for i in np.flatnonzero(~arrays.detected).tolist():
-        classes = [math.log(_shared_class(tracks[i], one.classes[0][0])) for one in detections]
+    moving = detections.moving[:, None] > 0.0
+    alike = np.where(moving == tracks.moving, 0.0, _PARKED_MISMATCH)
+    for i in np.flatnonzero(~detected).tolist():
+        labels = tracks.labels[i]
+        classes = [math.log(_shared_class(labels, shares[0][0])) for shares in detections.classes]
         alike[:, i] = np.where(moving[:, 0], classes, FORBIDDEN)
     return alike
 
 
-def _density_m2(
-    tracks: Sequence[Track], motion: MotionBelief, detections: Sequence[Detection], azimuth: FloatArray
-) -> FloatArray:
+def _density_m2(tracks: Tracks, detections: Detections, azimuth: FloatArray) -> FloatArray:
     """Return the log density of every position, 1/m^2, FORBIDDEN outside the gate.
 
     The velocity enters by how much likelier it is than that of another, so that an entity without a place is
     scored in the same units, by its azimuth and log range.
     """
-    measured = [full_measurement(one.position, _ANY_SPEED_STD) for one in detections if one.position]
+    measured = [full_measurement(one, _ANY_SPEED_STD) for one in detections.positions]
     z, noise = np.array([one[0] for one in measured]), np.array([one[1] for one in measured])
     range_m = np.maximum(np.hypot(z[:, 0], z[:, 1]), 1.0)
     along = z[:, :2] / range_m[:, None]
-    farther = np.log(range_m)[:, None] - motion.mean[:, LOG_RANGE]
+    farther = np.log(range_m)[:, None] - tracks.mean[:, LOG_RANGE]
     nearness = np.einsum("ij,ijk,ik->i", along, noise[:, :2, :2], along) / range_m**2
-    variance = motion.covariance[:, LOG_RANGE, LOG_RANGE] + nearness[:, None]
+    variance = tracks.covariance[:, LOG_RANGE, LOG_RANGE] + nearness[:, None]
     squares = farther**2 / variance
     # From 1 / (rad log m) to 1 / m^2.
     log_range = -0.5 * (squares + np.log(2.0 * math.pi * variance)) - 2.0 * np.log(range_m)[:, None]
     density = np.where(squares > _GATE, FORBIDDEN, azimuth + log_range)
-    placed = [i for i, track in enumerate(tracks) if track.place is not None]
-    if placed:
-        density[:, placed] = _cartesian([tracks[i] for i in placed], z, noise)
+    placed = tracks.placed
+    if placed.any():
+        mean, covariance = tracks.place_mean[placed], tracks.place_covariance[placed]
+        distance, log_density = _log_normal(z[:, None] - mean, noise[:, None] + covariance)
+        _, usual = _log_normal(z[:, 2:], noise[:, 2:, 2:] + _SPEED_STD**2 * np.eye(2))
+        density[:, placed] = np.where(distance > _GATE, FORBIDDEN, log_density - usual[:, None])
     return density
-
-
-def _cartesian(tracks: Sequence[Track], z: FloatArray, noise: FloatArray) -> FloatArray:
-    places = CartesianBelief.stacked([track.place for track in tracks if track.place is not None])
-    distance, density = _log_normal(z[:, None] - places.mean, noise[:, None] + places.covariance)
-    _, usual = _log_normal(z[:, 2:], noise[:, 2:, 2:] + _SPEED_STD**2 * np.eye(2))
-    return np.where(distance > _GATE, FORBIDDEN, density - usual[:, None])
 
 
 def _log_normal(residual: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -295,20 +285,19 @@ def _log_normal(residual: FloatArray, spread: FloatArray) -> tuple[FloatArray, F
     return distance, -0.5 * (distance + np.linalg.slogdet(2.0 * math.pi * spread)[1])
 
 
-def _shared_class(track: Track, label: str) -> float:
-    """Return P(a detector calls what a track sounds like by this label)."""
+def _shared_class(labels: ClassShares, label: str) -> float:
+    """Return P(a detector calls what sounds like some classes by this label)."""
     if label not in _VEHICLES:
         return _MISREAD if label in _ON_FOOT else 1.0
-    kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in track.labels)
+    kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in labels)
     return max(sum(share for matches, share in kinds if matches), _MISREAD)
 
 
-def leaving(arrays: TrackArrays, site: SiteGeometry) -> FloatArray:
+def leaving(tracks: Tracks, site: SiteGeometry) -> FloatArray:
     """Return P(the leading end of an entity in view has passed the edge ahead of it), shape (tracks,)."""
-    motion = arrays.motion
-    way = np.sign(motion.mean[:, AZIMUTH_RATE]) * (arrays.seen & arrays.moving)  # Of a first sighting none
-    end_rad = motion.mean[:, AZIMUTH] + 0.5 * way * arrays.width_rad
-    return site.past_edge(end_rad, np.sqrt(motion.covariance[:, AZIMUTH, AZIMUTH]), way)
+    way = np.sign(tracks.mean[:, AZIMUTH_RATE]) * (tracks.seen & tracks.moving)  # Of a first sighting none
+    end_rad = tracks.mean[:, AZIMUTH] + 0.5 * way * tracks.width_rad
+    return site.past_edge(end_rad, tracks.azimuth_std_rad, way)
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:
@@ -327,14 +316,11 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
     return min(max(by_time / near(side.azimuth_rad, side.std_rad), _UNFORESEEN), 1.0)
 
 
-def emergence_density(
-    tracks: Sequence[Track], detections: Sequence[Detection], site: SiteGeometry
-) -> FloatArray:
+def emergence_density(tracks: Sequence[Track], detections: Detections, site: SiteGeometry) -> FloatArray:
     """Return the density of first sightings of hidden entities, 1/rad, shape (sightings, tracks)."""
-    from_edge_rad = [
-        [side.distance_rad(one.azimuth_rad, one.width_rad or 0.0) for side in site.sides]
-        for one in detections
-    ]
+    widths_rad = np.nan_to_num(detections.width_rad).tolist()
+    ends = list(zip(detections.azimuth_rad.tolist(), widths_rad, strict=True))
+    from_edge_rad = [[side.distance_rad(*end) for side in site.sides] for end in ends]
     deviations = np.array(from_edge_rad) / EDGE_STD_RAD
     # Of first sightings about the edge that they come past, 1/rad.
     near = np.exp(-0.5 * deviations**2) / (EDGE_STD_RAD * math.sqrt(2.0 * math.pi))

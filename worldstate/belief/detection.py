@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from operator import attrgetter
+from dataclasses import dataclass, fields
+from operator import attrgetter, methodcaller
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
 from worldstate.belief.kinematics.motion import LEAST_STD
 from worldstate.ground import FloatArray, wrap_angle
-from worldstate.ground.serialisation import Probability
-from worldstate.measurement import CameraLook, Sector, Sighting
+from worldstate.measurement import CameraLook, Sector
 from worldstate.measurement.position import Position, PositionScan
 
 from .site_geometry import CLUTTER_RATE
@@ -33,22 +32,38 @@ _SAME_SIGMA = 3.0
 # All that tells two boxes apart: one that moves and one parked at the same place are two.
 BY_ALL = attrgetter("azimuth_rad", "label", "score", "std_rad", "width_rad", "moving")
 _BY_PLACE = attrgetter("position_m", "covariance", "velocity_mps", "existence_probability", "classes")
-_BY_AZIMUTH = attrgetter("azimuth_rad", "std_rad", "classes", "width_rad", "moving")
+_MEASURED = attrgetter("azimuth_rad", "std_rad", "width_rad", "moving")
 
 
-@dataclass(frozen=True, slots=True)
-class Detection:
-    """What is measured of one object at one instant, by one look or by several."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """What is measured of objects at one instant, by one look or by several; shape (n,) each."""
 
-    azimuth_rad: float
-    std_rad: float
-    moving: bool | None  # None where nothing tells
-    classes: ClassShares
-    existence: Probability  # Of an object of which nothing else is known
-    log_new: float  # Density of objects that were not known before, nats: 1/rad of boxes, 1/m^2 of positions
-    found: Probability | None  # P(detected | in view); None of messages, which need no line of sight
-    width_rad: float | None = None  # None where it is not measured
-    position: Position | None = None
+    azimuth_rad: FloatArray
+    std_rad: FloatArray
+    width_rad: FloatArray  # NaN where it is not measured
+    moving: FloatArray  # 1 or 0, NaN where nothing tells
+    existence: FloatArray  # Of objects of which nothing else is known
+    log_new: FloatArray  # Density of objects not known before, nats: 1/rad of boxes, 1/m^2 of positions
+    found: FloatArray  # P(detected | in view), 0 of messages, which need no line of sight
+    classes: tuple[ClassShares, ...]
+    positions: tuple[Position, ...] = ()  # None of boxes
+    in_sight: bool = True  # Whether what is found must be in line of sight: not of messages
+
+    @classmethod
+    def of(
+        cls,
+        rows: Sequence[tuple[float, ...]],
+        classes: tuple[ClassShares, ...],
+        positions: tuple[Position, ...] = (),
+        in_sight: bool = True,
+    ) -> "Detections":
+        """Return detections by their numbers, a row each, and what else is told of them."""
+        azimuth, std, width, moving, existence, log_new, found = np.array(rows, float).reshape(-1, 7).T
+        return cls(azimuth, std, width, moving, existence, log_new, found, classes, positions, in_sight)
+
+    def __len__(self) -> int:
+        return len(self.classes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +71,7 @@ class Scan:
     """One look of one sensor: where it has searched and how well, and all that it has found."""
 
     source: str
-    detections: tuple[Detection, ...]  # Ordered by what they are: the sensor's order carries no meaning
+    detections: Detections  # Ordered by what they are: the sensor's order carries no meaning
     sector: Sector | None  # None of messages, which search nothing
     miss_rate: float | None  # None where it was not asked
     clutter_rate: float
@@ -64,9 +79,16 @@ class Scan:
     range_m: float = math.inf
     names_sector: bool = False  # Whether it is one of several cameras, each with a view of its own
 
-    def searches(self, azimuth_rad: float) -> bool:
-        """Tell whether the look says anything of what is there."""
-        return self.sector is not None and self.miss_rate is not None and self.sector.touches(azimuth_rad)
+
+def miss_rates(scans: Sequence[Scan], azimuth_rad: FloatArray) -> FloatArray:
+    """Return P(all looks miss what is in view there), NaN where none has searched."""
+    rates = np.full(len(azimuth_rad), math.nan)
+    for one in scans:
+        if one.sector is not None and one.miss_rate is not None:
+            from_centre_rad = np.abs(wrap_angle(azimuth_rad - one.sector.centre_rad))
+            searched = from_centre_rad <= one.sector.half_width_rad
+            rates[searched] = np.where(np.isnan(rates), 1.0, rates)[searched] * one.miss_rate
+    return rates
 
 
 def camera_scan(seen: CameraLook, view: Sector, weight: float) -> Scan:
@@ -76,48 +98,40 @@ def camera_scan(seen: CameraLook, view: Sector, weight: float) -> Scan:
         miss_rate, clutter_rate = min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or CLUTTER_RATE
     # Boxes that come without an answer were found without a stated miss rate.
     found, log_new = 1.0 - (miss_rate or 0.0), math.log(UNHEARD / (2.0 * view.half_width_rad))
-    boxes = (_of_box(one, log_new, found) for one in sorted(seen.sightings, key=BY_ALL))
+    boxes = sorted(seen.sightings, key=BY_ALL)
+    rows = [(*_MEASURED(one), _FIRST_EXISTENCE, log_new, found) for one in boxes]
+    detections = Detections.of(rows, tuple(((one.label, one.score),) for one in boxes))
+    np.maximum(detections.std_rad, LEAST_STD, out=detections.std_rad)
     named = seen.look.sector_rad is not None
-    return Scan("vision", tuple(boxes), view, miss_rate, clutter_rate, weight, names_sector=named)
-
-
-def _of_box(box: Sighting, log_new: float, found: float) -> Detection:
-    classes = ((box.label, box.score),)
-    measured = box.azimuth_rad, max(box.std_rad, LEAST_STD), box.moving, classes
-    return Detection(*measured, _FIRST_EXISTENCE, log_new, found, box.width_rad)
+    return Scan("vision", detections, view, miss_rate, clutter_rate, weight, names_sector=named)
 
 
 def position_scan(scan: PositionScan, weight: float) -> Scan:
     """Return the scan of a radar or a lidar, or what messages tell."""
-    searched, places = scan.searched, sorted(scan.positions, key=_BY_PLACE)
+    searched, places = scan.searched, tuple(sorted(scan.positions, key=_BY_PLACE))
     if searched is None:
-        log_new = math.log(UNHEARD / _RADIO_AREA_M2)
-        told = tuple(_of_position(one, log_new, None) for one in places)
+        told = _of_positions(places, math.log(UNHEARD / _RADIO_AREA_M2), None)
         return Scan(scan.source, told, None, None, CLUTTER_RATE, weight)
     sector, found = searched.sector, searched.detection_probability
     log_new = math.log(UNHEARD / max(sector.half_width_rad * searched.range_m**2, 1.0))
-    seen = tuple(_of_position(one, log_new, found) for one in places)
     rates = 1.0 - found, searched.clutter_rate
-    return Scan(scan.source, seen, sector, *rates, weight, searched.range_m)
+    return Scan(scan.source, _of_positions(places, log_new, found), sector, *rates, weight, searched.range_m)
 
 
-def _of_position(position: Position, log_new: float, found: float | None) -> Detection:
-    (x, y), covariance = position.position_m, np.array(position.covariance)[:2, :2]
-    range_m = max(math.hypot(x, y), 1.0)
-    across = np.array([-y, x]) / range_m
-    return Detection(
-        math.atan2(y, x),
-        math.sqrt(across @ covariance @ across) / range_m,
-        None if position.velocity_mps is None else math.hypot(*position.velocity_mps) > _PARKED_MPS,
-        position.classes,
-        position.existence_probability,
-        log_new,
-        found,
-        position=position,
-    )
+def _of_positions(places: tuple[Position, ...], log_new: float, found: float | None) -> Detections:
+    rows = []
+    for one in places:
+        (x, y), covariance, velocity = one.position_m, np.array(one.covariance)[:2, :2], one.velocity_mps
+        range_m = max(math.hypot(x, y), 1.0)
+        across = np.array([-y, x]) / range_m
+        std_rad = math.sqrt(across @ covariance @ across) / range_m
+        moving = math.nan if velocity is None else float(math.hypot(*velocity) > _PARKED_MPS)
+        measured = math.atan2(y, x), std_rad, math.nan, moving
+        rows.append((*measured, one.existence_probability, log_new, found or 0.0))
+    return Detections.of(rows, tuple(one.classes for one in places), places, found is not None)
 
 
-def fused(scans: Sequence[Scan]) -> tuple[list[Detection], FloatArray]:
+def fused(scans: Sequence[Scan]) -> tuple[Detections, FloatArray]:
     r"""Return the detections of an instant, and 1 for the looks that each is by, shape (detections, looks).
 
     Boxes of several cameras that are of one object are one detection, whatever the cameras are called:
@@ -125,27 +139,42 @@ def fused(scans: Sequence[Scan]) -> tuple[list[Detection], FloatArray]:
     .. math:: \sigma^{-2} = \sum_s \sigma_s^{-2}, \qquad z = \sigma^2 \sum_s \sigma_s^{-2} z_s
     """
     if len(scans) == 1:
-        return list(scans[0].detections), np.ones((len(scans[0].detections), 1))
-    every = [(one, number) for number, scan in enumerate(scans) for one in scan.detections]
-    every.sort(key=lambda pair: _BY_AZIMUTH(pair[0]))
-    groups = [[pair] for pair in every]
-    for a, b in _near_pairs([one for one, _ in every]):
+        return scans[0].detections, np.ones((len(scans[0].detections), 1))
+    boxes, looks = _in_order([one.detections for one in scans])
+    groups = [[number] for number in range(len(boxes))]
+    for a, b in _near_pairs(boxes):
         one, other = groups[a], groups[b]
-        if {number for _, number in one}.isdisjoint(number for _, number in other):
+        if {looks[i] for i in one}.isdisjoint(looks[i] for i in other):
             one += other
             groups = [one if group is other else group for group in groups]
     parts = list({id(group): group for group in groups}.values())
     by_look = np.zeros((len(parts), len(scans)))
     for i, group in enumerate(parts):
-        by_look[i, [number for _, number in group]] = 1.0
-    return [_joined([one for one, _ in group]) for group in parts], by_look
+        by_look[i, [looks[number] for number in group]] = 1.0
+    return _joined(boxes, parts), by_look
 
 
-def _near_pairs(detections: Sequence[Detection]) -> list[tuple[int, int]]:
+def _in_order(every: Sequence[Detections]) -> tuple[Detections, list[int]]:
+    """Return all boxes of several looks in the order of what they are, and which look each is of."""
+    boxes = [
+        (azimuth_rad, std_rad, classes, number, rest)
+        for number, one in enumerate(every)
+        for azimuth_rad, std_rad, *rest, classes in zip(
+            *map(_values, _COLUMNS(one)), one.classes, strict=True
+        )
+    ]
+    boxes.sort(key=lambda box: (*box[:3], *box[4]))
+    rows = [(azimuth_rad, std_rad, *rest) for azimuth_rad, std_rad, _, _, rest in boxes]
+    return Detections.of(rows, tuple(box[2] for box in boxes)), [box[3] for box in boxes]
+
+
+_values = methodcaller("tolist")
+_COLUMNS = attrgetter(*[one.name for one in fields(Detections)][:7])
+
+
+def _near_pairs(boxes: Detections) -> list[tuple[int, int]]:
     """Return the pairs that may be of one object, the nearest first."""
-    azimuth = np.array([one.azimuth_rad for one in detections])
-    variance = np.square([one.std_rad for one in detections])
-    moving = np.array([one.moving for one in detections], bool)
+    azimuth, variance, moving = boxes.azimuth_rad, np.square(boxes.std_rad), boxes.moving
     squares = wrap_angle(azimuth[:, None] - azimuth) ** 2 / (variance[:, None] + variance)
     near = np.triu((squares <= _SAME_SIGMA**2) & (moving[:, None] == moving), 1)
     a, b = np.nonzero(near)
@@ -153,18 +182,17 @@ def _near_pairs(detections: Sequence[Detection]) -> list[tuple[int, int]]:
     return list(zip(a[order].tolist(), b[order].tolist(), strict=True))
 
 
-def _joined(same: Sequence[Detection]) -> Detection:
-    if len(same) == 1:
-        return same[0]
-    best = max(same, key=lambda one: one.classes[0][1])
-    weights = 1.0 / np.square([one.std_rad for one in same])
-    offsets = wrap_angle(np.array([one.azimuth_rad for one in same]) - best.azimuth_rad)
-    azimuth_rad = wrap_angle(best.azimuth_rad + float(weights @ offsets / weights.sum()))
-    return replace(
-        best,
-        azimuth_rad=azimuth_rad,
-        std_rad=1.0 / math.sqrt(weights.sum()),
-        log_new=max(one.log_new for one in same),
-        found=1.0 - math.prod(1.0 - (one.found or 0.0) for one in same),
-        width_rad=max(one.width_rad or 0.0 for one in same),
-    )
+def _joined(boxes: Detections, groups: Sequence[list[int]]) -> Detections:
+    """Return one detection of every group of boxes."""
+    best = [max(group, key=lambda i: boxes.classes[i][0][1]) for group in groups]
+    azimuth, std, width, moving, existence, log_new, found = (one[best] for one in _COLUMNS(boxes))
+    for at, group in enumerate(groups):
+        if len(group) > 1:
+            weights = 1.0 / np.square(boxes.std_rad[group])
+            middle_rad = float(boxes.azimuth_rad[best[at]])
+            offsets = wrap_angle(boxes.azimuth_rad[group] - middle_rad)
+            azimuth[at] = wrap_angle(middle_rad + float(weights @ offsets / weights.sum()))
+            std[at], width[at] = 1.0 / math.sqrt(weights.sum()), boxes.width_rad[group].max()
+            log_new[at], found[at] = boxes.log_new[group].max(), 1.0 - (1.0 - boxes.found[group]).prod()
+    classes = tuple(boxes.classes[i] for i in best)
+    return Detections(azimuth, std, width, moving, existence, log_new, found, classes)

@@ -17,7 +17,6 @@ ego vehicle, an entity at p comes into view after
 """
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, MotionBel
 from worldstate.ground import FloatArray, wrap_angle
 
 from .site_geometry import SideGeometry, SiteGeometry
-from .track import Track
+from .track import Tracks
 
 # What is not known of v / d: within a factor of 1.2 (three points of a lognormal distribution with the
 # weights of Gauss and Hermite).
@@ -133,18 +132,20 @@ def time_to_visible(
     return time_s, math.sqrt(variance) / abs(rate)
 
 
-def announced(tracks: Iterable[Track], site: SiteGeometry) -> tuple[float, ...]:
+def announced(tracks: Tracks, site: SiteGeometry) -> tuple[float, ...]:
     """Return for each side the probability that a hidden entity with a place comes into view, shape (K,)."""
     chances = [0.0] * len(site.sides)
-    for track in tracks:
-        if not track.seen and track.place is not None and _comes(track, track.place, site):
-            chances[track.side] = max(chances[track.side], track.existence * track.behind)
+    for i in np.flatnonzero(tracks.placed & ~tracks.seen).tolist():
+        if _comes(tracks, i, site):
+            side, chance = int(tracks.side[i]), float(tracks.existence[i] * tracks.behind[i])
+            chances[side] = max(chances[side], chance)
     return tuple(chances)
 
 
-def _comes(track: Track, place: CartesianBelief, site: SiteGeometry) -> bool:
+def _comes(tracks: Tracks, row: int, site: SiteGeometry) -> bool:
     """Tell whether an entity may come into view within the times that a sequence model speaks of."""
+    place = CartesianBelief(tracks.place_mean[row], tracks.place_covariance[row])
     if place.velocity_std_mps > _UNKNOWN_SPEED_STD:
         return True
-    expected = time_to_visible(place, site.sides[track.side], site.ego_speed_mps)
-    return track.moving and expected is not None and expected[0] <= COMING_S[-1]
+    expected = time_to_visible(place, site.sides[tracks.side[row]], site.ego_speed_mps)
+    return bool(tracks.moving[row]) and expected is not None and expected[0] <= COMING_S[-1]

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from .settings import FilterSettings
 # Of hidden vehicles, (theta_dot rad/s, rho 1/s, log r): they close at 5 m/s from 25 m, give or take as much
 # again, the range within a factor of 1.8.
 _HIDDEN_MEAN, _HIDDEN_STD = (0.0, -0.2, math.log(25.0)), (0.15, 0.25, 0.6)
+# Prior of a vehicle in view, of which only the azimuth is measured: neither closing nor receding, within .5
+# 1/s, at exp(3.2) = 25 m within a factor of 1.8.
+IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
 # Of the azimuth that a hidden vehicle is heard at, which averaging does not remove: 10 degrees, half the
 # spread of hidden vehicles behind a default corner.
 HIDDEN_BIAS_STD = 0.17
@@ -72,7 +75,8 @@ def _hidden_motion(azimuth_rad: float, std_rad: float) -> MotionBelief:
     return MotionBelief.around((azimuth_rad, *_HIDDEN_MEAN), (std_rad, *_HIDDEN_STD))
 
 
-@dataclass(frozen=True, slots=True)
+# No slots: what follows from the sides is computed once, and read in every step.
+@dataclass(frozen=True)
 class SiteGeometry:
     """All sides, the field of view and the settings, constant from step to step."""
 
@@ -92,10 +96,19 @@ class SiteGeometry:
         side = max(range(len(chances)), key=chances.__getitem__)
         return side if chances[side] >= 0.5 else None
 
+    @cached_property
+    def _edges(self) -> FloatArray:
+        edges = np.array([(one.edge_azimuth_rad, one.edge_std_rad) for one in self.sides])
+        return edges.T[:, :, None]
+
+    @cached_property
+    def expected(self) -> MotionBelief:
+        """What is expected of vehicles that are hidden on each side, and last of those in view."""
+        return MotionBelief.stacked([*(side.prior() for side in self.sides), IN_VIEW])
+
     def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
         """Return the chances that azimuths lie past the edge on their way: 1 to the left, -1, 0 of none."""
-        edges = np.array([(one.edge_azimuth_rad, one.edge_std_rad) for one in self.sides])
-        edge_rad, edge_std = edges.T[:, :, None]
+        edge_rad, edge_std = self._edges
         past = way * (azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
         farthest = np.where(way * edge_rad > 0.0, past, -np.inf).max(axis=0)
         return np.array([normal_share(one) for one in farthest.tolist()])

@@ -1,23 +1,26 @@
-"""The belief of one entity."""
+"""The belief of the entities: each by itself, and all of them in columns, as a step reads and writes them."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from typing import Annotated, TypeAlias, TypeVar
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import starmap
+from operator import attrgetter
+from typing import Annotated, Any, TypeAlias, TypeVar, get_type_hints
 from uuid import UUID, uuid5
 
 import numpy as np
+from numpy.typing import NDArray
 
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, predict_place
-from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief, predict, relax
+from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, MotionBelief, predict, relax
 from worldstate.ground import BoolArray, FloatArray
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
+from worldstate.ground.typing import IntArray
 from worldstate.ground.values import Answer
 
 from .side_belief import SideBelief
-from .site_geometry import SideGeometry, SiteGeometry
+from .site_geometry import IN_VIEW, SiteGeometry
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
@@ -32,33 +35,34 @@ _ACCELERATION, _PARKED_ACCELERATION = 2.0, 1e-4
 # To the prior, of components that are not measured: one window; what its sound did not confirm fades.
 _RELAXATION_S = 1.0
 _VISIBLE_LIFE_S = 10.0  # Mean, of a seen entity without looks
-# Prior of a vehicle in view, of which only the azimuth is measured: neither closing nor receding, within .5
-# 1/s, at exp(3.2) = 25 m within a factor of 1.8.
-_IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
-
 # Of the position, m: five seconds after a sharp one, and twice what is published. Then only the azimuth is
 # tracked, or a hidden one's side.
 _LOST_PLACE_M = 10.0
+NEVER_NS = np.iinfo(np.int64).min  # Of what was never seen
 
 
 NumbersT = TypeVar("NumbersT", float, FloatArray)  # Of one entity, or of each of many
 Label: TypeAlias = Annotated[tuple[str, float], Keys("label", "probability")]
+Objects: TypeAlias = NDArray[np.object_]
 
 
-@dataclass(eq=False)
+# Not frozen: a snapshot of twenty would take a tenth longer. Nothing writes into one.
+@dataclass(slots=True, eq=False)
 class Track:
-    """Existence, motion, class and history of one entity; a step writes into copies of its own."""
+    """Existence, motion, class and history of one entity."""
 
     id: str  # UUID for life
-    side: Count  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
-    seen: bool  # Whether vision has it; before that its existence is read from the explanation belief
     existence: Probability
-    motion: MotionBelief = field(metadata=FLAT)  # Azimuth, rates, log range
-    labels: tuple[Label, ...]  # Class probabilities, sorted by label
-    moving: bool  # False for what vision holds for parked
-    sources: tuple[str, ...]  # Modalities that contributed, sorted
     created_ns: int  # Birth and last measurement that moved it
     updated_ns: int
+    side: Count = (
+        0  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
+    )
+    seen: bool = False  # Whether vision has it; before that its existence is read from the explanation belief
+    motion: MotionBelief = field(default=IN_VIEW, metadata=FLAT)  # Azimuth, rates, log range
+    labels: tuple[Label, ...] = ((UNKNOWN, 1.0),)  # Class probabilities, sorted by label
+    moving: bool = True  # False for what vision holds for parked
+    sources: tuple[str, ...] = ()  # Modalities that contributed, sorted
     last_seen_ns: int | None = None  # Last sighting
     answer: Answer = "unqueried"  # Last answer of the co-evidence channel about it
     miss_rate: Probability | None = None  # beta of that answer
@@ -80,41 +84,132 @@ class Track:
         """Tell whether it is, or may be, of a side."""
         return self.side == side if self.of_side is not None else self.side_shares[side] > 0.0
 
-    def unseen_ns(self, stamp_ns: int) -> float:
-        """Return how long before a time it was last seen; infinite where it never was."""
-        return math.inf if self.last_seen_ns is None else stamp_ns - self.last_seen_ns
-
     @property
     def detected(self) -> bool:
         """Whether a sensor or a message has told where it is: it was not only heard."""
         return self.seen or self.place is not None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackArrays:
-    """What a step reads of all tracks at once, shape (tracks,) each."""
+@dataclass(eq=False)
+class Tracks:
+    """All entities, in columns: row i of each is what a `Track` holds of entity i.
 
-    motion: MotionBelief
-    existence: FloatArray
+    A step writes into a draft of its own. Shapes: (n,), means (n, 4), covariances (n, 4, 4).
+    """
+
+    id: Objects
+    side: IntArray
     seen: BoolArray
-    detected: BoolArray
+    existence: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    labels: Objects
     moving: BoolArray
+    sources: Objects
+    created_ns: IntArray
+    updated_ns: IntArray
+    last_seen_ns: IntArray
+    answer: Objects
+    miss_rate: FloatArray  # NaN where it was not asked
+    approach_heard: BoolArray
+    came_from: FloatArray
+    placed: BoolArray  # Whether it has a place; where it has none the next two mean nothing
+    place_mean: FloatArray
+    place_covariance: FloatArray
     behind: FloatArray
     width_rad: FloatArray
+    side_shares: Objects
+
+    def __len__(self) -> int:
+        return len(self.seen)
 
     @classmethod
-    def of(cls, tracks: Sequence[Track]) -> "TrackArrays":
-        """Return the arrays of some tracks."""
-        seen = np.array([one.seen for one in tracks], bool)
-        return cls(
-            MotionBelief.stacked([one.motion for one in tracks]),
-            np.array([one.existence for one in tracks]),
-            seen,
-            seen | np.array([one.place is not None for one in tracks], bool),
-            np.array([one.moving for one in tracks], bool),
-            np.array([one.behind for one in tracks]),
-            np.array([one.width_rad for one in tracks]),
-        )
+    def of(cls, rows: Sequence[Track]) -> "Tracks":
+        """Return the columns of some entities."""
+        motion = MotionBelief.stacked([one.motion for one in rows])
+        place = CartesianBelief.stacked([one.place or _NOWHERE for one in rows])
+        told: dict[str, Iterable[Any]] = {
+            "last_seen_ns": (NEVER_NS if one.last_seen_ns is None else one.last_seen_ns for one in rows),
+            "miss_rate": (math.nan if one.miss_rate is None else one.miss_rate for one in rows),
+            "placed": (one.place is not None for one in rows),
+        }
+        columns: dict[str, Any] = {
+            name: np.fromiter(told.get(name) or map(attrgetter(name), rows), kind, len(rows))
+            for name, kind in _COLUMNS.items()
+        }
+        beliefs = motion.mean, motion.covariance, place.mean, place.covariance
+        return cls(**columns | dict(zip(_BELIEFS, beliefs, strict=True)))
+
+    def rows(self) -> tuple[Track, ...]:
+        """Return the entities one by one."""
+        columns = {name: one.tolist() for name, one in vars(self).items() if name in _COLUMNS}
+        placed, last_ns, rates = columns.pop("placed"), columns["last_seen_ns"], columns["miss_rate"]
+        columns["last_seen_ns"] = [None if ns == NEVER_NS else ns for ns in last_ns]
+        columns["miss_rate"] = [None if math.isnan(rate) else rate for rate in rates]
+        columns["motion"] = self.motion.each()
+        columns["place"] = [self.place(row) if is_placed else None for row, is_placed in enumerate(placed)]
+        return tuple(starmap(Track, zip(*(columns[name] for name in Track.__slots__), strict=True)))
+
+    def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":
+        """Return the columns of some of them."""
+        return Tracks(*(column[where] for column in vars(self).values()))
+
+    def without(self, rows: Sequence[int]) -> "Tracks":
+        """Return the columns of all others."""
+        return self.taken(np.delete(np.arange(len(self)), rows)) if rows else self
+
+    def joined(self, rows: Sequence[Track]) -> "Tracks":
+        """Return the columns with some more entities at their end."""
+        if not rows:
+            return self
+        pairs = zip(vars(self).values(), vars(Tracks.of(rows)).values(), strict=True)
+        return Tracks(*map(np.concatenate, pairs))
+
+    def draft(self) -> "Tracks":
+        """Return a copy that a step may write into."""
+        return Tracks(*(column.copy() for column in vars(self).values()))
+
+    @property
+    def motion(self) -> MotionBelief:
+        """The motion of all."""
+        return MotionBelief(self.mean, self.covariance)
+
+    @property
+    def azimuth_std_rad(self) -> FloatArray:
+        """Standard deviations of their azimuths."""
+        return np.asarray(np.sqrt(self.covariance[:, AZIMUTH, AZIMUTH]))
+
+    @property
+    def detected(self) -> BoolArray:
+        """Whether a sensor or a message has told where they are: they were not only heard."""
+        return self.seen | self.placed
+
+    def of_side(self, row: int) -> int | None:
+        """Return the side that its existence is read from: None, of any, where it is not known."""
+        heard_only = not (self.seen[row] or self.placed[row])
+        return None if self.side_shares[row] and heard_only else int(self.side[row])
+
+    def place(self, row: int) -> CartesianBelief | None:
+        """Return the place of one, None where it has none."""
+        return CartesianBelief(self.place_mean[row], self.place_covariance[row]) if self.placed[row] else None
+
+    def put(self, row: int, belief: MotionBelief | CartesianBelief) -> None:
+        """Give one of them a motion, or a place."""
+        if isinstance(belief, MotionBelief):
+            self.mean[row], self.covariance[row] = belief.mean, belief.covariance
+        else:
+            self.placed[row] = True
+            self.place_mean[row], self.place_covariance[row] = belief.mean, belief.covariance
+
+    def unseen_ns(self, stamp_ns: int) -> FloatArray:
+        """Return how long before a time each was last seen; infinite where it never was."""
+        return np.where(self.last_seen_ns == NEVER_NS, np.inf, stamp_ns - self.last_seen_ns)
+
+
+_BELIEFS = ("mean", "covariance", "place_mean", "place_covariance")
+_KINDS: dict[Any, Any] = {Objects: object, BoolArray: bool, IntArray: np.int64, FloatArray: float}
+_COLUMNS = {name: _KINDS[hint] for name, hint in get_type_hints(Tracks).items() if name not in _BELIEFS}
+_NOWHERE = CartesianBelief(np.zeros(4), np.zeros((4, 4)))
 
 
 def entity_id(stream: str, kind: str, number: int) -> str:
@@ -130,18 +225,7 @@ def entity_id(stream: str, kind: str, number: int) -> str:
 
 def born(kind: str, number: int, existence: float, stamp_ns: int, site: SiteGeometry) -> Track:
     """Return the n-th entity of a kind, of which nothing else is known: what has found it follows."""
-    return Track(
-        id=entity_id(site.settings.stream, kind, number),
-        side=0,
-        seen=False,
-        existence=existence,
-        motion=_IN_VIEW,
-        labels=((UNKNOWN, 1.0),),
-        moving=True,
-        sources=(),
-        created_ns=stamp_ns,
-        updated_ns=stamp_ns,
-    )
+    return Track(entity_id(site.settings.stream, kind, number), existence, stamp_ns, stamp_ns)
 
 
 def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
@@ -164,84 +248,70 @@ def after_sighting(existence: NumbersT, miss_rate: float, clutter_rate: float) -
     return found / (found + (1.0 - existence) * clutter_rate)
 
 
-def predict_tracks(tracks: Sequence[Track], sides: SideBelief, step_s: float, site: SiteGeometry) -> None:
+def predict_tracks(tracks: Tracks, sides: SideBelief, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
-    shares = {track.id: hidden_share(track, sides) for track in tracks}
-    _drive_on([track for track in tracks if track.place is not None], step_s, site)
-    # Those that have just lost their place, too.
-    polar = [track for track in tracks if track.place is None]
-    if polar:
-        _relax(polar, [shares[track.id] for track in polar], step_s, site)
+    shares, polar = hidden_shares(tracks, sides), np.ones(len(tracks), bool)
+    if tracks.placed.any():
+        _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
+        polar = ~tracks.placed  # Those that have just lost their place, too
+    if polar.any():
+        # All of them are read and written where they stand.
+        _relax(tracks, slice(None) if polar.all() else polar, shares, step_s, site)
 
 
-def turn(tracks: Sequence[Track], faster_rad_s: float) -> None:
+def turn(tracks: Tracks, faster_rad_s: float) -> None:
     """Turn tracks into the axes of an ego vehicle that now turns so much faster to the left."""
-    for track in tracks:
-        if track.seen and track.place is None:
-            mean = track.motion.mean.copy()
-            mean[AZIMUTH_RATE] -= faster_rad_s
-            track.motion = replace(track.motion, mean=mean)
+    tracks.mean[tracks.seen & ~tracks.placed, AZIMUTH_RATE] -= faster_rad_s
 
 
-def _drive_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> None:
+def _drive_on(tracks: Tracks, rows: IntArray, step_s: float, site: SiteGeometry) -> None:
     """Move the places of tracks on by a step, and drop those that are lost."""
-    if not tracks:
-        return
-    stacked = CartesianBelief.stacked([one.place for one in tracks if one.place])
-    accelerations = np.array([acceleration_psd(one) for one in tracks])
-    after = predict_place(stacked, step_s, accelerations, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
-    for track, place in zip(tracks, after.each(), strict=True):
+    before = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
+    accelerations = acceleration_psd(tracks.moving[rows])
+    after = predict_place(before, step_s, accelerations, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
+    tracks.place_mean[rows], tracks.place_covariance[rows] = after.mean, after.covariance
+    for i, place in zip(rows.tolist(), after.each(), strict=True):
         # No life time here: a sender that keeps sending is there, a silent one is lost within seconds.
-        track.place = place
         if place.position_std_m > _LOST_PLACE_M:
-            track.place, track.behind = None, 1.0
-            if not track.seen:
-                track.motion = site.sides[track.side].prior()
+            tracks.placed[i], tracks.behind[i] = False, 1.0
+            if not tracks.seen[i]:
+                tracks.put(i, site.sides[tracks.side[i]].prior())
     follow_places(tracks, site)
 
 
-def acceleration_psd(track: Track) -> float:
-    """Return the density of the white acceleration that a track moves by, m^2/s^3."""
-    return _ACCELERATION if track.moving else _PARKED_ACCELERATION
+def acceleration_psd(moving: BoolArray) -> FloatArray:
+    """Return the densities of the white acceleration that entities move by, m^2/s^3."""
+    return np.where(moving, _ACCELERATION, _PARKED_ACCELERATION)
 
 
 def _relax(
-    tracks: Sequence[Track], hidden_shares: Sequence[float], step_s: float, site: SiteGeometry
+    tracks: Tracks, rows: BoolArray | slice, hidden: FloatArray, step_s: float, site: SiteGeometry
 ) -> None:
     """Move tracks without a place by a step, drawn to what is expected of vehicles in view or hidden."""
-    seen = np.array([track.seen for track in tracks])
-    accelerations = np.where([track.moving for track in tracks], _ACCELERATION, _PARKED_ACCELERATION)
-    motion = predict(MotionBelief.stacked([track.motion for track in tracks]), step_s, accelerations)
+    seen = tracks.seen[rows]
+    before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
+    motion = predict(before, step_s, acceleration_psd(tracks.moving[rows]))
     # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle still hidden has not passed the
     # corner, whatever its last rates said.
-    kept = np.exp(-step_s * np.where(seen, 0.0, hidden_shares) / _RELAXATION_S)
-    expected = _expected(site.sides)
-    of = [-1 if one.seen else one.side for one in tracks]
+    kept = np.exp(-step_s * hidden[rows] / _RELAXATION_S)
+    expected, of = site.expected, np.where(seen, -1, tracks.side[rows])
     towards = MotionBelief(expected.mean[of], expected.covariance[of])
     relaxed = relax(motion, towards, kept, math.exp(-step_s / _RELAXATION_S))
-    lasts = math.exp(-step_s / _VISIBLE_LIFE_S)
-    for track, moved in zip(tracks, relaxed.each(), strict=True):
-        track.motion = moved
-        if track.seen:
-            track.existence *= lasts
+    tracks.mean[rows], tracks.covariance[rows] = relaxed.mean, relaxed.covariance
+    tracks.existence[rows] *= np.where(seen, math.exp(-step_s / _VISIBLE_LIFE_S), 1.0)
 
 
-@lru_cache(maxsize=64)
-def _expected(sides: tuple[SideGeometry, ...]) -> MotionBelief:
-    """Return what is expected of vehicles that are hidden on each side, and last of those in view."""
-    return MotionBelief.stacked([*(side.prior() for side in sides), _IN_VIEW])
-
-
-def follow_places(tracks: Sequence[Track], site: SiteGeometry) -> None:
+def follow_places(tracks: Tracks, site: SiteGeometry) -> None:
     """Give tracks the polar motion, and the chance to be hidden, that follow from their places."""
-    placed = [track for track in tracks if track.place is not None]
-    if not placed:
+    if not tracks.placed.any():
         return
-    places = CartesianBelief.stacked([track.place for track in placed if track.place])
+    rows = np.flatnonzero(tracks.placed)
+    places = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
     polar = polar_motion(places, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
-    for track, motion in zip(placed, polar.each(), strict=True):
-        track.motion = motion
-        track.behind = site.sides[track.side].behind(motion.azimuth_rad, motion.azimuth_std_rad)
+    tracks.mean[rows], tracks.covariance[rows] = polar.mean, polar.covariance
+    for i, motion in zip(rows.tolist(), polar.each(), strict=True):
+        side = site.sides[tracks.side[i]]
+        tracks.behind[i] = side.behind(motion.azimuth_rad, motion.azimuth_std_rad)
 
 
 def relabelled(
@@ -257,14 +327,17 @@ def relabelled(
     kept = {label: probability * (1.0 - gain) for label, probability in labels}
     for label, probability in seen_as:
         kept[label] = kept.get(label, 0.0) + gain * probability
-    return tuple(sorted((label, round(p, 12)) for label, p in kept.items() if p > 1e-3))
+    return tuple([(label, round(kept[label], 12)) for label in sorted(kept) if kept[label] > 1e-3])
 
 
-def hidden_share(track: Track, sides: SideBelief) -> float:
-    """Return P(hidden | exists) of a track, 0 once it was seen."""
-    if track.seen:
-        return 0.0
-    return sides.hidden_share(track.of_side) if track.place is None else track.behind
+def hidden_shares(tracks: Tracks, sides: SideBelief) -> FloatArray:
+    """Return P(hidden | exists) of every track, 0 once it was seen."""
+    if tracks.seen.all():
+        return np.zeros(len(tracks))
+    shares = np.where(tracks.seen, 0.0, tracks.behind)
+    for i in np.flatnonzero(~tracks.detected).tolist():
+        shares[i] = sides.hidden_share(tracks.of_side(i))
+    return shares
 
 
 def side_weights(track: Track, sides: int) -> tuple[float, ...]:
@@ -273,11 +346,11 @@ def side_weights(track: Track, sides: int) -> tuple[float, ...]:
     return track.side_shares if track.of_side is None else known
 
 
-def heard_as(track: Track, kinds: ClassShares) -> tuple[Label, ...]:
+def heard_as(tracks: Tracks, row: int, kinds: ClassShares) -> tuple[Label, ...]:
     """Return class probabilities after one more hop; what a detector once said, the ear does not change."""
-    if not kinds or track.last_seen_ns is not None:
-        return track.labels
-    return relabelled(track.labels, kinds, _HEARD_GAIN)
+    labels: tuple[Label, ...] = tracks.labels[row]
+    is_heard = kinds and tracks.last_seen_ns[row] == NEVER_NS
+    return relabelled(labels, kinds, _HEARD_GAIN) if is_heard else labels
 
 
 def merged(sources: tuple[str, ...], source: str) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ hidden_K, visible, none) and, with equal rates for all directions, onto the thre
 chain adds is whether a source in view is the one that was heard while hidden.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, reduce
@@ -60,6 +61,7 @@ def equilibrium(rates_hz: RatesHz, directions: int) -> FloatArray:
 # About 1e-261: keeps every log finite, and is far below what the likelihoods of a few windows could raise
 # again.
 LOG_FLOOR = -600.0
+_FLOOR = math.exp(LOG_FLOOR)
 
 
 # No slots: the probabilities are computed once, and read some sixteen times a step.
@@ -111,7 +113,7 @@ class ExplanationBelief:
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "ExplanationBelief":
         """Return the belief after a time step without a measurement."""
         moved = self.probabilities @ transition(rates_hz, self.k, step_ns)
-        return replace(self, log_probabilities=_logs(moved / moved.sum()))
+        return ExplanationBelief(_logs(moved / moved.sum()))
 
     def update(self, evidence: SignatureEvidence, log_co_evidence: FloatArray) -> "ExplanationBelief":
         r"""Return the belief after one window with its co-evidence.
@@ -125,7 +127,7 @@ class ExplanationBelief:
         told = evidence.log_likelihoods + log_co_evidence
         joint = np.array(self.log_probabilities) + np.repeat(told, [*[1] * self.k, self.k + 1, 1])
         joint -= np.logaddexp.reduce(joint)
-        return replace(self, log_probabilities=tuple(np.minimum(np.maximum(joint, LOG_FLOOR), 0.0).tolist()))
+        return ExplanationBelief(tuple(np.minimum(np.maximum(joint, LOG_FLOOR), 0.0).tolist()))
 
     def emerge(self, direction: int, residual: float) -> "ExplanationBelief":
         """Return the belief after a hand-over: the vehicle that was hidden in a direction is in view."""
@@ -136,14 +138,14 @@ class ExplanationBelief:
         p[2 * k] += (1.0 - residual) * p[:k].sum() + p[k + direction]
         p[:k] *= residual
         p[k + direction] = 0.0
-        return replace(self, log_probabilities=_logs(p))
+        return ExplanationBelief(_logs(p))
 
     def forget_origin(self, direction: int) -> "ExplanationBelief":
         """Return the belief with the visible mass that came from a direction counted as from elsewhere."""
         p, k = self.probabilities.copy(), self.k
         p[2 * k] += p[k + direction]
         p[k + direction] = 0.0
-        return replace(self, log_probabilities=_logs(p))
+        return ExplanationBelief(_logs(p))
 
 
 # As checkpoints hold it.
@@ -153,8 +155,7 @@ AsLogs: TypeAlias = Annotated[
 
 
 def _logs(probabilities: FloatArray) -> tuple[float, ...]:
-    with np.errstate(divide="ignore"):
-        return tuple(np.maximum(np.log(probabilities), LOG_FLOOR).tolist())
+    return tuple(np.log(np.maximum(probabilities, _FLOOR)).tolist())
 
 
 # Window ends are rounded to samples and stamps to nanoseconds: two windows end to end differ from one
@@ -212,7 +213,8 @@ class WindowBelief:
 
     def since(self, stamp_ns: int) -> "WindowBelief":
         """Return the belief without evidence of before a time."""
-        return replace(self, heard=tuple(one for one in self.heard if one.stamp_ns >= stamp_ns))
+        heard = tuple(one for one in self.heard if one.stamp_ns >= stamp_ns)
+        return self if len(heard) == len(self.heard) else replace(self, heard=heard)
 
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "WindowBelief":
         """Return the belief after a time step without a window."""

@@ -1,17 +1,21 @@
 """Births, hand-overs and deaths of entities, those that have become one, and the events of all this."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 
-from worldstate.abduction.road_users import UNKNOWN
+import numpy as np
+
+from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import TIE, SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import Track, born, heard_as
+from worldstate.belief.track import NEVER_NS, Tracks, born, heard_as
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
+from worldstate.ground import BoolArray
 from worldstate.ground.values import nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Event
@@ -30,7 +34,6 @@ HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 _LOST_RAD = 0.8  # Standard deviation; beyond, the azimuth is known to no more than half of the view
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
-_AGE = attrgetter("created_ns", "id")
 
 
 def birth_death(
@@ -40,86 +43,107 @@ def birth_death(
 
     Shapes: alarmed (K,).
     """
-    heard = [hidden_on(memory.tracks, k) for k in _sides(site)]
-    memory.tracks = tuple(
-        one
-        for one in memory.tracks
-        if one not in heard or _goes_on(one, alarmed, measurement, memory.sides, site)
-    )
+    tracks = memory.tracks
+    heard = {hidden_on(tracks, k) for k in _sides(site)} - {None} if hidden_rows(tracks) else set()
+    gone = [i for i in heard if i is not None and not _goes_on(memory, i, alarmed, measurement, site)]
+    memory.tracks = tracks = tracks.without(gone)
     # Before births: another one is born on the side that it leaves.
-    for one in memory.tracks:
-        if one.side_shares:
-            _put_on_its_side(one, memory.sides, site)
+    for i in _of_unknown_side(tracks):
+        _put_on_its_side(tracks, i, memory.sides, site)
     for k in _sides_of_births(memory, alarmed, site):
         _give_birth(memory, k, measurement, site)
-    if len(_hidden(memory.tracks)) != 1 or memory.sides.hidden_share(None) < HIDDEN:
-        for one in memory.tracks:
-            if one.of_side is None:
-                one.side_shares, one.existence = (), memory.sides.existence(one.side)
+    tracks = memory.tracks
+    if len(hidden_rows(tracks)) != 1 or memory.sides.hidden_share(None) < HIDDEN:
+        for i in _of_unknown_side(tracks):
+            if tracks.of_side(i) is None:
+                tracks.side_shares[i], tracks.existence[i] = (), memory.sides.existence(tracks.side[i])
+
+
+def hidden_rows(tracks: Tracks) -> list[int]:
+    """Return the rows of the hidden entities."""
+    if tracks.seen.all():
+        return []
+    rows: list[int] = np.flatnonzero(~tracks.seen & (tracks.behind >= HIDDEN)).tolist()
+    return rows
+
+
+def _of_unknown_side(tracks: Tracks) -> list[int]:
+    return [i for i, shares in enumerate(tracks.side_shares) if shares]
 
 
 def _goes_on(
-    track: Track, alarmed: Sequence[bool], measurement: Measurement, sides: SideBelief, site: SiteGeometry
+    memory: Memory, row: int, alarmed: Sequence[bool], measurement: Measurement, site: SiteGeometry
 ) -> bool:
     """Update a hidden entity by one more hop; tell whether it is still believed."""
-    track.labels = heard_as(track, measurement.kinds)
-    if track.place is not None:
+    tracks = memory.tracks
+    tracks.labels[row] = heard_as(tracks, row, measurement.kinds)
+    if tracks.placed[row]:
         return True  # It was announced, and is there until its place is lost
-    track.existence = sides.existence(track.of_side)
-    named = any(alarmed[k] for k in _sides(site) if track.of_side in (k, None))
-    return track.existence >= site.settings.death_probability or named
+    of_side = tracks.of_side(row)
+    tracks.existence[row] = existence = memory.sides.existence(of_side)
+    named = any(alarmed[k] for k in _sides(site) if of_side in (k, None))
+    return existence >= site.settings.death_probability or named
 
 
 def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> list[int]:
     """Return the sides on which a hidden entity is born: of one vehicle the likelier one."""
-    sides, least, hidden = memory.sides, site.settings.birth_probability, _hidden(memory.tracks)
-    rearmed = _rearmed(memory)
+    tracks, sides, least = memory.tracks, memory.sides, site.settings.birth_probability
+    hidden, rearmed = hidden_rows(tracks), _rearmed(memory)
     if sides.both is not None and not hidden and all(rearmed):
         some = sides.hidden_on(None) >= least or any(alarmed)
         return [max(_sides(site), key=sides.hidden_on)] if some else []
-    if sides.both is not None and sides.both < least and any(one.of_side is None for one in hidden):
+    if sides.both is not None and sides.both < least and any(tracks.of_side(i) is None for i in hidden):
         return []
-    likely = (sides.hidden[k] >= least or alarmed[k] for k in _sides(site))
-    taken = {one.side for one in hidden}
-    return [
-        k
-        for k, (one, free) in enumerate(zip(likely, rearmed, strict=True))
-        if one and free and k not in taken
-    ]
+    taken = set(tracks.side[hidden].tolist())
+    likely = [sides.hidden[k] >= least or alarmed[k] for k in _sides(site)]
+    return [k for k in _sides(site) if likely[k] and rearmed[k] and k not in taken]
 
 
 def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> None:
     """Add one more hidden entity on a side, of unknown side where it is the only one."""
-    sides, shares = memory.sides, tuple[float, ...]()
-    one = _returning(memory.tracks, k, measurement.stamp_ns, site)
-    if one is None:
+    tracks, sides, shares = memory.tracks, memory.sides, tuple[float, ...]()
+    row = _returning(tracks, k, measurement.stamp_ns, site)
+    if row is None:
         # After a hand-over it is another one, of the other side.
-        if sides.both is not None and not _hidden(memory.tracks) and all(_rearmed(memory)):
+        if sides.both is not None and not hidden_rows(tracks) and all(_rearmed(memory)):
             shares = sides.side_shares(site.settings.death_probability)
         one = born(site.sides[k].label, memory.history[k].births, 0.0, measurement.stamp_ns, site)
         memory.history[k].births += 1
         # A detector adds to the kinds at the hand-over.
-        one.labels, one.sources = measurement.kinds or one.labels, (measurement.source,)
+        one = replace(one, labels=measurement.kinds or one.labels, sources=(measurement.source,))
+    else:
+        (one,) = tracks.taken([row]).rows()
+        tracks = tracks.without([row])
     # What came into view from here before was another vehicle: the new one starts without its mass.
     if isinstance(memory.belief, WindowBelief):
         memory.belief = memory.belief.map(partial(ExplanationBelief.forget_origin, direction=k))
-    one.side, one.seen, one.came_from, one.existence = k, False, 1.0, min(sides.hidden[k], 1.0)
-    one.motion, one.updated_ns = site.sides[k].prior(), measurement.stamp_ns
-    one.place, one.behind, one.side_shares = None, 1.0, shares
-    _put_on_its_side(one, sides, site)
-    memory.tracks = (*(other for other in memory.tracks if other is not one), one)
+    one = replace(
+        one,
+        side=k,
+        seen=False,
+        came_from=1.0,
+        existence=min(sides.hidden[k], 1.0),
+        motion=site.sides[k].prior(),
+        updated_ns=measurement.stamp_ns,
+        place=None,
+        behind=1.0,
+        side_shares=shares,
+    )
+    memory.tracks = tracks.joined([one])
+    _put_on_its_side(memory.tracks, len(tracks), sides, site)
 
 
-def _put_on_its_side(track: Track, sides: SideBelief, site: SiteGeometry) -> None:
+def _put_on_its_side(tracks: Tracks, row: int, sides: SideBelief, site: SiteGeometry) -> None:
     """Put an entity of unknown side on its likelier one; in a tie it stays, which rounding must not undo."""
-    if track.of_side is not None:
-        track.side_shares = ()
+    if tracks.of_side(row) is not None:
+        tracks.side_shares[row] = ()
         return
     shares = sides.side_shares(site.settings.death_probability)
-    if shares[track.side] < max(shares) * (1.0 - TIE):
+    if shares[tracks.side[row]] < max(shares) * (1.0 - TIE):
         side = shares.index(max(shares))
-        track.side, track.motion = side, site.sides[side].prior()
-    track.side_shares, track.existence = shares, sides.existence(None)
+        tracks.side[row] = side
+        tracks.put(row, site.sides[side].prior())
+    tracks.side_shares[row], tracks.existence[row] = shares, sides.existence(None)
 
 
 def _rearmed(memory: Memory) -> list[bool]:
@@ -131,137 +155,144 @@ def _sides(site: SiteGeometry) -> range:
     return range(len(site.sides))
 
 
-def _hidden(tracks: Iterable[Track]) -> list[Track]:
-    return [one for one in tracks if not one.seen and one.behind >= HIDDEN]
-
-
 def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
     """Merge tracks that have become one; return by the ids that end those that go on.
 
     Of two at one place, of the same class, one has just been found and the other not for a second. They go
     on where the first is, under the id that was known earlier; so do the halves of one of unknown side.
     """
-    tracks, stamp_ns, into = memory.tracks, memory.stamp_ns, dict[str, str]()
-    ended = list[Track]()
-    if _are_halves(_hidden(tracks), memory.sides, site):
-        first, second = sorted(_hidden(tracks), key=_AGE)
-        first.side_shares = memory.sides.side_shares(site.settings.death_probability)
-        _put_on_its_side(first, memory.sides, site)
+    tracks, stamp_ns, into, ended = memory.tracks, memory.stamp_ns, dict[str, str](), list[int]()
+    hidden = hidden_rows(tracks)
+    if _are_halves(tracks, hidden, memory.sides, site):
+        first, second = sorted(hidden, key=partial(_age, tracks))
+        tracks.side_shares[first] = memory.sides.side_shares(site.settings.death_probability)
+        _put_on_its_side(tracks, first, memory.sides, site)
         ended.append(second)
-        into[second.id] = first.id
-    found = [one for one in tracks if one.seen and one.last_seen_ns == stamp_ns]
-    lost = [one for one in tracks if one.seen and one.unseen_ns(stamp_ns) >= _ALONE_NS]
-    for other in lost:
-        same = next((one for one in found if _at_one_place(one, other)), None)
+        into[tracks.id[second]] = tracks.id[first]
+    for other in np.flatnonzero(tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS)).tolist():
+        found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
+        same = next((i for i in found if _at_one_place(tracks, i, other)), None)
         if same is not None:
-            first, second = sorted((same, other), key=_AGE)
-            into[second.id] = first.id
-            same.existence = max(same.existence, other.existence)
-            same.id, same.created_ns, same.came_from = first.id, first.created_ns, first.came_from
+            first, second = sorted((same, other), key=partial(_age, tracks))
+            into[tracks.id[second]] = tracks.id[first]
+            tracks.existence[same] = max(tracks.existence[same], tracks.existence[other])
+            for column in (tracks.id, tracks.created_ns, tracks.came_from):
+                column[same] = column[first]
             ended.append(other)
-    memory.tracks = tuple(one for one in tracks if one not in ended)
+    memory.tracks = tracks.without(ended)
     return into
 
 
-def _are_halves(hidden: list[Track], sides: SideBelief, site: SiteGeometry) -> bool:
+def _age(tracks: Tracks, row: int) -> tuple[int, str]:
+    return tracks.created_ns[row], tracks.id[row]
+
+
+def _are_halves(tracks: Tracks, hidden: list[int], sides: SideBelief, site: SiteGeometry) -> bool:
     r"""Tell whether two entities that are only heard are one, by the joint of both sides.
 
     .. math:: P(C_k, C_j) < p_{birth}^2
 
     which is less than two vehicles have that are each believed just enough to be born.
     """
-    told_apart = any(one.detected or one.last_seen_ns is not None for one in hidden)
-    if len(hidden) != 2 or told_apart or hidden[0].side == hidden[1].side:
+    if len(hidden) != 2 or told_apart(tracks)[hidden].any() or len(set(tracks.side[hidden])) != 2:
         return False
-    behind = all(sides.hidden_share(one.side) >= HIDDEN for one in hidden)
+    behind = all(sides.hidden_share(tracks.side[i]) >= HIDDEN for i in hidden)
     return behind and sides.both is not None and sides.both < site.settings.birth_probability**2
 
 
-def _at_one_place(one: Track, other: Track) -> bool:
+def told_apart(tracks: Tracks) -> BoolArray:
+    """Return which were told apart from others: by a message, or since they were seen."""
+    return np.asarray(tracks.detected | (tracks.last_seen_ns != NEVER_NS))
+
+
+def _at_one_place(tracks: Tracks, one: int, other: int) -> bool:
     """Tell whether two tracks of one class stand within each other's deviations of azimuth and range.
 
     One that has left the view is soon anywhere in it: beyond the gate no sighting would have been its own.
     """
-    gap = one.motion.mean - other.motion.mean
+    gap = tracks.mean[one] - tracks.mean[other]
     gap[AZIMUTH] = wrap_angle(gap[AZIMUTH])
-    variance = (one.motion.covariance + other.motion.covariance).diagonal()
+    variance = (tracks.covariance[one] + tracks.covariance[other]).diagonal()
     near = abs(gap[AZIMUTH]) <= GATE_RAD and all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
-    alike = _likeliest(one) == _likeliest(other)
-    return near and alike and one.moving == other.moving
+    alike = _likeliest(tracks.labels[one]) == _likeliest(tracks.labels[other])
+    return near and alike and bool(tracks.moving[one] == tracks.moving[other])
 
 
-def _likeliest(track: Track) -> str:
-    return max(track.labels, key=itemgetter(1), default=(UNKNOWN, 1.0))[0]
+def _likeliest(labels: ClassShares) -> str:
+    return max(labels, key=itemgetter(1), default=(UNKNOWN, 1.0))[0]
 
 
-def hidden_on(tracks: Iterable[Track], k: int) -> Track | None:
-    """Return the likeliest hidden entity of a side, or one that may be there; None where there is none."""
-    there = (one for one in _hidden(tracks) if one.may_be_on(k))
-    return max(there, key=lambda one: (one.side == k, one.existence), default=None)
+def hidden_on(tracks: Tracks, k: int) -> int | None:
+    """Return the row of the likeliest hidden entity of a side, or of one that may be there, if any is."""
+    there = [i for i in hidden_rows(tracks) if _may_be_on(tracks, i, k)]
+    return max(there, key=lambda i: (tracks.side[i] == k, tracks.existence[i]), default=None)
 
 
-def _returning(tracks: Iterable[Track], k: int, stamp_ns: int, site: SiteGeometry) -> Track | None:
+def _may_be_on(tracks: Tracks, row: int, side: int) -> bool:
+    of_side = tracks.of_side(row)
+    return bool(tracks.side_shares[row][side] > 0.0) if of_side is None else of_side == side
+
+
+def _returning(tracks: Tracks, k: int, stamp_ns: int, site: SiteGeometry) -> int | None:
     """Return the moving entity last seen near this side's edge within the reocclusion time, if any."""
-    side = site.sides[k]
-    candidates = [
-        track
-        for track in tracks
-        if track.seen and track.moving
-        if REOCCLUSION_NS <= track.unseen_ns(stamp_ns) <= _REOCCLUSION_END_NS
-        if side.distance_rad(track.motion.azimuth_rad) <= _REOCCLUSION_RAD
-    ]
-    return min(candidates, key=lambda track: side.distance_rad(track.motion.azimuth_rad), default=None)
+    unseen_ns = tracks.unseen_ns(stamp_ns)
+    recent = (unseen_ns >= REOCCLUSION_NS) & (unseen_ns <= _REOCCLUSION_END_NS)
+    rows = np.flatnonzero(tracks.seen & tracks.moving & recent).tolist()
+    apart_rad = {i: site.sides[k].distance_rad(float(tracks.mean[i, AZIMUTH])) for i in rows}
+    near = (i for i, apart in apart_rad.items() if apart <= _REOCCLUSION_RAD)
+    return min(near, key=apart_rad.__getitem__, default=None)
 
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.
 MOST_EVENTS = 64
 
 
-def published(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
+def published(tracks: Tracks, settings: FilterSettings) -> Tracks:
     """Return the tracks that a snapshot names."""
     # A refuted claim is remembered while it is repeated: forgotten, it would be believed anew.
-    return tuple(one for one in tracks if not one.place or one.existence >= settings.delete_existence)
+    refuted = tracks.placed & (tracks.existence < settings.delete_existence)
+    return tracks.taken(~refuted) if refuted.any() else tracks
 
 
 def events_between(
-    before: tuple[Track, ...], after: tuple[Track, ...], stamp_ns: int, into: Mapping[str, str]
+    before: Tracks, after: Tracks, stamp_ns: int, into: Mapping[str, str]
 ) -> tuple[Event, ...]:
     """Return what became of every entity, those that were there before first; `into` by merged ids."""
-    known, left = {track.id: track for track in before}, {track.id: track for track in after}
-    kinds = {name: "merged" if name in into else _became(one, left.get(name)) for name, one in known.items()}
-    kinds |= {name: "born" for name in left if name not in known}
-    events = (Event(stamp_ns, kind, name, into.get(name)) for name, kind in kinds.items() if kind is not None)
-    return tuple(events)[:MOST_EVENTS]
-
-
-def _became(before: Track, after: Track | None) -> EventKind | None:
-    if after is None:
-        return "died"
-    if before.seen != after.seen:
-        return "handed_over" if after.seen else "hidden_again"
-    return "coasting" if after.seen and before.answer == "visible" != after.answer else None
+    left = dict(zip(after.id, zip(after.seen.tolist(), after.answer, strict=True), strict=True))
+    events = list[Event]()
+    for name, was_seen, answer in zip(before.id, before.seen.tolist(), before.answer, strict=True):
+        seen, said = left.pop(name, (None, None))
+        kind: EventKind | None = None
+        if seen is None:
+            kind = "merged" if name in into else "died"
+        elif seen != was_seen:
+            kind = "handed_over" if seen else "hidden_again"
+        elif seen and answer == "visible" != said:
+            kind = "coasting"
+        if kind is not None:
+            events.append(Event(stamp_ns, kind, name, into.get(name)))
+    events += (Event(stamp_ns, "born", name) for name in left)
+    return tuple(events[:MOST_EVENTS])
 
 
 def after_look(
-    memory: Memory, emerged: Mapping[int, float], fresh: Iterable[Track], stamp_ns: int, site: SiteGeometry
+    memory: Memory, emerged: Mapping[int, float], known: int, stamp_ns: int, site: SiteGeometry
 ) -> None:
-    """Update the memory after a look that has found new tracks, and some that were not seen before.
+    """Update the memory after a look; entities beyond the first so many, which were known, are new.
 
-    `emerged` is the chance that a detection was theirs, by their places in the memory.
+    `emerged` is the chance that a detection was theirs, by the rows of those that were not seen before.
     """
+    tracks = memory.tracks
     # Of the side where it is: what was heard may have been believed on the other one.
-    handed_over = {
-        memory.tracks[i].side: max(HANDOVER_RESIDUAL, 1.0 - chance) for i, chance in emerged.items()
-    }
+    handed_over = {int(tracks.side[i]): max(HANDOVER_RESIDUAL, 1.0 - chance) for i, chance in emerged.items()}
     # First seen near an edge, it came past it unheard.
-    unheard = {
-        track.side
-        for track in fresh
-        if track.seen and track.moving
-        if site.sides[track.side].distance_rad(track.motion.azimuth_rad, track.width_rad)
-        <= 2.0 * EDGE_STD_RAD
-    }
-    memory.tracks = surviving(memory.tracks, site.settings)
+    unheard = set[int]()
+    for i in range(known, len(tracks)):
+        side = int(tracks.side[i])
+        apart_rad = site.sides[side].distance_rad(float(tracks.mean[i, AZIMUTH]), float(tracks.width_rad[i]))
+        if tracks.seen[i] and tracks.moving[i] and apart_rad <= 2.0 * EDGE_STD_RAD:
+            unheard.add(side)
+    memory.tracks = surviving(tracks, site.settings)
     past_edges(memory, handed_over, unheard, stamp_ns)
 
 
@@ -280,21 +311,17 @@ def past_edges(
             emerge = partial(ExplanationBelief.emerge, direction=side, residual=residual)
             memory.belief = memory.belief.map(emerge)
     else:
-        hidden = [one for one in memory.tracks if not one.seen]
+        tracks, hidden = memory.tracks, ~memory.tracks.seen
         # One that is still believed hidden where another came from was not what came.
-        left = {k: float(any(one.side == k for one in hidden)) for k in unheard}
-        # Vehicles of another side that were told apart before: by a message, or since they were seen.
-        apart = {one.side for one in hidden if one.detected or one.last_seen_ns is not None}
+        left = {k: float(k in tracks.side[hidden]) for k in unheard}
+        apart = set(tracks.side[hidden & told_apart(tracks)].tolist())
         memory.belief = memory.belief.handed_over(left | dict(handed_over), apart, stamp_ns)
     for side in handed_over:
         memory.history[side].handover_ns = stamp_ns
 
 
-def surviving(tracks: Sequence[Track], settings: FilterSettings) -> tuple[Track, ...]:
+def surviving(tracks: Tracks, settings: FilterSettings) -> Tracks:
     """Return the tracks without seen entities of too little existence or too uncertain azimuth."""
-    least = settings.delete_existence
-    return tuple(
-        track
-        for track in tracks
-        if not track.seen or (track.existence >= least and track.motion.azimuth_std_rad <= _LOST_RAD)
-    )
+    known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= _LOST_RAD**2
+    kept = known & (tracks.existence >= settings.delete_existence) | ~tracks.seen
+    return tracks if kept.all() else tracks.taken(kept)

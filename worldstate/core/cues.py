@@ -12,7 +12,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.evidence import SignatureEvidence, log_lambda, posterior_of
+from worldstate.abduction.evidence import SignatureEvidence, posterior_of
 from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
@@ -88,9 +88,9 @@ def update_rule(
 ) -> None:
     """Update the sustained rule of a source with what it says."""
     # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
-    log_prior = np.log(model.policy.reference_prior)
+    log_prior = tuple(map(math.log, model.policy.reference_prior))
     posterior = posterior_of(log_prior, said, answer)
-    ratio, heard_nats = posterior.log_lambda, log_lambda(log_prior, said, NO_LOOK)
+    ratio, heard_nats = posterior.log_lambda, posterior_of(log_prior, said, NO_LOOK).log_lambda
     statistic, bounded = min(posterior.hidden_total, 1.0), ratio if math.isfinite(ratio) else None
     memory.last.instant = Instant(statistic, bounded, heard_nats)
     last = memory.rules.get(source)
@@ -223,7 +223,8 @@ def _cue(
     times: _Times,
     evidence: EvidenceTerms,
 ) -> RiskCue:
-    track = hidden_on(memory.tracks, k)
+    row = hidden_on(memory.tracks, k)
+    track = None if row is None else memory.tracks.taken([row]).rows()[0]
     azimuth_rad, std_rad, source = hidden_azimuth(k, track, memory.sequence, model.site)
     within, interval_s = times
     arrival_s = None

@@ -1,15 +1,16 @@
 """Update by detections: the looks that count, and the entities that they find, miss or announce."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, Association, associated, leaving
-from worldstate.belief.detection import Detection, Scan, camera_scan, fused, position_scan
+from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, associated, leaving
+from worldstate.belief.detection import Detections, Scan, camera_scan, fused, miss_rates, position_scan
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import (
     CartesianBelief,
@@ -22,7 +23,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry, normal_share
 from worldstate.belief.track import (
     Track,
-    TrackArrays,
+    Tracks,
     after_empty_look,
     after_sighting,
     born,
@@ -30,7 +31,8 @@ from worldstate.belief.track import (
     merged,
     relabelled,
 )
-from worldstate.ground import FloatArray, nanoseconds, seconds, wrap_angle
+from worldstate.ground import BoolArray, FloatArray, nanoseconds, seconds, wrap_angle
+from worldstate.ground.typing import IndexArray
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
 from .birth_death import REOCCLUSION_NS, after_look
@@ -45,7 +47,6 @@ from .site_model import FilterModel
 _NEW_RATE_STD = (0.5, 0.5)
 _PARKED_RATE_STD = (1e-3, 1e-3)
 _ROUNDING = 1e-12  # Odds of certainty have no quotient
-_Found = Mapping[int, Detection]  # By the index of the track
 
 
 def new_looks(
@@ -125,90 +126,84 @@ def detection_update(
     `asked` is what cameras answer of the sector of a sound; None of positions.
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
-    arrays = TrackArrays.of(known)
-    whose = associated(known, arrays, detections, site)
-    fresh = _born(memory, [detections[j] for j in whose.new], scans[0], stamp_ns, site)
-    memory.tracks = tracks = (*known, *fresh)
-    if fresh:
-        arrays = TrackArrays.of(tracks)
-    rows = whose.found | dict(enumerate(whose.new, start=len(known)))
-    found = {i: detections[j] for i, j in rows.items()}
+    whose = associated(known, detections, site)
+    fresh = [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
+    memory.tracks = tracks = known.joined(fresh)
+    chances, detection = np.ones(len(tracks)), np.full(len(tracks), -1)
+    chances[: len(known)] = whose.chances
+    detection[list(whose.found)], detection[len(known) :] = list(whose.found.values()), whose.new
+    rows, missed, was_seen = np.flatnonzero(detection >= 0), np.flatnonzero(detection < 0), tracks.seen.copy()
+    found = _Found(rows, detection[rows], detections)
     if scans[0].sector is None:
-        existence = [_told(one, found.get(i), scans[0]) for i, one in enumerate(tracks)]
+        existence = _told(tracks, found, scans[0])
     else:
-        existence = _existence(arrays, found, _hits(arrays, rows, whose, by_look), scans)
-    chances = whose.chances + [1.0] * len(fresh)
-    _move(tracks, arrays.motion, found)
-    for i, one in found.items():
-        _see(tracks[i], one, chances[i], scans, stamp_ns, site)
-    if len(found) < len(tracks):
-        views, past = _other_views(memory, scans), leaving(arrays, site).tolist()
-        for i in set(range(len(tracks))).difference(found):
-            _miss(tracks[i], past[i], scans, asked, views, stamp_ns, site)
-    for track, chance in zip(tracks, existence, strict=True):
-        track.existence = chance
+        hits = np.zeros((len(tracks), len(scans)))
+        hits[: len(known)] = np.minimum(whose.pairs.T @ by_look, 1.0)
+        # Certain of a first detection.
+        first = rows[~was_seen[rows]]
+        hits[first] = by_look[detection[first]]
+        existence = _existence(tracks, found, hits, scans)
+    _move(tracks, found)
+    _see(tracks, found, chances, scans, stamp_ns, site)
+    if len(missed):
+        _miss(memory, missed, scans, asked, stamp_ns, site)
+    tracks.existence = existence
     if scans[0].sector is None:
-        for i in found:
-            _announce(tracks[i], site)
+        for i in rows.tolist():
+            _announce(tracks, i, site)
     follow_places(tracks, site)
-    emerged = {i: chances[i] for i in whose.found if not arrays.seen[i] and tracks[i].seen}
-    after_look(memory, emerged, fresh, stamp_ns, site)
+    emerged = [i for i in whose.found if tracks.seen[i] and not was_seen[i]]
+    after_look(memory, {i: float(chances[i]) for i in emerged}, len(known), stamp_ns, site)
+
+
+class _Found(NamedTuple):
+    """Which entities were found, and by which detections, row by row."""
+
+    rows: IndexArray
+    by: IndexArray
+    detections: Detections
 
 
 def _born(
-    memory: Memory, new: Sequence[Detection], scan: Scan, stamp_ns: int, site: SiteGeometry
-) -> list[Track]:
-    """Return new entities before their detections count; hidden where messages say so."""
-    fresh = list[Track]()
-    for one in new:
-        side = site.hiding_side(one.azimuth_rad) if one.found is None else None
-        existence = min(one.existence, MOST_EXISTENCE)
-        if side is None:
-            track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
-            track.side = site.nearest_side(one.azimuth_rad)
-            memory.counts.sighted += 1
-        else:
-            track = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
-            track.side, track.came_from = side, 1.0
-            memory.history[side].births += 1
-        track.sources = (scan.source,)
-        fresh.append(track)
-    return fresh
+    memory: Memory, detections: Detections, by: int, scan: Scan, stamp_ns: int, site: SiteGeometry
+) -> Track:
+    """Return a new entity before its detection counts; hidden where messages say so."""
+    azimuth_rad = float(detections.azimuth_rad[by])
+    side = None if detections.in_sight else site.hiding_side(azimuth_rad)
+    existence = min(float(detections.existence[by]), MOST_EXISTENCE)
+    if side is None:
+        track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
+        memory.counts.sighted += 1
+        return replace(track, side=site.nearest_side(azimuth_rad), sources=(scan.source,))
+    track = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
+    memory.history[side].births += 1
+    return replace(track, side=side, came_from=1.0, sources=(scan.source,))
 
 
-def _hits(
-    arrays: TrackArrays, rows: Mapping[int, int], whose: Association, by_look: FloatArray
-) -> FloatArray:
-    """Return P(a look has detected a track), certain of a first detection, shape (tracks, looks)."""
-    hits = np.zeros((len(arrays.seen), by_look.shape[1]))
-    hits[: whose.pairs.shape[1]] = np.minimum(whose.pairs.T @ by_look, 1.0)
-    for i in np.flatnonzero(~arrays.seen).tolist():
-        if i in rows:
-            hits[i] = by_look[rows[i]]
-    return hits
-
-
-def _existence(arrays: TrackArrays, found: _Found, hits: FloatArray, scans: Sequence[Scan]) -> list[float]:
+def _existence(tracks: Tracks, found: _Found, hits: FloatArray, scans: Sequence[Scan]) -> FloatArray:
     r"""Return the existence after every look s of an instant, each with the chance c that it has detected it.
 
     .. math:: r_s = c_s\, r_+ + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
               p_s = p_D\, P_{range}\, (1 - P_{hidden}), \qquad
               \frac{r'}{1 - r'} = \frac{r}{1 - r} \prod_s \frac{r_s}{1 - r_s} \frac{1 - r}{r}
     """
-    seen, counts, before = arrays.seen, arrays.detected.copy(), arrays.existence.copy()
-    for i in (i for i in np.flatnonzero(~seen).tolist() if i in found):
-        counts[i], before[i] = True, max(before[i], found[i].existence)
+    seen, counts, before = tracks.seen, tracks.detected, tracks.existence
+    if not seen.all():
+        # A first detection counts before it is certain which entity it is of.
+        first = ~seen[found.rows]
+        rows, told = found.rows[first], found.detections.existence[found.by[first]]
+        counts, before = counts.copy(), before.copy()
+        counts[rows], before[rows] = True, np.maximum(before[rows], told)
     r = np.minimum(np.maximum(before, _ROUNDING), 1.0 - _ROUNDING)
-    in_sight = np.where(seen, 1.0, 1.0 - arrays.behind)
-    odds = ratio = _odds(r)
+    in_sight = np.where(seen, 1.0, 1.0 - tracks.behind)
+    odds = ratio = r / (1.0 - r)
     for hit, scan in zip(hits.T, scans, strict=True):
-        detected = _searched(arrays.motion, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
+        detected = _searched(tracks, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
         missed = after_empty_look(r, 1.0 - detected)
         missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
         now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
         ratio = ratio * _odds(now) / odds
-    existence: list[float] = np.where(counts, ratio / (1.0 + ratio), before).tolist()
-    return existence
+    return np.where(counts, ratio / (1.0 + ratio), before)
 
 
 def _odds(probabilities: FloatArray) -> FloatArray:
@@ -216,131 +211,139 @@ def _odds(probabilities: FloatArray) -> FloatArray:
     return np.asarray(bounded / (1.0 - bounded))
 
 
-def _searched(motion: MotionBelief, scan: Scan) -> FloatArray:
+def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
     """Return P(a look covers it) of every track, by the range of the sensor in its sector."""
     if scan.sector is None or scan.miss_rate is None:
-        return np.zeros(len(motion.mean))
-    from_centre_rad = np.abs(wrap_angle(motion.mean[:, AZIMUTH] - scan.sector.centre_rad))
+        return np.zeros(len(tracks))
+    from_centre_rad = np.abs(wrap_angle(tracks.mean[:, AZIMUTH] - scan.sector.centre_rad))
     covers = from_centre_rad <= scan.sector.half_width_rad
     if math.isinf(scan.range_m):
         return covers.astype(float)
-    stds = np.sqrt(motion.covariance[:, LOG_RANGE, LOG_RANGE])
-    deviations = (math.log(scan.range_m) - motion.mean[:, LOG_RANGE]) / stds
+    stds = np.sqrt(tracks.covariance[:, LOG_RANGE, LOG_RANGE])
+    deviations = (math.log(scan.range_m) - tracks.mean[:, LOG_RANGE]) / stds
     return np.where(covers, [normal_share(one) for one in deviations.tolist()], 0.0)
 
 
-def _told(track: Track, told: Detection | None, scan: Scan) -> float:
+def _told(tracks: Tracks, found: _Found, scan: Scan) -> FloatArray:
     """Return the existence after messages."""
     # A sender that lies in one message lies in the next: what a source repeats counts once.
-    if told is None or scan.source in track.sources:
-        return track.existence
-    odds = told.existence / (1.0 - told.existence)
-    before = min(track.existence, MOST_EXISTENCE)
-    return min(before * odds / (before * odds + 1.0 - before), MOST_EXISTENCE)
+    news = np.array([scan.source not in tracks.sources[i] for i in found.rows.tolist()], bool)
+    rows, told = found.rows[news], found.detections.existence[found.by[news]]
+    odds, before = told / (1.0 - told), np.minimum(tracks.existence[rows], MOST_EXISTENCE)
+    after = tracks.existence.copy()
+    after[rows] = np.minimum(before * odds / (before * odds + 1.0 - before), MOST_EXISTENCE)
+    return after
 
 
-def _move(tracks: Sequence[Track], motion: MotionBelief, found: _Found) -> None:
+def _move(tracks: Tracks, found: _Found) -> None:
     """Update the motion or the place of the found tracks with what was measured of them."""
-    usual = list[int]()
-    for i, one in found.items():
-        track = tracks[i]
-        if one.position is not None or track.place is not None:
-            track.place = _placed(track, one)
-        elif track.seen and one.moving == track.moving:
-            usual.append(i)
+    rows, by, detections = found
+    placed = tracks.placed[rows] | bool(detections.positions)
+    usual = ~placed & tracks.seen[rows] & (detections.moving[by] == tracks.moving[rows])
+    for i, j in zip(rows[~usual].tolist(), by[~usual].tolist(), strict=True):
+        if detections.positions or tracks.placed[i]:
+            tracks.put(i, _placed(tracks, i, detections, j))
         else:
-            track.motion = _motion_at(one, track.motion)
-    if usual:
-        azimuth_rad, std_rad = np.array([(found[i].azimuth_rad, found[i].std_rad) for i in usual]).T
-        before = MotionBelief(motion.mean[usual], motion.covariance[usual])
-        after = update(before, AZIMUTH, azimuth_rad, std_rad).each()
-        for i, moved in zip(usual, after, strict=True):
-            tracks[i].motion = moved
+            tracks.put(i, _motion_at(detections, j, tracks.mean[i], tracks.covariance[i]))
+    if usual.any():
+        rows, by = rows[usual], by[usual]
+        before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
+        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by])
+        tracks.mean[rows], tracks.covariance[rows] = after.mean, after.covariance
 
 
-def _placed(track: Track, found: Detection) -> CartesianBelief:
-    position, place = found.position, track.place
-    if position is None:
+def _placed(tracks: Tracks, row: int, detections: Detections, by: int) -> CartesianBelief:
+    """Return the place of a track after a position, or after a bearing of what has a place."""
+    place = tracks.place(row)
+    if not detections.positions:
         assert place is not None
-        return update_bearing(place, found.azimuth_rad, found.std_rad)
+        return update_bearing(place, float(detections.azimuth_rad[by]), float(detections.std_rad[by]))
+    position = detections.positions[by]
     if place is not None:
         return update_position(place, position)
     place = at_position(position)
-    if not track.seen:
+    if not tracks.seen[row]:
         return place
-    return update_bearing(place, track.motion.azimuth_rad, track.motion.azimuth_std_rad)
+    return update_bearing(place, float(tracks.mean[row, AZIMUTH]), float(tracks.azimuth_std_rad[row]))
 
 
-def _motion_at(box: Detection, before: MotionBelief) -> MotionBelief:
+def _motion_at(boxes: Detections, by: int, mean: FloatArray, covariance: FloatArray) -> MotionBelief:
     """Return the motion belief at a box, with approach rate and range of an earlier belief."""
-    rate_std, radial_std = _NEW_RATE_STD if box.moving else _PARKED_RATE_STD
-    mean, std = [box.azimuth_rad, 0.0, 0.0, 3.2], [box.std_rad, rate_std, radial_std, 0.6]
-    if box.moving:
-        mean[2:] = before.mean[RADIAL_RATE:].tolist()
-        std[2:] = np.sqrt(np.diag(before.covariance)[RADIAL_RATE : LOG_RANGE + 1]).tolist()
-    return MotionBelief.around((mean[0], mean[1], mean[2], mean[3]), (std[0], std[1], std[2], std[3]))
+    moving = boxes.moving[by] > 0.0
+    rate_std, radial_std = _NEW_RATE_STD if moving else _PARKED_RATE_STD
+    expected, std = [boxes.azimuth_rad[by], 0.0, 0.0, 3.2], [boxes.std_rad[by], rate_std, radial_std, 0.6]
+    if moving:
+        expected[2:] = mean[RADIAL_RATE:].tolist()
+        std[2:] = np.sqrt(np.diag(covariance)[RADIAL_RATE : LOG_RANGE + 1]).tolist()
+    return MotionBelief.around(expected, std)
 
 
 def _see(
-    track: Track, found: Detection, chance: float, scans: Sequence[Scan], stamp_ns: int, site: SiteGeometry
-) -> None:
-    """Update a track with its detection; one not in view before takes its side and class there."""
-    track.updated_ns, track.sources = stamp_ns, merged(track.sources, scans[0].source)
-    if found.classes:
-        track.labels = relabelled(track.labels, found.classes) if track.seen else found.classes
-    if found.moving is not None:
-        track.moving = found.moving
-    if found.width_rad is None:
-        track.approach_heard = True  # By the velocity of its position
-    else:
-        track.width_rad = found.width_rad
-    if found.found is None:
-        return
-    if not track.seen:
-        track.seen, track.side = True, site.nearest_side(found.azimuth_rad)
-        track.came_from *= chance
-    track.last_seen_ns, track.answer = stamp_ns, "visible"
-    track.miss_rate = _miss_rate(scans, found.azimuth_rad)
-
-
-def _miss_rate(scans: Sequence[Scan], azimuth_rad: float) -> float | None:
-    """Return P(all looks miss what is in view there), None where none has searched."""
-    rates = [one.miss_rate or 0.0 for one in scans if one.searches(azimuth_rad)]
-    return math.prod(rates) if rates else None
-
-
-def _announce(track: Track, site: SiteGeometry) -> None:
-    """Put a track that a message has placed on the side whose occluder hides it there, if one does."""
-    assert track.place is not None
-    x, y = track.place.mean[:2].tolist()
-    side = site.hiding_side(math.atan2(y, x))
-    if side is not None and (not track.seen or track.unseen_ns(track.updated_ns) > REOCCLUSION_NS):
-        track.side, track.seen, track.came_from = side, False, 1.0
-
-
-def _miss(
-    track: Track,
-    past: float,
+    tracks: Tracks,
+    found: _Found,
+    chances: FloatArray,
     scans: Sequence[Scan],
-    asked: CoEvidence | None,
-    views: Sequence[Sector],
     stamp_ns: int,
     site: SiteGeometry,
 ) -> None:
-    """Update the last answer about a track that none of the looks of an instant has found."""
-    if track.detected:
-        miss_rate = _miss_rate(scans, track.motion.azimuth_rad)
-        # Where only other cameras have looked, or a radar elsewhere, the last answer holds.
-        holds = asked is None or any(one.touches(track.motion.azimuth_rad) for one in views)
-        if miss_rate is not None and asked is not None and _has_left(track, past, miss_rate, stamp_ns, site):
-            miss_rate, holds = None, False
+    """Update the found tracks; those not in view before take their side and class there."""
+    rows, by, detections = found
+    was_seen = tracks.seen[rows].tolist()
+    tracks.updated_ns[rows] = stamp_ns
+    for i, j, known in zip(rows.tolist(), by.tolist(), was_seen, strict=True):
+        tracks.sources[i] = merged(tracks.sources[i], scans[0].source)
+        if classes := detections.classes[j]:
+            tracks.labels[i] = relabelled(tracks.labels[i], classes) if known else classes
+    moving = detections.moving[by]
+    tracks.moving[rows] = np.where(np.isnan(moving), tracks.moving[rows], moving > 0.0)
+    if detections.positions:
+        tracks.approach_heard[rows] = True  # By the velocity of its position
     else:
-        # What is only heard was asked of in the sector of its sound.
-        miss_rate, holds = asked.miss_rate if isinstance(asked, Absent) else None, asked is None
-    if miss_rate is not None:
-        track.answer, track.miss_rate = "absent", miss_rate
-    elif not holds:
-        track.answer, track.miss_rate = "unqueried", None
+        tracks.width_rad[rows] = detections.width_rad[by]
+    if not detections.in_sight:
+        return
+    azimuth_rad = detections.azimuth_rad[by]
+    for at, i in enumerate(rows.tolist()):
+        if not was_seen[at]:
+            tracks.side[i] = site.nearest_side(float(azimuth_rad[at]))
+            tracks.came_from[i] *= chances[i]
+    tracks.seen[rows], tracks.last_seen_ns[rows], tracks.answer[rows] = True, stamp_ns, "visible"
+    tracks.miss_rate[rows] = miss_rates(scans, azimuth_rad)
+
+
+def _announce(tracks: Tracks, row: int, site: SiteGeometry) -> None:
+    """Put a track that a message has placed on the side whose occluder hides it there, if one does."""
+    x, y = tracks.place_mean[row, :2].tolist()
+    side = site.hiding_side(math.atan2(y, x))
+    unseen_ns = tracks.unseen_ns(int(tracks.updated_ns[row]))[row]
+    if side is not None and (not tracks.seen[row] or unseen_ns > REOCCLUSION_NS):
+        tracks.side[row], tracks.seen[row], tracks.came_from[row] = side, False, 1.0
+
+
+def _miss(
+    memory: Memory,
+    rows: IndexArray,
+    scans: Sequence[Scan],
+    asked: CoEvidence | None,
+    stamp_ns: int,
+    site: SiteGeometry,
+) -> None:
+    """Update the last answer about the tracks that none of the looks of an instant has found."""
+    tracks, views = memory.tracks, _other_views(memory, scans)
+    azimuth_rad, detected = tracks.mean[rows, AZIMUTH], tracks.detected[rows]
+    # Where only other cameras have looked, or a radar elsewhere, the last answer holds. What is only heard
+    # was asked of in the sector of its sound.
+    rates, holds = miss_rates(scans, azimuth_rad), np.full(len(rows), asked is None)
+    rates[~detected] = asked.miss_rate if isinstance(asked, Absent) else math.nan
+    if asked is not None:
+        within = [any(one.touches(at) for one in views) for at in azimuth_rad.tolist()]
+        left = detected & _has_left(tracks, rows, rates, stamp_ns, site)
+        holds = detected & within & ~left
+        rates[left] = math.nan
+    absent = ~np.isnan(rates)
+    tracks.answer[rows[absent]], tracks.miss_rate[rows[absent]] = "absent", rates[absent]
+    unasked = rows[~absent & ~holds]
+    tracks.answer[unasked], tracks.miss_rate[unasked] = "unqueried", math.nan
 
 
 def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
@@ -352,14 +355,16 @@ def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
     return [Sector.between(*one.sector_rad) for one in asked if one.sector_rad is not None]
 
 
-def _has_left(track: Track, past: float, miss_rate: float, stamp_ns: int, site: SiteGeometry) -> bool:
-    r"""Tell whether the likelier reason of a miss is that its leading end has passed the edge ahead of it.
+def _has_left(
+    tracks: Tracks, rows: IndexArray, rates: FloatArray, stamp_ns: int, site: SiteGeometry
+) -> BoolArray:
+    r"""Tell whether the likelier reason of a miss is that a leading end has passed the edge ahead of it.
 
     .. math:: p \ge (1 - p)\, \beta^{\min(t / T, 1)}
 
-    with the chance p of that, the time t since its last box and the interval T of looks. Boxes end as soon as
+    with the chance p of that, the time t since the last box and the interval T of looks. Boxes end as soon as
     a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
     """
-    unseen = track.unseen_ns(stamp_ns) / nanoseconds(site.settings.look_interval_s)
-    missed = math.pow(miss_rate, min(unseen, 1.0))
-    return 0.0 < past >= (1.0 - past) * missed
+    past = leaving(tracks, site)[rows]
+    unseen = tracks.unseen_ns(stamp_ns)[rows] / nanoseconds(site.settings.look_interval_s)
+    return (past > 0.0) & (past >= (1.0 - past) * rates ** np.minimum(unseen, 1.0))

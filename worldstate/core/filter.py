@@ -291,7 +291,7 @@ class FilterRecord:
         if any(len(one.statistic) > self.policy.sustain_hops for one in rules):
             raise InvalidArgumentError("memory.rules: expected statistics of the policy's rule")
         announced = [side for one in rules for side in one.announced]
-        named = max((*announced, *(track.side for track in memory.tracks)), default=0)
+        named = max((*announced, *memory.tracks.side.tolist()), default=0)
         if len(memory.history) != k or named >= k:
             raise InvalidArgumentError("memory: expected known sides")
 

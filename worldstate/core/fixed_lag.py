@@ -101,6 +101,8 @@ class FixedLag:
 
     def _at(self, stamp_ns: int) -> list[Timed]:
         """Return what was taken of one instant, in its order."""
+        if not self.arrivals or stamp_ns > self.arrivals[-1].measurement.stamp_ns:
+            return []
         first, end = (side(self.arrivals, stamp_ns, key=_STAMP_NS) for side in (bisect_left, bisect_right))
         return [one.measurement for one in self.arrivals[first:end]]
 

@@ -1,16 +1,16 @@
 """The state that the filter carries from one call to the next."""
 
 from dataclasses import dataclass, field
-from typing import TypeAlias, TypeVar
+from typing import Annotated, TypeAlias, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
 from worldstate.abduction.road_users import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.side_belief import SideBelief
-from worldstate.belief.track import Track
+from worldstate.belief.track import Track, Tracks
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
-from worldstate.ground.serialisation import Count, Probability
+from worldstate.ground.serialisation import Count, Probability, Via
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing, Heard
 from worldstate.state import Context, Event, Relation
@@ -106,7 +106,9 @@ class Memory:
     # By single windows, until a sequence is read, which then is the only belief.
     belief: Belief
     history: tuple[SideHistory, ...]
-    tracks: tuple[Track, ...] = ()  # Entities
+    tracks: Annotated[Tracks, Via(tuple[Track, ...], Tracks.rows, Tracks.of)] = field(
+        default_factory=lambda: Tracks.of(())
+    )
     counts: Counts = field(default_factory=Counts)
     last: LastSaid = field(default_factory=LastSaid)
     # How far the threshold has moved, where the policy lets it.
@@ -129,7 +131,7 @@ class Memory:
     def draft(self) -> "Memory":
         """Return a copy that a step may write into."""
         own = draft_of(self)
-        own.history, own.tracks = tuple(map(draft_of, self.history)), tuple(map(draft_of, self.tracks))
+        own.history, own.tracks = tuple(map(draft_of, self.history)), self.tracks.draft()
         own.counts, own.last = draft_of(self.counts), draft_of(self.last)
         own.rules, own.looks = dict(self.rules), dict(self.looks)
         return own

@@ -8,7 +8,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import STATED
 from worldstate.belief.site_geometry import normal_share
-from worldstate.belief.track import Track, hidden_share, side_weights
+from worldstate.belief.track import Track, Tracks, hidden_shares, side_weights
 from worldstate.ground import FloatArray, nanoseconds
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
@@ -26,15 +26,24 @@ _BESIDE = 10.0  # Metres ahead that a metre beside the lane counts for
 _LEAST = 0.05  # What is less likely is not named
 
 
-def relations_at(memory: Memory, tracks: Sequence[Track], context: Context) -> tuple[Relation, ...]:
+def relations_at(memory: Memory, tracks: Tracks, context: Context) -> tuple[Relation, ...]:
     """Return the relations of some tracks, with the interval in which each has held by those in memory."""
+    # What a camera alone has found, first in view, has none.
+    related = ~tracks.seen | (tracks.came_from >= _LEAST) | tracks.approach_heard | tracks.placed
+    if not memory.relations and not related.any():
+        return ()
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
-    edges = [one for track in tracks for one in _edges(track, memory, context)]
-    placed = [one for one in tracks if one.place and one.place.known]
+    shares, some = hidden_shares(tracks, memory.sides)[related].tolist(), tracks.taken(related).rows()
+    edges = [
+        one
+        for track, share in zip(some, shares, strict=True)
+        for one in _edges(track, share, memory, context)
+    ]
+    placed = [one for one in some if one.place and one.place.known]
     if placed:
         edges += _between(placed, memory.stamp_ns, context)
     now = {(one.src, one.dst, one.kind): one for one in edges}
-    names = {track.id for track in tracks}
+    names = set(tracks.id)
     for key, edge in before.items():
         if key not in now and edge.src in names:
             now[key] = Relation(*key, 0.0, memory.stamp_ns)
@@ -54,11 +63,10 @@ def _held(edge: Relation, before: Relation | None) -> Relation:
     return replace(edge, since_ns=since_ns, until_ns=until_ns)
 
 
-def _edges(track: Track, memory: Memory, context: Context) -> Iterator[Relation]:
+def _edges(track: Track, share: float, memory: Memory, context: Context) -> Iterator[Relation]:
     """Yield the relations of one entity to its occluder and to the ego vehicle."""
     occluder, stamp_ns = context.occluders[track.side].id, memory.stamp_ns
     if not track.seen:
-        share = hidden_share(track, memory.sides)
         for k, one in enumerate(context.occluders):
             hidden = share * side_weights(track, len(context.occluders))[k]
             if track.may_be_on(k):

@@ -50,12 +50,11 @@ def heard_beside(memory: Memory, measurement: Measurement) -> Heard:
     The belief moves by the sequence's own reading, which was learned where vehicles mask one another.
     """
     heard = measurement.heard
-    near = [
-        one.existence
-        for one in memory.tracks
-        if one.moving and one.unseen_ns(measurement.stamp_ns) <= _JUST_LEFT_NS
-    ]
-    in_view = max([*near, 0.0 if memory.sequence is None else memory.sequence.in_view], default=0.0)
+    tracks = memory.tracks
+    near = tracks.moving & (tracks.last_seen_ns >= measurement.stamp_ns - _JUST_LEFT_NS)
+    in_view = float(tracks.existence[near].max(initial=0.0))
+    if memory.sequence is not None:
+        in_view = max(in_view, memory.sequence.in_view)
     share = 1.0 - in_view * (1.0 - float(np.interp(heard.excess_db, _EXCESS_DB, _NOTICED)))
     if share >= min(heard.share, _SAID):
         return heard

@@ -22,8 +22,8 @@ from worldstate.belief.kinematics.motion import (
 )
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import HIDDEN_BIAS_STD, SiteGeometry
-from worldstate.belief.track import Track, acceleration_psd, hidden_share
-from worldstate.ground import FloatArray, seconds
+from worldstate.belief.track import Track, Tracks, acceleration_psd, hidden_shares
+from worldstate.ground import seconds
 from worldstate.state import Classification, Context, Entity, Hearing, SearchedView, SensorHealth, Visibility
 from worldstate.state.entity import AzimuthSource, SideShare
 from worldstate.state.sensor import Ego
@@ -34,11 +34,10 @@ from .sequence_memory import SequenceMemory
 # Beyond two seconds vehicles at junctions have turned or braked.
 _AFTER_S = np.array([1.0, 2.0])
 _CUBES = _AFTER_S**3 / 3.0
-_NAMES = tuple(f"{after_s:g}" for after_s in _AFTER_S)
 Forecast: TypeAlias = dict[str, tuple[float, float]]
 
 
-def forecasts(tracks: tuple[Track, ...], means: FloatArray, covariances: FloatArray) -> list[Forecast]:
+def forecasts(tracks: Tracks) -> list[Forecast]:
     r"""Return where entities will be, one forecast a track: constant velocity, all of them at once.
 
     With the state :math:`(\theta, \dot\theta, \rho, \log r)` and its covariance P, after t seconds
@@ -48,22 +47,22 @@ def forecasts(tracks: tuple[Track, ...], means: FloatArray, covariances: FloatAr
               \sigma_t^2 = h^T P h + \frac{s t^3}{3 r^2 q}, \quad h = (1, a t / q, -b t / q, 0),
 
     with white acceleration of density s.
-
-    Shapes: means (n, 4), covariances (n, 4, 4).
     """
-    theta, omega, rho, log_range = means.T[:, :, None]
+    theta, omega, rho, log_range = tracks.mean.T[:, :, None]
     a, b = 1.0 + rho * _AFTER_S, omega * _AFTER_S
     q = np.maximum(a * a + b * b, LEAST_Q)
     gradient = np.stack([np.ones_like(a), a * _AFTER_S / q, -b * _AFTER_S / q], axis=-1)
-    known = (gradient @ covariances[:, :LOG_RANGE, :LOG_RANGE] * gradient).sum(axis=-1)
-    density = np.array([acceleration_psd(one) for one in tracks])
+    known = (gradient @ tracks.covariance[:, :LOG_RANGE, :LOG_RANGE] * gradient).sum(axis=-1)
+    density = acceleration_psd(tracks.moving)
     range_m = np.exp(np.minimum(np.maximum(log_range, math.log(NEAREST_M)), math.log(FARTHEST_M)))
     variance = known + density[:, None] * _CUBES / (range_m**2 * q)
     azimuth_rad = theta + np.arctan2(b, a)
     azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
     # Full precision would take twice as long to write.
     rows = np.stack([azimuth_rad, np.sqrt(variance)], axis=-1)
-    return [dict(zip(_NAMES, map(tuple, row), strict=True)) for row in rows.round(6).tolist()]
+    return [
+        {"1": (mean, std), "2": (then, then_std)} for (mean, std), (then, then_std) in rows.round(6).tolist()
+    ]
 
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
@@ -82,23 +81,24 @@ _MOSTLY_MISSED = 0.5
 _Moments: TypeAlias = tuple[list[float], list[float], list[float], Forecast]
 
 
-def entities_of(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -> tuple[Entity, ...]:
+def entities_of(tracks: Tracks, memory: Memory, site: SiteGeometry) -> tuple[Entity, ...]:
     """Return some tracks as published entities."""
-    if not tracks:
-        return ()
     # All at once: a number taken out of an array by itself costs as much as a row.
-    means = np.array([track.motion.mean for track in tracks])
-    covariances = np.array([track.motion.covariance for track in tracks])
-    stds = np.sqrt(covariances.diagonal(axis1=1, axis2=2))
-    lists = (array.round(_DIGITS).tolist() for array in (means, stds, covariances[:, *_UPPER]))
-    moments = zip(*lists, forecasts(tracks, means, covariances), strict=True)
+    stds = np.sqrt(tracks.covariance.diagonal(axis1=1, axis2=2))
+    lists = (array.round(_DIGITS).tolist() for array in (tracks.mean, stds, tracks.covariance[:, *_UPPER]))
+    shares, moments = (
+        hidden_shares(tracks, memory.sides).tolist(),
+        zip(*lists, forecasts(tracks), strict=True),
+    )
     build = partial(_entity, memory, memory.sides, site)
-    return tuple(map(build, tracks, moments))
+    return tuple(map(build, tracks.rows(), shares, moments))
 
 
-def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track, moments: _Moments) -> Entity:
+def _entity(
+    memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track, share: float, moments: _Moments
+) -> Entity:
     mean, std, (variance, mixed, rate_variance), forecast = moments
-    share, existence = hidden_share(track, sides), existence_of(track, sides)
+    existence = existence_of(track, sides)
     hidden = share >= 0.5
     heard_only = hidden and track.place is None
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
@@ -138,7 +138,7 @@ def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track,
 def _classes(track: Track) -> tuple[Classification, ...]:
     """Return the class probabilities of a track; what no label has is unknown, so that they sum to one."""
     classes = [Classification(label, share) for label, share in track.labels if label != UNKNOWN]
-    rest = 1.0 - sum(one.probability for one in classes)
+    rest = 1.0 - sum([one.probability for one in classes])
     return (*classes, Classification(UNKNOWN, round(rest, _DIGITS))) if rest > _ROUNDING else tuple(classes)
 
 
@@ -196,8 +196,10 @@ def _azimuth_source(track: Track | None, motion: MotionBelief, site: SiteGeometr
 
 def _side_shares(track: Track, memory: Memory, site: SiteGeometry) -> tuple[SideShare, ...]:
     """Return the parts of the azimuth density of an entity that may be on several sides."""
+    if track.of_side is not None:
+        return ()
     shares = {k: share for k, share in enumerate(track.side_shares) if share > 0.0}
-    if track.of_side is not None or len(shares) < 2:
+    if len(shares) < 2:
         return ()
     at = {k: hidden_azimuth(k, track, memory.sequence, site)[:2] for k in shares}
     return tuple(SideShare(site.sides[k].label, round(share, _DIGITS), *at[k]) for k, share in shares.items())

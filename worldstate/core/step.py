@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from worldstate.belief.association import HANDOVER_RESIDUAL
 from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.kinematics.cartesian import corrected, driven
+from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import Track, hidden_share, predict_tracks, turn
+from worldstate.belief.track import Tracks, hidden_shares, predict_tracks, turn
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
 
@@ -16,6 +19,7 @@ from .birth_death import (
     birth_death,
     events_between,
     hidden_on,
+    hidden_rows,
     merge_tracks,
     past_edges,
     published,
@@ -47,23 +51,26 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     else:
         memory.belief = memory.belief.predict(model.context.rates.values_hz, step_ns)
     memory.ego = memory.ego and driven(memory.ego, seconds(step_ns))
-    announced_before = [track for track in before.tracks if not track.seen and track.place is not None]
-    if announced_before:
-        _pass_places(announced_before, memory, model)
+    if (before.tracks.placed & ~before.tracks.seen).any():
+        _pass_places(before.tracks, memory, model)
     return memory
 
 
-def _pass_places(before: Sequence[Track], memory: Memory, model: FilterModel) -> None:
+def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
     """Update the memory after announced entities have come past their edge, or their place was lost."""
-    now = {track.id: track for track in memory.tracks}
-    emerged = tuple(old.side for old in before if old.behind >= 0.5 > now[old.id].behind)
+    tracks, emerged, gone = memory.tracks, list[int](), list[int]()
+    now = {name: row for row, name in enumerate(tracks.id)}
     # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
     heard = [chance >= model.site.settings.birth_probability for chance in memory.sides.hidden]
-    for old in before:
-        others = [one for one in memory.tracks if not one.seen and one.place is None and one.side == old.side]
-        lost = now[old.id]
-        if lost in others and (len(others) > 1 or not heard[old.side]):
-            memory.tracks = tuple(one for one in memory.tracks if one is not lost)
+    for old in np.flatnonzero(before.placed & ~before.seen).tolist():
+        row, side = now[before.id[old]], int(before.side[old])
+        if before.behind[old] >= 0.5 > tracks.behind[row]:
+            emerged.append(side)
+        only_heard = np.flatnonzero(~tracks.detected & (tracks.side == side)).tolist()
+        others = [one for one in only_heard if one not in gone]
+        if row in others and (len(others) > 1 or not heard[side]):
+            gone.append(row)
+    memory.tracks = tracks.without(gone)
     past_edges(memory, dict.fromkeys(emerged, HANDOVER_RESIDUAL), (), memory.stamp_ns)
 
 
@@ -129,26 +136,29 @@ def _place_hidden(memory: Memory, site: SiteGeometry) -> None:
     """Put the entities that are only heard and hidden where the sequence has them."""
     if memory.sequence is None:
         return
-    coming, sides = memory.sequence.coming, memory.sides
-    for one in memory.tracks:
-        if not one.detected and (share := hidden_share(one, sides)) >= HIDDEN:
-            one.motion = hidden_motion(coming[one.side], share, site.sides[one.side], one.motion)
+    tracks, coming = memory.tracks, memory.sequence.coming
+    shares = hidden_shares(tracks, memory.sides)
+    for i in np.flatnonzero(~tracks.detected & (shares >= HIDDEN)).tolist():
+        side, before = tracks.side[i], MotionBelief(tracks.mean[i], tracks.covariance[i])
+        tracks.put(i, hidden_motion(coming[side], float(shares[i]), site.sides[side], before))
 
 
 def _keep_likeliest(memory: Memory) -> None:
     """Keep the likeliest tracks; boxes and claims do not push out what is only heard."""
     tracks = memory.tracks
     if len(tracks) > MOST_TRACKS:
-        order = sorted(range(len(tracks)), key=lambda i: (tracks[i].detected, -tracks[i].existence))
-        memory.tracks = tuple(tracks[i] for i in sorted(order[:MOST_TRACKS]))
+        order = np.lexsort((-tracks.existence, tracks.detected))
+        memory.tracks = tracks.taken(np.sort(order[:MOST_TRACKS]))
         memory.counts.left_out += len(tracks) - MOST_TRACKS
 
 
 def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
     """Return the sides whose vehicle of before is in view now, from whichever side it came."""
-    seen = {one.id for one in memory.tracks if one.seen}
+    if not hidden_rows(before.tracks):
+        return []
+    seen = set(memory.tracks.id[memory.tracks.seen])
     told = (hidden_on(before.tracks, k) for k in range(len(before.history)))
-    return [k for k, one in enumerate(told) if one is not None and one.id in seen]
+    return [k for k, row in enumerate(told) if row is not None and before.tracks.id[row] in seen]
 
 
 def _note_advisories(

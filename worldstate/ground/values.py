@@ -82,6 +82,8 @@ def wrap_angle(angle_rad: AngleT) -> AngleT:
     if isinstance(angle_rad, float):
         # Ten times as fast as an array of one angle, of which a step of the filter has hundreds.
         return math.pi - (math.pi - float(angle_rad)) % (2.0 * math.pi)
+    if isinstance(angle_rad, np.ndarray) and angle_rad.ndim and angle_rad.dtype == np.float64:
+        return np.pi - np.mod(np.pi - angle_rad, 2 * np.pi)
     wrapped = np.pi - np.mod(np.pi - np.asarray(angle_rad, dtype=np.float64), 2 * np.pi)
     return float(wrapped) if np.ndim(angle_rad) == 0 else wrapped  # type: ignore[return-value]
 

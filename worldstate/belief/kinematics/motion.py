@@ -20,6 +20,7 @@ Aidala and Hammel, "Utilization of modified polar coordinates for bearings-only 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Self, TypeAlias
 
 import numpy as np
@@ -59,11 +60,16 @@ def propagate(state: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]
 
 def process_noise(acceleration_psd: _Numbers, range_m: _Numbers, step_s: float) -> FloatArray:
     r"""Return Q, shape (..., 4, 4), of a white acceleration: at range r it turns and closes by a/r."""
+    strength = np.asarray(acceleration_psd / np.square(range_m))
+    return np.asarray(strength[..., None, None] * _unit_noise(step_s))
+
+
+@lru_cache(maxsize=64)
+def _unit_noise(step_s: float) -> FloatArray:
     twice, once, rate = step_s**3 / 3.0, step_s**2 / 2.0, step_s
-    unit = np.array(
+    return np.array(
         [[twice, once, 0.0, 0.0], [once, rate, 0.0, 0.0], [0.0, 0.0, rate, once], [0.0, 0.0, once, twice]]
     )
-    return np.asarray(np.asarray(acceleration_psd / np.square(range_m))[..., None, None] * unit)
 
 
 def _checked_covariance(row: FloatArray) -> FloatArray:
@@ -87,11 +93,13 @@ def conditioned(covariance: FloatArray, largest_std: float) -> FloatArray:
     A deviation above the largest one says nothing, but leaves no digits to the others.
     """
     covariance = 0.5 * (covariance + covariance.mT)
-    variance = np.einsum("...ii->...i", covariance)  # A view
-    if variance.max() > largest_std**2:
+    variance = covariance.reshape(*covariance.shape[:-2], 16)[..., ::5]  # A view
+    largest = variance.max(axis=-1, keepdims=True)
+    if (largest > largest_std**2).any():
         scale = np.minimum(largest_std / np.sqrt(np.maximum(variance, LEAST_STD**2)), 1.0)
         covariance *= _outer(scale, scale)
-    variance += _CONDITION * variance.max(axis=-1, keepdims=True)
+        largest = variance.max(axis=-1, keepdims=True)
+    variance += _CONDITION * largest
     return covariance
 
 
@@ -137,9 +145,7 @@ class MotionBelief(GaussianBelief):
     """
 
     @classmethod
-    def around(
-        cls, mean: tuple[float, float, float, float], std: tuple[float, float, float, float]
-    ) -> "MotionBelief":
+    def around(cls, mean: Sequence[float], std: Sequence[float]) -> "MotionBelief":
         """Return independent components."""
         return cls(np.array(mean), np.diag(np.square(np.clip(std, LEAST_STD, LARGEST_STD))))
 
@@ -201,11 +207,11 @@ def relax(
     return _belief(towards.mean + phi * offset, covariance)
 
 
-def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: float) -> float:
+def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: _Numbers) -> FloatArray:
     """Return log N(z; theta, P_theta + R) of a bearing, residual wrapped, nats per rad."""
-    variance = float(belief.covariance[AZIMUTH, AZIMUTH]) + std_rad**2
-    residual = wrap_angle(azimuth_rad - belief.azimuth_rad)
-    return -0.5 * (residual**2 / variance + math.log(2.0 * math.pi * variance))
+    variance = belief.covariance[..., AZIMUTH, AZIMUTH] + np.square(std_rad)
+    residual = wrap_angle(azimuth_rad - belief.mean[..., AZIMUTH])
+    return np.asarray(-0.5 * (residual**2 / variance + np.log(2.0 * math.pi * variance)))
 
 
 def update(
