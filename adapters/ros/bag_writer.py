@@ -98,10 +98,7 @@ def write_bag(
 
     The stamps of detections and speeds count from the start of the recording; `start_ns` is added to all.
     """
-    with (
-        open_sound(sound, array.n_microphones, strict=False) as audio,
-        bag_writer(path, storage) as write,
-    ):
+    with open_sound(sound, array.n_microphones, strict=False) as audio, bag_writer(path, storage) as write:
         write(ARRAY_TOPIC, types.ARRAY, start_ns, _array(array, start_ns))
         rate_hz, taken = audio.sample_rate_hz, 0
         events = heapq.merge(

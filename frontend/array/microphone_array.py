@@ -228,10 +228,7 @@ class MicrophoneArray:
         return np.asarray(-(directions @ self.positions_m.T) / SPEED_OF_SOUND_M_S)
 
     def steering(
-        self,
-        frequencies_hz: ArrayLike,
-        azimuths_rad: ArrayLike,
-        elevations_rad: ArrayLike = 0.0,
+        self, frequencies_hz: ArrayLike, azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0
     ) -> Complex128Array:
         r"""Return steering vectors at given frequencies and directions.
 

@@ -272,11 +272,7 @@ class ChannelMonitor:
         return self._dropout_finder.lost
 
     def push(
-        self,
-        samples: Float32Array,
-        energies: FloatArray,
-        powers: Float32Array,
-        matrices: Complex64Array,
+        self, samples: Float32Array, energies: FloatArray, powers: Float32Array, matrices: Complex64Array
     ) -> ArrayHealth:
         r"""Take the hop that `find_lost` took, its lost frames left out; return channels to keep and faults.
 

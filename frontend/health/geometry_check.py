@@ -379,11 +379,7 @@ _NOISE = 0.2
 _UNUSABLE = 1e3
 
 
-def position_weights(
-    array: MicrophoneArray,
-    frequencies_hz: FloatArray,
-    usable: BoolArray,
-) -> Float32Array:
+def position_weights(array: MicrophoneArray, frequencies_hz: FloatArray, usable: BoolArray) -> Float32Array:
     r"""Weights of all other microphones in the prediction at every position.
 
     .. math:: w_{pj} = -\frac{(\Gamma + \Lambda)^{-1}_{pj}}{(\Gamma + \Lambda)^{-1}_{pp}}, \qquad

@@ -161,9 +161,7 @@ class PassLabel:
 
 
 def label_passes(
-    tracks: Sequence[BoxTrack],
-    camera_ahead_m: float = 0.0,
-    on_pass: Callable[[], None] = lambda: None,
+    tracks: Sequence[BoxTrack], camera_ahead_m: float = 0.0, on_pass: Callable[[], None] = lambda: None
 ) -> list[PassLabel]:
     """Return the labels of all vehicles that came out of an arm, in the order of their boxes.
 

@@ -40,11 +40,7 @@ def bearings_csv(track: HopTable) -> str:
 
 
 def track_bearings(
-    audio: Audio,
-    front_end: FrontEnd,
-    *,
-    count: bool = False,
-    on_second: Callable[[], None] = lambda: None,
+    audio: Audio, front_end: FrontEnd, *, count: bool = False, on_second: Callable[[], None] = lambda: None
 ) -> HopTable:
     """Read the bearing of every hop of an open recording, and count the sources of every second."""
     rows: list[tuple[float, ...]] = []

@@ -138,10 +138,7 @@ class RecordingReport:
 
 
 def run_recording(
-    source: Source,
-    *,
-    states_path: Path | None = None,
-    on_hop: Callable[[Step], None] = lambda step: None,
+    source: Source, *, states_path: Path | None = None, on_hop: Callable[[Step], None] = lambda step: None
 ) -> RecordingReport:
     """Listen to `source` to its end.
 

@@ -257,11 +257,7 @@ def write_birds_eye(state: WorldState, path: Path, *, title: str = "") -> None:
 
 
 def write_animation(
-    states: Sequence[WorldState],
-    path: Path,
-    *,
-    title: str = "",
-    on_frame: Callable[[], None] = lambda: None,
+    states: Sequence[WorldState], path: Path, *, title: str = "", on_frame: Callable[[], None] = lambda: None
 ) -> None:
     """Draw every snapshot from above into a GIF that plays at the speed of the recording."""
     check_gif(path)
