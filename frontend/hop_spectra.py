@@ -19,16 +19,8 @@ from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, sp
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import (
-    BoolArray,
-    Complex64Array,
-    Complex128Array,
-    Float32Array,
-    FloatArray,
-    IntArray,
-)
-from worldstate.ground.values import LEAST_HEARD
+from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError
+from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array
 
 from .settings import ELEVATIONS_RAD, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 

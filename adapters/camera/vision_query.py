@@ -16,14 +16,8 @@ from worldstate.abduction.co_evidence import (
     Unqueried,
     default_miss_rates,
 )
-from worldstate.ground import (
-    InputFileError,
-    InvalidArgumentError,
-    NotUsable,
-    nanoseconds,
-    seconds,
-    wrap_angle,
-)
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
+from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
 from .detections import DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked

@@ -16,16 +16,7 @@ from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import Via, encode
 from worldstate.ground.values import NotUsable, seconds
-from worldstate.operations.figure_style import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    figure_file,
-    legend_beside,
-)
+from worldstate.operations import figure_style as style
 
 # Of a rate by another clock: an error of four standard deviations is significant, one false report in 16,000.
 _SIGNIFICANT = 4.0
@@ -46,12 +37,12 @@ _LISTED_DROPOUTS = 100
 _COLOURS = {
     "dead": "gray",
     "intermittent": "silver",
-    "noisy": RED,
-    "inverted": PURPLE,
-    "swapped": ORANGE,
+    "noisy": style.RED,
+    "inverted": style.PURPLE,
+    "swapped": style.ORANGE,
     "clipped": "tab:brown",
-    "offset": SKY,
-    "level": BLUE,
+    "offset": style.SKY,
+    "level": style.BLUE,
 }
 # Areas of markers, points squared: one that holds a number of two digits, one that fits a line of the legend,
 # and how much smaller a second fault is drawn on the first.
@@ -242,10 +233,10 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
     """Draw the microphones across their two widest axes, coloured by fault, channels counted from 1."""
     across, up = sorted(np.argsort(array.aperture_m)[-2:].tolist())
     place = array.centred_m[:, [across, up]]
-    with figure_file(path, 7.5, 6.0) as figure:
+    with style.figure_file(path, 7.5, 6.0) as figure:
         axes = figure.add_subplot()
-        axes.scatter(place[:, 0], place[:, 1], s=_AREA, color=GREEN, alpha=0.35, lw=0)
-        axes.scatter([], [], s=_LEGEND_AREA, color=GREEN, alpha=0.35, lw=0, label="well")
+        axes.scatter(place[:, 0], place[:, 1], s=_AREA, color=style.GREEN, alpha=0.35, lw=0)
+        axes.scatter([], [], s=_LEGEND_AREA, color=style.GREEN, alpha=0.35, lw=0, label="well")
         drawn: Counter[int] = Counter()
         for fault in sorted({verdict.fault for verdict in health.verdicts}):
             channels = [verdict.channel for verdict in health.verdicts if verdict.fault == fault]
@@ -267,7 +258,7 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
         if across == 1:
             axes.invert_xaxis()  # left is left
         axes.set_title(f"{array.n_microphones} microphones {_VIEWS[across, up]}; channels from 1")
-        legend_beside(axes)
+        style.legend_beside(axes)
 
 
 def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stance: str) -> dict[str, object]:
