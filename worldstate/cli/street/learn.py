@@ -79,7 +79,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-
     ground.in_range("--days", arguments.days, 0.0, 1e5)
     if arguments.detections and len(arguments.input) > 1:
         raise InvalidArgumentError("--detections: expected one INPUT with it, they are of one recording")
