@@ -34,7 +34,7 @@ from worldstate.abduction.road_users import (
     neutral,
     with_siren,
 )
-from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
+from worldstate.abduction.sequence.sequence_inputs import SIDES, hop_columns
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
 from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.adapters.camera.vision_query import SeveralCameras
@@ -345,7 +345,7 @@ def read_hop(
     rate_hz = std_hz = np.nan
     if not isinstance(looming, NotUsable):
         rate_hz, std_hz = looming.inverse_tta_hz, looming.std_hz
-    evidence = HopEvidence.heard(
+    columns = hop_columns(
         np.array([sides.log_ratios]),
         np.array([sides.visible]),
         feature=frame.feature[None],
@@ -355,7 +355,7 @@ def read_hop(
         looming_std_hz=np.array([std_hz]),
         bearing_rad=np.array([frame.bearing_rad]),
     )
-    return reader.read(evidence, frame.feature)
+    return reader.read(columns, frame.feature)
 
 
 def heard_of(frame: AcousticFrame) -> Heard:

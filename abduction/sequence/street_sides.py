@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import freeze_arrays, in_range
+from worldstate.ground.checks import freeze_arrays
 
 from .sequence_inputs import SIDES
 from .sequence_model import COMING_S, GROUPS
@@ -63,11 +63,6 @@ class StreetSides:
     weights: FloatArray  # shape (12,): Per nat of a sector
     offset: float
     certainty: float  # In [0, 1]: of few passes, less
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, weights=(SECTORS,))
-        in_range("offset", self.offset, -1e9, 1e9)
-        in_range("certainty", self.certainty, 0.0, 1.0)
 
     def log_ratio(self, feature: FloatArray) -> FloatArray:
         """Return the log-odds of left against right by the windows' own patterns, shape (n,)."""
