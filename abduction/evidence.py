@@ -7,6 +7,7 @@ done in nats, and a prior of zero is a log of -inf.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -116,6 +117,15 @@ class SignatureEvidence:
     def log_likelihoods(self) -> np.ndarray:
         """The vector (hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
         return np.array([*self.hidden, self.visible, self.none], dtype=np.float64)
+
+    @property
+    def likelier_side(self) -> Literal["left", "right"] | None:
+        """The side with the higher likelihood, None if they are equal or no sides."""
+        by_direction = dict(zip(self.directions, self.hidden, strict=True))
+        left, right = by_direction.get("left"), by_direction.get("right")
+        if left is None or right is None or left == right:
+            return None
+        return "left" if left > right else "right"
 
 
 def _check_each(name: str, values: object, directions: Sequence[str]) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from operator import itemgetter
 from typing import Protocol
 
@@ -10,29 +10,17 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
-from worldstate.abduction.grounding.grounded_likelihood import (
-    Descriptor,
-    GroundedAnswer,
-    GroundedObservation,
-    GroundedSettings,
-    Observable,
-    car,
-    ground,
-    motorcycle,
-)
+from worldstate.abduction.grounding.grounded_likelihood import LINE_SPACING, GroundedObservation, Observable
+from worldstate.abduction.grounding.grounded_likelihood import Grounding as Grounding
 from worldstate.abduction.road_users import (
-    SEEN_AS,
-    SIREN,
-    UNKNOWN,
     ClassShares,
     DomainGuard,
     DomainVerdict,
     Foreign,
     RoadUserModel,
-    WarningSignal,
-    likeliest,
+    expected_labels,
+    heard_kinds,
     neutral,
-    with_siren,
 )
 from worldstate.abduction.sequence.sequence_inputs import SIDES, hop_columns
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
@@ -49,22 +37,11 @@ from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import NotUsable, OutOfDomainError, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.measurement.measurement import (
-    Approach,
-    Bearing,
-    CoEvidenceChannel,
-    Heard,
-    Measurement,
-    MeasurementAdapter,
-    Side,
-)
+from worldstate.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
+from worldstate.measurement.measurement import MeasurementAdapter
 
 # Loudness is the mean of these bands: of others it would not be what a sequence was trained on.
 LEVEL_BAND_HZ = (50.0, 2700.0)
-# Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
-# would take a wrong guess of the ear for a look at the right thing.
-_ASKED = 0.95
-LINE_SPACING = "line_spacing_hz"
 # Six simulated demos, error of the evidence of a side: .2 nats with 28 of 56 channels dead, 1.2 with 42, 2.1
 # with 50; .06 where a tenth of the samples clips, .7 with four tenths (the change within a second: .46).
 _DEAD, _CLIPPED = (0.5, 0.85), (0.1, 0.5)
@@ -93,42 +70,6 @@ class Signature(Protocol):
     def evidence(self, feature: FloatArray, /) -> SignatureEvidence:
         """Return log-likelihoods of one feature vector."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Grounding:
-    """Which road users are reckoned with, and which ties between their sound and their motion.
-
-    Parameters
-    ----------
-    descriptors : tuple of Descriptor
-        Classes of road users, at least one.
-    settings : GroundedSettings
-        Sectors, and couplings that are switched off.
-
-    Examples
-    --------
-    >>> scores = SignatureEvidence(("left", "right"), (1.0, -1.0), 0.0, 0.0)
-    >>> observation = GroundedObservation(inverse_tta_hz=Observable(0.4, 0.05))
-    >>> answer = Grounding().answer(scores, observation)
-    >>> answer.best.entity_class, answer.evidence.hidden[0] > 1.0
-    ('motor_vehicle', True)
-    """
-
-    descriptors: tuple[Descriptor, ...] = (car(), motorcycle())
-    settings: GroundedSettings = field(default_factory=GroundedSettings)
-
-    def answer(self, signature: SignatureEvidence, observation: GroundedObservation) -> GroundedAnswer:
-        """Return likelihoods of the explanations and the hidden state that explains the observation best.
-
-        Parameters
-        ----------
-        signature : SignatureEvidence
-            From calibrated scores.
-        observation : GroundedObservation
-            From `observe`.
-        """
-        return ground(signature, observation, self.descriptors, self.settings)
 
 
 class AcousticAdapter(MeasurementAdapter[Float32Array]):
@@ -395,7 +336,7 @@ def _answer(measurement: Measurement, vision: CoEvidenceChannel) -> CoEvidence:
     bearing, labels = measurement.bearing, expected_labels(measurement.kinds)
     if isinstance(bearing, Bearing) and bearing.std_rad <= _COARSE_STD_RAD:
         return vision.ask(measurement.stamp_ns, bearing, labels)
-    side = _likelier_side(measurement.signature)
+    side = measurement.signature.likelier_side
     return vision.ask(measurement.stamp_ns, NotUsable("coarse bearing"), labels, side)
 
 
@@ -419,41 +360,6 @@ def _array_fault(health: ArrayHealth | NotUsable) -> str | None:
         return None
     counts = Counter(one.fault.value for one in health.faults)
     return "microphones: " + ", ".join(f"{count} {fault}" for fault, count in sorted(counts.items()))
-
-
-def _likelier_side(signature: SignatureEvidence) -> Side | None:
-    """Return the side with the higher likelihood, None if they are equal or no sides."""
-    by_direction = dict(zip(signature.directions, signature.hidden, strict=True))
-    left, right = by_direction.get("left"), by_direction.get("right")
-    if left is None or right is None or left == right:
-        return None
-    return "left" if left > right else "right"
-
-
-def heard_kinds(model: RoadUserModel, character: FloatArray, domain: DomainVerdict | None) -> ClassShares:
-    """Return the classes of one hop; none where the sound is foreign."""
-    if isinstance(domain, Foreign):
-        return ()
-    shares = model.classify(character)
-    if isinstance(domain, WarningSignal) and domain.signal == SIREN:
-        return with_siren(shares, domain.log_odds)
-    return shares
-
-
-def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
-    """Return the detector's classes that what is heard may be; None where it may be anything.
-
-    Examples
-    --------
-    >>> sorted(expected_labels((("car", 0.9), ("unknown", 0.01), ("van", 0.09))))
-    ['car', 'truck']
-    >>> expected_labels((("car", 0.9), ("unknown", 0.1))) is expected_labels(()) is None
-    True
-    """
-    likely = likeliest(kinds, _ASKED)
-    if not likely or likely & {UNKNOWN, SIREN}:
-        return None
-    return frozenset().union(*(SEEN_AS[name] for name in likely))
 
 
 def observe(
