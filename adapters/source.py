@@ -114,11 +114,8 @@ class ListenSettings:
 
     def site(self) -> SiteEstimateSettings | None:
         """Return how the site is learned, None for not at all."""
-        if not self.site_adaptation:
-            return None
-        return (
-            SiteEstimateSettings() if self.forgetting_s is None else SiteEstimateSettings(self.forgetting_s)
-        )
+        given = {} if self.forgetting_s is None else {"forgetting_s": self.forgetting_s}
+        return SiteEstimateSettings(**given) if self.site_adaptation else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -117,15 +117,13 @@ class HopSpectra:
         looming_bins = band_bins(LOOMING_BAND_HZ, sample_rate_hz, nfft)
         bands = (self.srp_bins, self.feature_bins, looming_bins)
         bins = range(min(b.start for b in bands), max(b.stop for b in bands))
-        self._srp, self._feature, self._looming = (
-            slice(b.start - bins.start, b.stop - bins.start) for b in bands
-        )
+        inside = (slice(b.start - bins.start, b.stop - bins.start) for b in bands)
+        self._srp, self._feature, self._looming = inside
         frequencies = bin_frequencies_hz(self.srp_bins, sample_rate_hz, nfft)
         # A row of elevation each: the few dimensions and nodes that do for one are too many for all together.
         azimuths = settings.azimuths_rad()
-        self.beams = tuple(
-            Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD
-        )
+        rows = (Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD)
+        self.beams = tuple(rows)
         self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft)
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft, self._order = nfft, settings.feature_order

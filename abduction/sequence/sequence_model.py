@@ -56,14 +56,12 @@ class BoostedTrees:
     baseline: FloatArray  # shape (classes,)
 
     def __post_init__(self) -> None:
-        trees, nodes = np.shape(self.split)
+        grid = trees, nodes = np.shape(self.split)
         if not (0 < trees <= MOST_TREES and 0 < nodes <= MOST_NODES):
-            raise InvalidArgumentError(
-                f"split: expected at most {MOST_TREES} trees of {MOST_NODES} nodes, got {(trees, nodes)}"
-            )
+            most = f"at most {MOST_TREES} trees of {MOST_NODES} nodes"
+            raise InvalidArgumentError(f"split: expected {most}, got {grid}")
         for name in ("split", "yes", "no", "tree_class"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.intp))
-        grid = (trees, nodes)
         freeze_arrays(self, threshold=grid, value=grid, baseline=(len(self.baseline),))
         here = np.arange(nodes)
         for name in ("yes", "no"):

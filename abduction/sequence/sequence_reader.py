@@ -58,10 +58,9 @@ class SequenceHistory:
 
     def heard(self, columns: FloatArray) -> "SequenceHistory":
         """Return the history one hop on, of `hop_columns` of one row."""
-        return SequenceHistory(
-            np.concatenate([self.recent[1 - inputs.MEMORY_HOPS :], columns]),
-            np.concatenate([self.minute[1 - inputs.QUIET_HOPS :], inputs.streets_own(columns)]),
-        )
+        recent = np.concatenate([self.recent[1 - inputs.MEMORY_HOPS :], columns])
+        minute = np.concatenate([self.minute[1 - inputs.QUIET_HOPS :], inputs.streets_own(columns)])
+        return SequenceHistory(recent, minute)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

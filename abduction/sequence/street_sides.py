@@ -169,9 +169,8 @@ class SidePatterns:
         about = np.array(self.squares) - crossed - crossed.T + (means.T * weights) @ means
         scatter = about / weights.sum()
         even = max(float(np.trace(scatter)) / SECTORS, _LEAST_SCATTER)
-        direction = np.linalg.solve(
-            (1.0 - _ROUND) * scatter + _ROUND * even * np.eye(SECTORS), means[0] - means[1]
-        )
+        rounded = (1.0 - _ROUND) * scatter + _ROUND * even * np.eye(SECTORS)
+        direction = np.linalg.solve(rounded, means[0] - means[1])
         offset, certainty = -0.5 * direction @ means.sum(axis=0), 1.0 / (1.0 + _DOUBT * (1.0 / weights).sum())
         return StreetSides(direction, float(offset), float(certainty))
 

@@ -302,9 +302,8 @@ class VisionQuery:
             return None
         angles = self.camera.off_axis(in_view.midpoints(SAMPLES))
         kept = self.keep.labels
-        seen = float(
-            np.mean([self.miss_rate.over(angles, d, one).mean() if one in kept else 1.0 for one in labels])
-        )
+        betas = [self.miss_rate.over(angles, d, one).mean() if one in kept else 1.0 for one in labels]
+        seen = float(np.mean(betas))
         share = in_view.half_width_rad / sector.half_width_rad
         return share * seen + (1.0 - share)
 

@@ -112,9 +112,8 @@ def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterato
 def image_message(stamp_ns: int, jpeg: bytes) -> LogMessage:
     """Return an image of the camera."""
     text = base64.b64encode(jpeg).decode("ascii")
-    return LogMessage(
-        IMAGE_TOPIC, stamp_ns, scene.CompressedImage(scene.SceneTime.of_ns(stamp_ns), "camera", text)
-    )
+    image = scene.CompressedImage(scene.SceneTime.of_ns(stamp_ns), "camera", text)
+    return LogMessage(IMAGE_TOPIC, stamp_ns, image)
 
 
 TIMELINE = "stream"
@@ -170,10 +169,8 @@ def _shapes(rr: ModuleType, item: scene.SceneItem) -> Iterator[tuple[str, object
         ahead = (arrow.shaft_length + arrow.head_length, 0.0, 0.0)
         yield "arrow", rr.Arrows3D(vectors=[ahead], colors=[_color(arrow.color)])
     if item.cubes:
-        centers, sizes = (
-            _points(one.pose.position for one in item.cubes),
-            _points(one.size for one in item.cubes),
-        )
+        centers = _points(one.pose.position for one in item.cubes)
+        sizes = _points(one.size for one in item.cubes)
         yield "boxes", rr.Boxes3D(centers=centers, sizes=sizes, colors=_colors(item.cubes))
     if item.texts:
         places, labels = _points(one.pose.position for one in item.texts), [one.text for one in item.texts]
@@ -240,9 +237,8 @@ def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int
     try:
         server = foxglove.start_server(name="worldstate", port=port, context=context)
     except (RuntimeError, OverflowError) as error:
-        raise InvalidArgumentError(
-            f"--export foxglove: expected a free port, got {port} ({error})"
-        ) from error
+        problem = f"expected a free port, got {port} ({error})"
+        raise InvalidArgumentError(f"--export foxglove: {problem}") from error
     channels: dict[str, Any] = {}
     begun_s: float | None = None
 

@@ -113,13 +113,12 @@ def feature_order(
     """
     low, high = domain.sample_rate_hz
     if not low <= _rate_of_long_frames(sample_rate_hz, settings.nfft) <= high:
+        made_for = f"{low:.0f} to {high:.0f} Hz and frames of {FEATURE_NFFT}"
         expected = (
-            f"a model made for {low:.0f} to {high:.0f} Hz and frames of {FEATURE_NFFT} expects such sound"
+            f"a model made for {made_for} expects such sound, or a half, a quarter or an eighth of both"
         )
         got = f"{sample_rate_hz:g} Hz and frames of {settings.nfft}"
-        raise OutOfDomainError(
-            f"sample rate: {expected}, or a half, a quarter or an eighth of both, got {got}. {way_out}"
-        )
+        raise OutOfDomainError(f"sample rate: {expected}, got {got}. {way_out}")
     made_with = _feature(domain.feature, domain.band_hz)
     got = _feature(settings.feature_version, FEATURE_BAND_HZ)
     if got != made_with:
@@ -151,10 +150,8 @@ def check_tables(model: ModelDomain, table: ModelDomain) -> None:
     """
     order = check_array(model, array_of(table))
     if (np.diff(order) != 1).any():
-        raise OutOfDomainError(
-            "the table's microphones are the model's in another order: extract the features again with the "
-            "channels in the model's order"
-        )
+        advice = "extract the features again with the channels in the model's order"
+        raise OutOfDomainError(f"the table's microphones are the model's in another order: {advice}")
     expected, got = (_feature(one.feature, one.band_hz) for one in (model, table))
     if got != expected:
         raise OutOfDomainError(f"feature: expected {expected}, got {got}")

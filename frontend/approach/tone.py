@@ -304,9 +304,8 @@ def _window(n_samples: float, decimator: Decimator) -> int:
     """Return the number of outputs that always fit into this many input samples."""
     count = int((n_samples - decimator.n_taps) // decimator.factor)
     if count < 2 * _PADDING * _RING[1]:
-        raise InvalidArgumentError(
-            f"tone_band_hz: expected a filter well below {n_samples:.0f} samples, got {decimator.n_taps}"
-        )
+        expected = f"a filter well below {n_samples:.0f} samples"
+        raise InvalidArgumentError(f"tone_band_hz: expected {expected}, got {decimator.n_taps}")
     return count
 
 

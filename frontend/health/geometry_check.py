@@ -331,9 +331,8 @@ class DelayCheck:
             return []
         whole = np.isfinite(values[:, known]).all(axis=1)
         values = np.where(known, values, 0.0)
-        return self._drift(values[whole], np.flatnonzero(whole), free) or self._late(
-            values[whole & np.array(self._far)], free
-        )
+        drifting = self._drift(values[whole], np.flatnonzero(whole), free)
+        return drifting or self._late(values[whole & np.array(self._far)], free)
 
     def _drift(self, values: FloatArray, seconds: IndexArray, free: FloatArray) -> list[ChannelFault]:
         if len(seconds) < _MIN_DRIFT_S:

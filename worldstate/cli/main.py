@@ -54,9 +54,8 @@ def current_words(words: Sequence[str]) -> list[str]:
     """Return the words of a call with the former name of a command replaced; a study is refused."""
     first, *rest = words or [""]
     if first in STUDIES:
-        raise InvalidArgumentError(
-            f"{first}: expected `worldstate-lab {STUDIES[first]}`, of the distribution worldstate-lab"
-        )
+        successor = f"`worldstate-lab {STUDIES[first]}`, of the distribution worldstate-lab"
+        raise InvalidArgumentError(f"{first}: expected {successor}")
     if first in FORMER:
         print(f"worldstate: `{first}` is now `{FORMER[first]}`", file=sys.stderr)
         return [*FORMER[first].split(), *rest]

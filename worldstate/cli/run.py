@@ -54,9 +54,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     listening.add_listen_options(parser)
     listening.add_memory_options(parser, "0")
     add = parser.add_argument
-    add(
-        "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
-    )
+    silent = "leave silent channels out instead of refusing the recording"
+    add("--mask-dead", action="store_true", help=silent)
     moves = "columns time_s, speed_mps; optional yaw_rate_rad_s, and x_m, y_m, yaw_rad where corners stand"
     add("--odometry", type=Path, metavar="CSV", help=moves)
     other = "what another sensor recorded, by a reader that an installed package brings; may be repeated"

@@ -56,9 +56,8 @@ def significant(values: FloatArray, figures: int) -> FloatArray:
     >>> significant(np.array([1234.5678, 0.00012345678]), 3)
     array([1.23e+03, 1.23e-04])
     """
-    return np.array([float(f"{value:.{figures}g}") for value in values.ravel().tolist()]).reshape(
-        values.shape
-    )
+    rounded = [float(f"{value:.{figures}g}") for value in values.ravel().tolist()]
+    return np.array(rounded).reshape(values.shape)
 
 
 def wrap_angle(angle_rad: AngleT) -> AngleT:

@@ -300,9 +300,8 @@ class FixedLagSmoother:
         if place is not None:
             toward, log_m = math.atan2(place[1], place[0]), math.log(max(math.hypot(*place), 1.0))
         if toward is None:
-            raise InvalidArgumentError(
-                f"observations: expected {entity!r:.40} to begin with a bearing or position"
-            )
+            expected = f"{entity!r:.40} to begin with a bearing or position"
+            raise InvalidArgumentError(f"observations: expected {expected}")
         one = self._entities[entity] = _Entity()
         state = np.array([toward, 0.0, 0.0, log_m])
         prior = np.array([state[0], 0.0, 0.0, math.log(_START_M)])

@@ -54,9 +54,8 @@ class Moments:
 
     def plus(self, value: float, weight: float = 1.0) -> "Moments":
         """Return them with one observation more."""
-        return Moments(
-            self.weight + weight, self.total + weight * value, self.squares + weight * value * value
-        )
+        total, squares = self.total + weight * value, self.squares + weight * value * value
+        return Moments(self.weight + weight, total, squares)
 
     def faded(self, factor: float) -> "Moments":
         """Return them with everything weighed less."""

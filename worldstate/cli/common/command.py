@@ -41,9 +41,8 @@ class Program:
     commands: Mapping[str, str]  # The words of a command to its module
     groups: Mapping[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()  # Left out of the overview
-    former_options: Mapping[str, str] = field(
-        default_factory=dict
-    )  # Options that are gone to their successors
+    # Options that are gone to their successors
+    former_options: Mapping[str, str] = field(default_factory=dict)
 
     def called(self, words: Sequence[str]) -> str | None:
         """Return the words of the command that a call names, None where it names none."""

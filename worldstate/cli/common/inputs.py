@@ -120,10 +120,8 @@ def given_array(arguments: argparse.Namespace) -> "frontend.MicrophoneArray | No
 
 def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
     """Return where a bearing is looked for, all else by default."""
-    band = arguments.band
-    return adapters.ListenSettings(
-        band_hz=None if band is None else (band[0], band[1]), azimuth_span_deg=arguments.azimuth_span
-    )
+    band = None if arguments.band is None else (arguments.band[0], arguments.band[1])
+    return adapters.ListenSettings(band_hz=band, azimuth_span_deg=arguments.azimuth_span)
 
 
 def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, frontend.MicrophoneArray]":

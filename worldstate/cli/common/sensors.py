@@ -74,10 +74,9 @@ def add_lens_options(parser: argparse.ArgumentParser, group: "argparse._Argument
 
 def add_detector_option(parser: argparse.ArgumentParser, default: str | None = "motion") -> None:
     """Declare --detector."""
-    kinds = (
-        "motion, knn: background subtraction by mixtures or neighbours; FILE.onnx: a model in YOLO's output"
-    )
-    told = f"{kinds} form; or the name of one that an installed package brings (default: {default or 'none'})"
+    moving = "motion, knn: background subtraction by mixtures or neighbours"
+    other = "FILE.onnx: a model in YOLO's output form; or the name of one that an installed package brings"
+    told = f"{moving}; {other} (default: {default or 'none'})"
     parser.add_argument("--detector", metavar="NAME", default=default, help=told)
 
 

@@ -34,9 +34,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_table_options(parser)
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    labels = (
-        "windows of recordings of one's own, learned as those of the table: what `label --windows` writes"
-    )
+    written = "what `label --windows` writes"
+    labels = f"windows of recordings of one's own, learned as those of the table: {written}"
     add("--labels", type=Path, nargs="+", default=[], metavar="CSV", help=labels)
     ids = "CSV files with a column ID: leave out the recordings of these windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)

@@ -59,9 +59,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")
     wrong = "hear one junction of the exam with a turned array and with wrong positions, too"
     add("--mounting-errors", action="store_true", help=wrong)
-    add(
-        "--quick", action="store_true", help="from minutes of sound: to try the command, not to use the model"
-    )
+    quick = "from minutes of sound: to try the command, not to use the model"
+    add("--quick", action="store_true", help=quick)
     add("--seed", type=int, default=1, help="another seed, other streams (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 

@@ -326,10 +326,8 @@ def _cards(verdicts: tuple[ChannelVerdict, ...]) -> list[list[ChannelVerdict]]:
 def _advice(verdict: ChannelVerdict) -> str:
     value, std = verdict.value, verdict.std or 0.0
     other = (verdict.looks_like or 0) + 1
-    late, drift = (
-        f"{1e3 * abs(value):.2f} +- {1e3 * std:.2f} ms",
-        f"{1e6 * abs(value):.0f} +- {1e6 * std:.0f}",
-    )
+    late = f"{1e3 * abs(value):.2f} +- {1e3 * std:.2f} ms"
+    drift = f"{1e6 * abs(value):.0f} +- {1e6 * std:.0f}"
     return {
         Fault.DEAD: "silent: check plug, cable, phantom power",
         Fault.INTERMITTENT: f"out or crackling in {100 * value:.0f} % of the time: check plug and cable",
