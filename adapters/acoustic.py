@@ -363,7 +363,7 @@ def _array_fault(health: ArrayHealth | NotUsable) -> str | None:
 
 
 def observe(
-    frame: AcousticFrame, bearing: Bearing | NotUsable, approach: Approach | NotUsable
+    frame: AcousticFrame, bearing: Bearing | NotUsable, rate: Approach | NotUsable
 ) -> GroundedObservation:
     """Return what a frame says beside its feature; spreads are those of the estimators' own bounds."""
     # Where the front-end looks for an engine line (`FrontEndSettings.tone_band_hz`), it is the spacing of the
@@ -372,7 +372,5 @@ def observe(
     if not isinstance(tone, NotUsable):
         lines[LINE_SPACING] = Observable(tone.frequency_hz, tone.frequency_std_hz)
     heard = bearing if isinstance(bearing, NotUsable) else Observable(bearing.azimuth_rad, bearing.std_rad)
-    near = (
-        approach if isinstance(approach, NotUsable) else Observable(approach.inverse_tta_hz, approach.std_hz)
-    )
+    near = rate if isinstance(rate, NotUsable) else Observable(rate.inverse_tta_hz, rate.std_hz)
     return GroundedObservation(bearing_rad=heard, inverse_tta_hz=near, signature=lines)

@@ -15,10 +15,9 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence
-from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground.typing import FloatArray
 
-from .ratio_recursion import balanced
+from .ratio_recursion import balanced, transitions
 from .sequence_inputs import HOP_S
 from .sequence_model import COMING_S, GROUPS
 
@@ -38,9 +37,8 @@ COMES = np.array([state.startswith("coming") for state in STATES])
 BEHIND = np.array([state.endswith("_behind") for state in STATES])
 IN_VIEW = BEHIND | (np.arange(len(STATES)) == SEEN)
 # States of a vehicle that follows one just come into view: gaps of up to eight seconds, alike.
-FOLLOWS = np.concatenate(
-    [np.zeros(_COMING), np.diff((0.0, *COMING_S)) / COMING_S[-1], np.zeros(len(STATES) - 2 * _COMING)]
-)
+_GAPS = np.diff((0.0, *COMING_S)) / COMING_S[-1]
+FOLLOWS = np.concatenate([np.zeros(_COMING), _GAPS, np.zeros(len(STATES) - 2 * _COMING)])
 # Mean seconds in a state before another one follows: passages, and births of .004 a hop.
 _PASSED_S = 3.0
 _FOLLOWS_S = {

@@ -185,7 +185,7 @@ class StreetHearing:
 
     Examples
     --------
-    >>> StreetHearing(SidePatterns("roof")).hops
+    >>> len(StreetHearing(SidePatterns("roof")).recent)
     0
     """
 
@@ -197,13 +197,8 @@ class StreetHearing:
     def __post_init__(self) -> None:
         object.__setattr__(self, "recent", np.reshape(self.recent, (-1, SECTORS + 1)))
         freeze_arrays(self, recent=(None, SECTORS + 1))
-        if self.hops > HEARD_HOPS:
-            raise InvalidArgumentError(f"recent: expected at most {HEARD_HOPS} hops, got {self.hops}")
-
-    @property
-    def hops(self) -> int:
-        """Number of hops that are kept."""
-        return len(self.recent)
+        if len(self.recent) > HEARD_HOPS:
+            raise InvalidArgumentError(f"recent: expected at most {HEARD_HOPS} hops, got {len(self.recent)}")
 
 
 class StreetListener:

@@ -12,7 +12,7 @@ from .errors import InvalidArgumentError
 from .typing import FloatArray
 
 # A float stays a float, an array an array.
-AngleT = TypeVar("AngleT", float, FloatArray)
+RealT = TypeVar("RealT", float, FloatArray)
 
 # What a co-evidence channel last said of an entity: found, searched for and not found, not searched for.
 Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
@@ -60,7 +60,7 @@ def significant(values: FloatArray, figures: int) -> FloatArray:
     return np.array(rounded).reshape(values.shape)
 
 
-def wrap_angle(angle_rad: AngleT) -> AngleT:
+def wrap_angle(angle_rad: RealT) -> RealT:
     """Wrap an angle in radians into (-pi, pi].
 
     Parameters
