@@ -43,7 +43,7 @@ def arrival_pattern(feature: FloatArray) -> FloatArray:
     return np.asarray(sectors - sectors.mean(axis=-1, keepdims=True))
 
 
-def somebody_comes(groups: FloatArray) -> FloatArray:
+def coming_probability(groups: FloatArray) -> FloatArray:
     """Return the probability that a vehicle comes, shape (...,) of posteriors (..., 2, groups)."""
     return np.asarray((groups[..., :_COMING].sum(axis=-1) + groups[..., _OTHER]).mean(axis=-1))
 
@@ -225,7 +225,7 @@ class StreetListener:
 
         Shapes: groups (2, groups), feature (azimuths,), positive.
         """
-        before, now = self.hearing, np.append(arrival_pattern(feature[None])[0], somebody_comes(groups))
+        before, now = self.hearing, np.append(arrival_pattern(feature[None])[0], coming_probability(groups))
         left, right = (min(one + 1, HEARD_HOPS) for one in before.since)
         recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now[None]])
         self.hearing = StreetHearing(before.known, recent, (left, right))

@@ -12,7 +12,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.sequence.street_sides import PassSound, arrival_pattern, somebody_comes
+from worldstate.abduction.sequence.street_sides import PassSound, arrival_pattern, coming_probability
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
@@ -125,7 +125,8 @@ def heard_street(source: Source, model: Model) -> HeardStreet | None:
         _LOG.warning(_UNHEARD, "the recording is too short")
         return None
     time_s, features, groups = map(np.array, zip(*read, strict=True))
-    return HeardStreet(time_s, arrival_pattern(features), somebody_comes(groups), heard_with(model.domain))
+    patterns, coming = arrival_pattern(features), coming_probability(groups)
+    return HeardStreet(time_s, patterns, coming, heard_with(model.domain))
 
 
 def write_street(path: str | Path, street: LearnedStreet) -> None:
