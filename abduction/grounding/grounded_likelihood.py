@@ -422,9 +422,8 @@ def ground(
     if not names or len(set(names)) != len(names):
         raise InvalidArgumentError(f"descriptors: expected one or more with different names, got {names}")
     over_speed = _over_speed(observation, descriptors, chosen)
-    hidden_azimuth, visible_azimuth = (
-        _over_azimuth(observation.bearing_rad, std_rad) for std_rad in (_HIDDEN_STD_RAD, _VISIBLE_STD_RAD)
-    )
+    stds_rad = _HIDDEN_STD_RAD, _VISIBLE_STD_RAD
+    hidden_azimuth, visible_azimuth = (_over_azimuth(observation.bearing_rad, one) for one in stds_rad)
     per_class = np.logaddexp.reduce(over_speed, axis=1)
     moving = np.logaddexp.reduce(per_class)
     hidden = np.array(evidence.hidden) + moving + np.logaddexp.reduce(hidden_azimuth)
