@@ -283,12 +283,9 @@ def posterior_of(prior: FloatArray, evidence: SignatureEvidence, co_evidence: Co
     log_evidence = _log_sum(joint)
     if log_evidence == -np.inf:
         raise InvalidArgumentError("log_prior: expected mass on an explanation that the co-evidence allows")
-    return Posterior(
-        evidence.directions,
-        tuple((joint - log_evidence).tolist()),
-        _log_ratio(prior, log_likelihood),
-        log_evidence,
-    )
+    log_probabilities = tuple((joint - log_evidence).tolist())
+    ratio = _log_ratio(prior, log_likelihood)
+    return Posterior(evidence.directions, log_probabilities, ratio, log_evidence)
 
 
 def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence) -> float:

@@ -377,10 +377,8 @@ class NoiseMeter:
         excess = level_db - self._quiet
         self.excess_db = float(excess.mean())
         incoherent = coherence < (1.0 - _INCOHERENT) * self._usual_coherence
-        shares = (
-            falling(self.excess_db, _NOISE_DB) if incoherent else 1.0,
-            falling(self._rise_db(float(level_db.mean())), _JUMP_DB),
-        )
+        jump = falling(self._rise_db(float(level_db.mean())), _JUMP_DB)
+        shares = (falling(self.excess_db, _NOISE_DB) if incoherent else 1.0, jump)
         if min(shares) >= 1.0:
             return 1.0, None
         quarter = BANDS // 4

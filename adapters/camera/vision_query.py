@@ -205,12 +205,8 @@ class VisionQuery:
         if beta is None:
             return Unqueried("sector outside the field of view")
         clutter = self._clutter(d)
-        found = any(
-            sighting.moving
-            and sighting.label in labels
-            and sector.touches(sighting.azimuth_rad, sighting.width_rad)
-            for sighting in self.sightings(stamp_ns)
-        )
+        moving = (one for one in self.sightings(stamp_ns) if one.moving and one.label in labels)
+        found = any(sector.touches(one.azimuth_rad, one.width_rad) for one in moving)
         return Present(beta, clutter) if found else Absent(beta, clutter)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:

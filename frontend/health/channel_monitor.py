@@ -328,14 +328,9 @@ class ChannelMonitor:
         keep = ~bad
         for fault in faults:
             keep[fault.channel] &= fault.fault not in MASKED_FAULTS
-        return ArrayHealth(
-            ChannelMask(keep),
-            tuple(faults),
-            self._dropouts,
-            self._n_dropouts,
-            self._geometry_check.coherence,
-            self._clipping.newest_share,
-        )
+        dropouts = self._dropouts, self._n_dropouts
+        coherence, clipped = self._geometry_check.coherence, self._clipping.newest_share
+        return ArrayHealth(ChannelMask(keep), tuple(faults), *dropouts, coherence, clipped)
 
     def _single_channel_faults(self) -> list[ChannelFault]:
         """Faults seen on a channel by itself: clipping, offset, level, gusts."""

@@ -90,11 +90,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
     if arguments.save_state is not None and report.end is not None:
         adapters.save_checkpoint(arguments.save_state, report.end)
-    summary = report.to_dict() | {
-        "array": inputs.stance(source.array),
-        "detections": sensors.box_counts(source, as_json=arguments.json),
-    }
-    return output.CommandResult(summary)
+    boxes = sensors.box_counts(source, as_json=arguments.json)
+    beside = {"array": inputs.stance(source.array), "detections": boxes}
+    return output.CommandResult(report.to_dict() | beside)
 
 
 def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "adapters.Source":

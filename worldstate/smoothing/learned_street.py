@@ -223,13 +223,8 @@ class LearnedArm:
 
     def faded(self, factor: float) -> "LearnedArm":
         """Return it with everything weighed less."""
-        return LearnedArm(
-            self.direction,
-            self.edge.faded(factor),
-            self.log_pace.faded(factor),
-            factor * self.arrivals,
-            factor * self.exposure_s,
-        )
+        edge, log_pace = self.edge.faded(factor), self.log_pace.faded(factor)
+        return LearnedArm(self.direction, edge, log_pace, factor * self.arrivals, factor * self.exposure_s)
 
 
 @dataclass(frozen=True, slots=True)

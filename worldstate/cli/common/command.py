@@ -78,14 +78,9 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of one command, with --json."""
 
     def __init__(self, program: str, module: ModuleType) -> None:
-        _, description, examples = _documentation(module.__doc__ or "")
-        super().__init__(
-            program,
-            description=description,
-            epilog=examples,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
+        _, told, examples = _documentation(module.__doc__ or "")
+        form = argparse.RawDescriptionHelpFormatter
+        super().__init__(program, description=told, epilog=examples, formatter_class=form, allow_abbrev=False)
         self.first: tuple[str, ...] = getattr(module, "FIRST_OPTIONS", ())
         self.add_argument("--json", action="store_true", help="print the result as one JSON object")
         if self.first:

@@ -200,11 +200,8 @@ class HealthLog:
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
         explained = {(channel, other) for channel, fault in self._seen for other in _EXPLAINS.get(fault, ())}
-        kept = [
-            verdict
-            for verdict in ordered
-            if (verdict.channel, verdict.fault) not in explained and not self._is_other_half(verdict)
-        ]
+        own = (verdict for verdict in ordered if (verdict.channel, verdict.fault) not in explained)
+        kept = [verdict for verdict in own if not self._is_other_half(verdict)]
         return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in _one_cause(kept))
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:
