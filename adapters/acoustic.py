@@ -323,13 +323,10 @@ def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> M
     if vision is None:
         return replace(measurement, co_evidence=Unqueried("no camera"), sightings=(), look=None, further=())
     stamp_ns = measurement.stamp_ns
-    return replace(
-        measurement,
-        co_evidence=_answer(measurement, vision),
-        sightings=vision.sightings(stamp_ns),
-        look=vision.last_look(stamp_ns),
-        further=vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else (),
-    )
+    answer, sightings = _answer(measurement, vision), vision.sightings(stamp_ns)
+    look = vision.last_look(stamp_ns)
+    further = vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else ()
+    return replace(measurement, co_evidence=answer, sightings=sightings, look=look, further=further)
 
 
 def _answer(measurement: Measurement, vision: CoEvidenceChannel) -> CoEvidence:

@@ -233,16 +233,10 @@ class Source:
 
     def camera_channel(self) -> VisionQuery:
         """Return the camera's detections as the channel that is asked for co-evidence."""
-        rates = self.miss_rates
-        return VisionQuery(
-            self.camera,
-            self.detections,
-            rates.table if rates is not None else None,
-            self.degradation,
-            self.settings.boxes,
-            line_of_sight=unoccluded_sector(self.context),
-            clutter=rates.clutter_rate if rates is not None else None,
-        )
+        rates, seen, boxes = self.miss_rates, self.detections, self.settings.boxes
+        beta, clutter = (None, None) if rates is None else (rates.table, rates.clutter_rate)
+        in_sight = unoccluded_sector(self.context)
+        return VisionQuery(self.camera, seen, beta, self.degradation, boxes, in_sight, clutter)
 
 
 def unoccluded_sector(context: Context) -> Sector:

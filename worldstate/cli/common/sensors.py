@@ -170,13 +170,9 @@ def recorded(
     from dataclasses import replace
 
     given = given_sensors(arguments)
-    return adapters.open_source(
-        sound,
-        array=given.car.array,
-        detections=given.detections(),
-        camera=given.camera,
-        settings=replace(settings, boxes=given.setup.boxes, uncalibrated=True),
-    )
+    array, seen = given.car.array, given.detections()
+    heard = replace(settings, boxes=given.setup.boxes, uncalibrated=True)
+    return adapters.open_source(sound, array=array, detections=seen, camera=given.camera, settings=heard)
 
 
 def camera_source(

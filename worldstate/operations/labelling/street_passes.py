@@ -44,12 +44,9 @@ def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
     # A first box may show no edge of this arm.
     outwards_rad = one.edge_rad if one.arm == "left" else -one.edge_rad
-    return StreetPass(
-        "left" if one.arm == "left" else "right",
-        one.edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None,
-        pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None,
-        sound,
-    )
+    edge_rad = one.edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None
+    usual_hz = pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None
+    return StreetPass("left" if one.arm == "left" else "right", edge_rad, usual_hz, sound)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -189,13 +189,9 @@ class HealthLog:
     def summary(self) -> RecordingHealth:
         """Return the verdicts so far."""
         latest = self._latest
-        return RecordingHealth(
-            verdicts=self._verdicts(),
-            dropouts=tuple(self._dropouts[:_LISTED_DROPOUTS]),
-            n_dropouts=latest.n_dropouts if latest else 0,
-            n_hops=self._n_hops,
-            coherence=latest.coherence if latest else NotUsable("nothing heard"),
-        )
+        dropouts, count = tuple(self._dropouts[:_LISTED_DROPOUTS]), latest.n_dropouts if latest else 0
+        coherence = latest.coherence if latest else NotUsable("nothing heard")
+        return RecordingHealth(self._verdicts(), dropouts, count, self._n_hops, coherence)
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
