@@ -156,6 +156,7 @@ class FixedLagSmoother:
 
     Examples
     --------
+    >>> from worldstate.smoothing.observations import Range
     >>> smoother = FixedLagSmoother()
     >>> for hop in range(20):
     ...     far_m = 12.0 - 0.5 * hop
@@ -383,6 +384,7 @@ def rts_track(
 
     Examples
     --------
+    >>> from worldstate.smoothing.observations import AngularHeight
     >>> start = MotionBelief.around((0.9, -0.1, -0.15, 3.2), (0.4, 0.25, 0.3, 0.6))
     >>> box = [Bearing(0.8, 0.01), AngularHeight(0.1, 0.05)]
     >>> track = rts_track("car", start, {0: [], 10**9: box})
