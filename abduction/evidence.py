@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import add
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -117,6 +118,15 @@ class SignatureEvidence:
     def log_likelihoods(self) -> np.ndarray:
         """The vector (hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
         return np.array([*self.hidden, self.visible, self.none], dtype=np.float64)
+
+    @property
+    def likelier_side(self) -> Literal["left", "right"] | None:
+        """The side with the higher likelihood, None if they are equal or no sides."""
+        by_direction = dict(zip(self.directions, self.hidden, strict=True))
+        left, right = by_direction.get("left"), by_direction.get("right")
+        if left is None or right is None or left == right:
+            return None
+        return "left" if left > right else "right"
 
 
 def _check_each(name: str, values: object, directions: Sequence[str]) -> None:
@@ -274,12 +284,9 @@ def posterior_of(prior: Sequence[float], evidence: SignatureEvidence, co_evidenc
     log_evidence = _log_sum(joint)
     if log_evidence == -math.inf:
         raise InvalidArgumentError("log_prior: expected mass on an explanation that the co-evidence allows")
-    return Posterior(
-        evidence.directions,
-        tuple(one - log_evidence for one in joint),
-        _log_ratio(prior, log_likelihood),
-        log_evidence,
-    )
+    log_probabilities = tuple(one - log_evidence for one in joint)
+    ratio = _log_ratio(prior, log_likelihood)
+    return Posterior(evidence.directions, log_probabilities, ratio, log_evidence)
 
 
 def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence) -> float:

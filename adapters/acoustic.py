@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from operator import itemgetter
 from typing import Protocol
 
@@ -10,31 +10,19 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
-from worldstate.abduction.grounding.grounded_likelihood import (
-    Descriptor,
-    GroundedAnswer,
-    GroundedObservation,
-    GroundedSettings,
-    Observable,
-    car,
-    ground,
-    motorcycle,
-)
+from worldstate.abduction.grounding.grounded_likelihood import LINE_SPACING, GroundedObservation, Observable
+from worldstate.abduction.grounding.grounded_likelihood import Grounding as Grounding
 from worldstate.abduction.road_users import (
-    SEEN_AS,
-    SIREN,
-    UNKNOWN,
     ClassShares,
     DomainGuard,
     DomainVerdict,
     Foreign,
     RoadUserModel,
-    WarningSignal,
-    likeliest,
+    expected_labels,
+    heard_kinds,
     neutral,
-    with_siren,
 )
-from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
+from worldstate.abduction.sequence.sequence_inputs import SIDES, hop_columns
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
 from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.adapters.camera.vision_query import SeveralCameras
@@ -49,22 +37,11 @@ from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import NotUsable, OutOfDomainError, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.measurement.measurement import (
-    Approach,
-    Bearing,
-    CoEvidenceChannel,
-    Heard,
-    Measurement,
-    MeasurementAdapter,
-    Side,
-)
+from worldstate.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
+from worldstate.measurement.measurement import MeasurementAdapter
 
 # Loudness is the mean of these bands: of others it would not be what a sequence was trained on.
 LEVEL_BAND_HZ = (50.0, 2700.0)
-# Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
-# would take a wrong guess of the ear for a look at the right thing.
-_ASKED = 0.95
-LINE_SPACING = "line_spacing_hz"
 # Six simulated demos, error of the evidence of a side: .2 nats with 28 of 56 channels dead, 1.2 with 42, 2.1
 # with 50; .06 where a tenth of the samples clips, .7 with four tenths (the change within a second: .46).
 _DEAD, _CLIPPED = (0.5, 0.85), (0.1, 0.5)
@@ -93,42 +70,6 @@ class Signature(Protocol):
     def evidence(self, feature: FloatArray, /) -> SignatureEvidence:
         """Return log-likelihoods of one feature vector."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Grounding:
-    """Which road users are reckoned with, and which ties between their sound and their motion.
-
-    Parameters
-    ----------
-    descriptors : tuple of Descriptor
-        Classes of road users, at least one.
-    settings : GroundedSettings
-        Sectors, and couplings that are switched off.
-
-    Examples
-    --------
-    >>> scores = SignatureEvidence(("left", "right"), (1.0, -1.0), 0.0, 0.0)
-    >>> observation = GroundedObservation(inverse_tta_hz=Observable(0.4, 0.05))
-    >>> answer = Grounding().answer(scores, observation)
-    >>> answer.best.entity_class, answer.evidence.hidden[0] > 1.0
-    ('motor_vehicle', True)
-    """
-
-    descriptors: tuple[Descriptor, ...] = (car(), motorcycle())
-    settings: GroundedSettings = field(default_factory=GroundedSettings)
-
-    def answer(self, signature: SignatureEvidence, observation: GroundedObservation) -> GroundedAnswer:
-        """Return likelihoods of the explanations and the hidden state that explains the observation best.
-
-        Parameters
-        ----------
-        signature : SignatureEvidence
-            From calibrated scores.
-        observation : GroundedObservation
-            From `observe`.
-        """
-        return ground(signature, observation, self.descriptors, self.settings)
 
 
 class AcousticAdapter(MeasurementAdapter[Float32Array]):
@@ -345,7 +286,7 @@ def read_hop(
     rate_hz = std_hz = np.nan
     if not isinstance(looming, NotUsable):
         rate_hz, std_hz = looming.inverse_tta_hz, looming.std_hz
-    evidence = HopEvidence.heard(
+    columns = hop_columns(
         np.array([sides.log_ratios]),
         np.array([sides.visible]),
         feature=frame.feature[None],
@@ -355,7 +296,7 @@ def read_hop(
         looming_std_hz=np.array([std_hz]),
         bearing_rad=np.array([frame.bearing_rad]),
     )
-    return reader.read(evidence, frame.feature)
+    return reader.read(columns, frame.feature)
 
 
 def heard_of(frame: AcousticFrame) -> Heard:
@@ -382,20 +323,17 @@ def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> M
     if vision is None:
         return replace(measurement, co_evidence=Unqueried("no camera"), sightings=(), look=None, further=())
     stamp_ns = measurement.stamp_ns
-    return replace(
-        measurement,
-        co_evidence=_answer(measurement, vision),
-        sightings=vision.sightings(stamp_ns),
-        look=vision.last_look(stamp_ns),
-        further=vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else (),
-    )
+    answer, sightings = _answer(measurement, vision), vision.sightings(stamp_ns)
+    look = vision.last_look(stamp_ns)
+    further = vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else ()
+    return replace(measurement, co_evidence=answer, sightings=sightings, look=look, further=further)
 
 
 def _answer(measurement: Measurement, vision: CoEvidenceChannel) -> CoEvidence:
     bearing, labels = measurement.bearing, expected_labels(measurement.kinds)
     if isinstance(bearing, Bearing) and bearing.std_rad <= _COARSE_STD_RAD:
         return vision.ask(measurement.stamp_ns, bearing, labels)
-    side = _likelier_side(measurement.signature)
+    side = measurement.signature.likelier_side
     return vision.ask(measurement.stamp_ns, NotUsable("coarse bearing"), labels, side)
 
 
@@ -421,43 +359,8 @@ def _array_fault(health: ArrayHealth | NotUsable) -> str | None:
     return "microphones: " + ", ".join(f"{count} {fault}" for fault, count in sorted(counts.items()))
 
 
-def _likelier_side(signature: SignatureEvidence) -> Side | None:
-    """Return the side with the higher likelihood, None if they are equal or no sides."""
-    by_direction = dict(zip(signature.directions, signature.hidden, strict=True))
-    left, right = by_direction.get("left"), by_direction.get("right")
-    if left is None or right is None or left == right:
-        return None
-    return "left" if left > right else "right"
-
-
-def heard_kinds(model: RoadUserModel, character: FloatArray, domain: DomainVerdict | None) -> ClassShares:
-    """Return the classes of one hop; none where the sound is foreign."""
-    if isinstance(domain, Foreign):
-        return ()
-    shares = model.classify(character)
-    if isinstance(domain, WarningSignal) and domain.signal == SIREN:
-        return with_siren(shares, domain.log_odds)
-    return shares
-
-
-def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
-    """Return the detector's classes that what is heard may be; None where it may be anything.
-
-    Examples
-    --------
-    >>> sorted(expected_labels((("car", 0.9), ("unknown", 0.01), ("van", 0.09))))
-    ['car', 'truck']
-    >>> expected_labels((("car", 0.9), ("unknown", 0.1))) is expected_labels(()) is None
-    True
-    """
-    likely = likeliest(kinds, _ASKED)
-    if not likely or likely & {UNKNOWN, SIREN}:
-        return None
-    return frozenset().union(*(SEEN_AS[name] for name in likely))
-
-
 def observe(
-    frame: AcousticFrame, bearing: Bearing | NotUsable, approach: Approach | NotUsable
+    frame: AcousticFrame, bearing: Bearing | NotUsable, rate: Approach | NotUsable
 ) -> GroundedObservation:
     """Return what a frame says beside its feature; spreads are those of the estimators' own bounds."""
     # Where the front-end looks for an engine line (`FrontEndSettings.tone_band_hz`), it is the spacing of the
@@ -466,7 +369,5 @@ def observe(
     if not isinstance(tone, NotUsable):
         lines[LINE_SPACING] = Observable(tone.frequency_hz, tone.frequency_std_hz)
     heard = bearing if isinstance(bearing, NotUsable) else Observable(bearing.azimuth_rad, bearing.std_rad)
-    near = (
-        approach if isinstance(approach, NotUsable) else Observable(approach.inverse_tta_hz, approach.std_hz)
-    )
+    near = rate if isinstance(rate, NotUsable) else Observable(rate.inverse_tta_hz, rate.std_hz)
     return GroundedObservation(bearing_rad=heard, inverse_tta_hz=near, signature=lines)

@@ -104,7 +104,6 @@ def other_modality(option: str, text: str) -> OtherModality:
 def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Timed]:
     for one in part(path):
         if not isinstance(one, Timed):
-            raise InvalidArgumentError(
-                f"{name}: expected Measurement, PositionScan or Odometry, got {one!r:.60}"
-            )
+            expected = "Measurement, PositionScan or Odometry"
+            raise InvalidArgumentError(f"{name}: expected {expected}, got {one!r:.60}")
         yield one

@@ -114,11 +114,8 @@ class ListenSettings:
 
     def site(self) -> SiteEstimateSettings | None:
         """Return how the site is learned, None for not at all."""
-        if not self.site_adaptation:
-            return None
-        return (
-            SiteEstimateSettings() if self.forgetting_s is None else SiteEstimateSettings(self.forgetting_s)
-        )
+        given = {} if self.forgetting_s is None else {"forgetting_s": self.forgetting_s}
+        return SiteEstimateSettings(**given) if self.site_adaptation else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,16 +233,10 @@ class Source:
 
     def camera_channel(self) -> VisionQuery:
         """Return the camera's detections as the channel that is asked for co-evidence."""
-        rates = self.miss_rates
-        return VisionQuery(
-            self.camera,
-            self.detections,
-            rates.table if rates is not None else None,
-            self.degradation,
-            self.settings.boxes,
-            line_of_sight=unoccluded_sector(self.context),
-            clutter=rates.clutter_rate if rates is not None else None,
-        )
+        rates, seen, boxes = self.miss_rates, self.detections, self.settings.boxes
+        beta, clutter = (None, None) if rates is None else (rates.table, rates.clutter_rate)
+        in_sight = unoccluded_sector(self.context)
+        return VisionQuery(self.camera, seen, beta, self.degradation, boxes, in_sight, clutter)
 
 
 def unoccluded_sector(context: Context) -> Sector:

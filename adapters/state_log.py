@@ -56,11 +56,9 @@ def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:
         if nearest is None or first_ns is None or last_ns is None:
             raise InputFileError(path, _EMPTY)
         if not first_ns - _SLACK_NS <= stamp_ns <= last_ns + _SLACK_NS:
-            raise InputFileError(
-                path,
-                f"expected a time from {seconds(first_ns):.1f} to {seconds(last_ns):.1f} s, in which it has "
-                f"snapshots, got {seconds(stamp_ns):.1f} s",
-            )
+            span = f"{seconds(first_ns):.1f} to {seconds(last_ns):.1f} s"
+            got = f"got {seconds(stamp_ns):.1f} s"
+            raise InputFileError(path, f"expected a time from {span}, in which it has snapshots, {got}")
         return WorldState.from_dict(nearest[1])
 
 

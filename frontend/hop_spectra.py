@@ -19,16 +19,8 @@ from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, sp
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import (
-    BoolArray,
-    Complex64Array,
-    Complex128Array,
-    Float32Array,
-    FloatArray,
-    IntArray,
-)
-from worldstate.ground.values import LEAST_HEARD
+from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError
+from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array
 
 from .settings import ELEVATIONS_RAD, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 
@@ -125,15 +117,13 @@ class HopSpectra:
         looming_bins = band_bins(LOOMING_BAND_HZ, sample_rate_hz, nfft)
         bands = (self.srp_bins, self.feature_bins, looming_bins)
         bins = range(min(b.start for b in bands), max(b.stop for b in bands))
-        self._srp, self._feature, self._looming = (
-            slice(b.start - bins.start, b.stop - bins.start) for b in bands
-        )
+        inside = (slice(b.start - bins.start, b.stop - bins.start) for b in bands)
+        self._srp, self._feature, self._looming = inside
         frequencies = bin_frequencies_hz(self.srp_bins, sample_rate_hz, nfft)
         # A row of elevation each: the few dimensions and nodes that do for one are too many for all together.
         azimuths = settings.azimuths_rad()
-        self.beams = tuple(
-            Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD
-        )
+        rows = (Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD)
+        self.beams = tuple(rows)
         self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft)
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft, self._order = nfft, settings.feature_order
@@ -387,10 +377,8 @@ class NoiseMeter:
         excess = level_db - self._quiet
         self.excess_db = float(excess.mean())
         incoherent = coherence < (1.0 - _INCOHERENT) * self._usual_coherence
-        shares = (
-            falling(self.excess_db, _NOISE_DB) if incoherent else 1.0,
-            falling(self._rise_db(float(level_db.mean())), _JUMP_DB),
-        )
+        jump = falling(self._rise_db(float(level_db.mean())), _JUMP_DB)
+        shares = (falling(self.excess_db, _NOISE_DB) if incoherent else 1.0, jump)
         if min(shares) >= 1.0:
             return 1.0, None
         quarter = BANDS // 4

@@ -7,11 +7,7 @@ import numpy as np
 
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import (
-    CLEANED_FEATURE_VERSION,
-    FEATURE_NFFT,
-    FEATURE_VERSION,
-)
+from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, FEATURE_NFFT, FEATURE_VERSION
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.ground import FloatArray, InvalidArgumentError, in_range
 

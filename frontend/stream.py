@@ -200,10 +200,9 @@ class FrontEnd:
         self.settings = settings = settings or FrontEndSettings(nfft=feature_nfft(self.sample_rate_hz))
         hop = self.sample_rate_hz / HOP_RATE_HZ
         if settings.nfft > hop:
-            raise InvalidArgumentError(
-                f"nfft: expected at most one hop of {hop:.0f} samples, got {settings.nfft}: "
-                "sound of a higher rate (6 kHz will do), or shorter frames"
-            )
+            problem = f"expected at most one hop of {hop:.0f} samples, got {settings.nfft}"
+            advice = "sound of a higher rate (6 kHz will do), or shorter frames"
+            raise InvalidArgumentError(f"nfft: {problem}: {advice}")
         self._start_ns = start_ns
         self._azimuths = settings.azimuths_rad()
         self._azimuths.flags.writeable = False

@@ -2,17 +2,24 @@
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_inputs import INPUTS, HopEvidence
+from worldstate.abduction.sequence.sequence_inputs import COLUMNS, INPUTS
 from worldstate.abduction.sequence.sequence_model import GROUPS, BoostedTrees, SequenceAlarm, SequenceModel
+from worldstate.ground.typing import FloatArray
 
 
-def evidence_of(rng: np.random.Generator, hops: int) -> HopEvidence:
-    """Return a stream that wanders, its looming and bearing refused now and then."""
+def evidence_of(rng: np.random.Generator, hops: int) -> FloatArray:
+    """Return the columns of a stream that wanders, its looming refused now and then."""
     single = rng.normal(size=(7, hops)).cumsum(axis=1)
-    single[4:6][:, rng.random(hops) < 0.3] = np.nan
-    single[5] = np.abs(single[5]) + 0.01
+    refused = rng.random(hops) < 0.3
+    single[4, refused] = 0.0
+    single[5] = np.where(refused, 10.0, np.minimum(np.abs(single[5]) + 0.01, 10.0))
     sides, bands = (rng.normal(size=(hops, width)).cumsum(axis=0) for width in (2, 4))
-    return HopEvidence(sides, *single, bands)
+    return np.concatenate([sides, single.T, bands], axis=1)
+
+
+def column(name: str) -> int:
+    """Return where the columns of a stream have what is named."""
+    return COLUMNS.index(name)
 
 
 def sequence_model(rng: np.random.Generator, alarm: SequenceAlarm | None = None) -> SequenceModel:

@@ -6,7 +6,7 @@ calibrated, the reliability curve, the ECE with its sampling floor, Brier score 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias, overload
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finit
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import IndexArray
+from worldstate.ground.values import RealT
 
 # As in the note's pseudocode; the tolerance is finer, for values are scaled to one first.
 _ITERATIONS = 100
@@ -100,14 +101,10 @@ class IsotonicMap:
         if risks[0] < 0 or risks[-1] > 1:
             raise InvalidArgumentError("risks: expected numbers in [0, 1]")
 
-    @overload
-    def __call__(self, statistic: float) -> float: ...
-    @overload
-    def __call__(self, statistic: FloatArray) -> FloatArray: ...
-    def __call__(self, statistic: float | FloatArray) -> float | FloatArray:
+    def __call__(self, statistic: RealT) -> RealT:
         """Return the risk at a statistic or an array of them."""
         risk = np.interp(statistic, self.statistics, self.risks)
-        return float(risk) if np.ndim(statistic) == 0 else risk
+        return float(risk) if np.ndim(statistic) == 0 else risk  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,14 +124,10 @@ class PlattMap:
         if self.slope > 0:
             raise InvalidArgumentError(f"slope: expected a number <= 0, got {self.slope}")
 
-    @overload
-    def __call__(self, statistic: float) -> float: ...
-    @overload
-    def __call__(self, statistic: FloatArray) -> FloatArray: ...
-    def __call__(self, statistic: float | FloatArray) -> float | FloatArray:
+    def __call__(self, statistic: RealT) -> RealT:
         """Return the risk at a statistic or an array of them."""
         risk = sigmoid(_logit(np.asarray(statistic, dtype=np.float64)), self.slope, self.offset)
-        return float(risk) if np.ndim(statistic) == 0 else risk
+        return float(risk) if np.ndim(statistic) == 0 else risk  # type: ignore[return-value]
 
 
 RiskMap: TypeAlias = IsotonicMap | PlattMap

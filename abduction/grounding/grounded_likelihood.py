@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.evidence import MOST_NATS, SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
 
+LINE_SPACING = "line_spacing_hz"
 SPEED_OF_SOUND_M_S = 343.0
 # Total ratio of gearbox and final drive, first to fifth gear: ordinary numbers of a passenger car (3.6, 2.05,
 # 1.4, 1.05 and 0.85 times 3.9), no measured ones.
@@ -148,7 +149,7 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
     """
     per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
     curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(_KNOTS_M_S)) for ratio in GEAR_RATIOS]
-    return _coupling("line_spacing_hz", curves, std_hz)
+    return _coupling(LINE_SPACING, curves, std_hz)
 
 
 def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
@@ -292,7 +293,7 @@ class Background:
 
 
 BACKGROUNDS = {
-    "line_spacing_hz": Background(70.0, 40.0),
+    LINE_SPACING: Background(70.0, 40.0),
     "tyre_shape_db": Background(0.0, 10.0),
     "doppler_ratio": Background(1.0, 0.05),
     "radial_speed_m_s": Background(0.0, 10.0),
@@ -421,9 +422,8 @@ def ground(
     if not names or len(set(names)) != len(names):
         raise InvalidArgumentError(f"descriptors: expected one or more with different names, got {names}")
     over_speed = _over_speed(observation, descriptors, chosen)
-    hidden_azimuth, visible_azimuth = (
-        _over_azimuth(observation.bearing_rad, std_rad) for std_rad in (_HIDDEN_STD_RAD, _VISIBLE_STD_RAD)
-    )
+    stds_rad = _HIDDEN_STD_RAD, _VISIBLE_STD_RAD
+    hidden_azimuth, visible_azimuth = (_over_azimuth(observation.bearing_rad, one) for one in stds_rad)
     per_class = np.logaddexp.reduce(over_speed, axis=1)
     moving = np.logaddexp.reduce(per_class)
     hidden = np.array(evidence.hidden) + moving + np.logaddexp.reduce(hidden_azimuth)
@@ -511,3 +511,31 @@ def _best(
         radial_speed_m_s=float(_SPEEDS_M_S[speed]),
         log_posterior=float(sides.max() + states.max() + azimuths.max()),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Grounding:
+    """Which road users are reckoned with, and which ties between their sound and their motion.
+
+    Parameters
+    ----------
+    descriptors : tuple of Descriptor
+        Classes of road users, at least one.
+    settings : GroundedSettings
+        Couplings that are switched off.
+
+    Examples
+    --------
+    >>> scores = SignatureEvidence(("left", "right"), (1.0, -1.0), 0.0, 0.0)
+    >>> observation = GroundedObservation(inverse_tta_hz=Observable(0.4, 0.05))
+    >>> answer = Grounding().answer(scores, observation)
+    >>> answer.best.entity_class, answer.evidence.hidden[0] > 1.0
+    ('motor_vehicle', True)
+    """
+
+    descriptors: tuple[Descriptor, ...] = (car(), motorcycle())
+    settings: GroundedSettings = field(default_factory=GroundedSettings)
+
+    def answer(self, signature: SignatureEvidence, observation: GroundedObservation) -> GroundedAnswer:
+        """Return what `ground` makes of calibrated scores and what else was observed."""
+        return ground(signature, observation, self.descriptors, self.settings)

@@ -15,10 +15,9 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence
-from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground.typing import FloatArray
 
-from .ratio_recursion import balanced
+from .ratio_recursion import balanced, transitions
 from .sequence_inputs import HOP_S
 from .sequence_model import COMING_S, GROUPS
 
@@ -72,12 +71,9 @@ def states_of(groups: FloatArray, prior: FloatArray) -> FloatArray:
     (0.167, True)
     """
     coming, rest = groups[..., :_COMING], groups[..., _COMING:]
-    behind = 0.5 * prior[_COMING] / prior[_COMING:].sum() + 0.5 * _in_view_of(rest)
+    in_view = rest[..., :1] / np.maximum(rest.sum(axis=-1, keepdims=True), _SMALLEST)
+    behind = 0.5 * prior[_COMING] / prior[_COMING:].sum() + 0.5 * in_view
     return np.concatenate([coming * (1.0 - behind), coming * behind, rest], axis=-1)
-
-
-def _in_view_of(rest: FloatArray) -> FloatArray:
-    return np.asarray(rest[..., :1] / np.maximum(rest.sum(axis=-1, keepdims=True), _SMALLEST))
 
 
 def groups_of(states: FloatArray) -> FloatArray:

@@ -5,8 +5,6 @@ eight for what the loudest vehicle of late has left. The right side is mirrored 
 model serves both. Where less than that was heard, the oldest hop stands in.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
@@ -24,55 +22,6 @@ _HALF, _SECOND, _TWO, _THREE, _FOUR, _SIX = 5, 10, 20, 30, 40, 60
 BANDS, _BAND_HOPS = 4, 3
 SIDES = ("left", "right")
 HOP_S = 0.1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HopEvidence:
-    """What the hops of a stream said, each of shape (n,), the sides of shape (n, 2), the bands of (n, 4)."""
-
-    sides: FloatArray  # Log ratio of hidden on the left, on the right, to visible or none; nats
-    visible: FloatArray  # Log ratio of visible to none, nats
-    level: FloatArray  # Mean of the log of the 60 values
-    loudness: FloatArray  # Mean log energy of the bands, nats
-    prominence: FloatArray  # Natural logarithm of the peak-to-median ratio
-    looming_hz: FloatArray  # 1/TTA; NaN where refused
-    looming_std_hz: FloatArray
-    bearing_rad: FloatArray  # Left positive; NaN where refused
-    bands: FloatArray  # shape (n, 4): Log energy of four groups of neighbouring bands, low ones first, nats
-
-    def __len__(self) -> int:
-        return len(self.visible)
-
-    @classmethod
-    def heard(
-        cls,
-        sides: FloatArray,
-        visible: FloatArray,
-        *,
-        feature: FloatArray,
-        band_log_energy: FloatArray,
-        prominence: FloatArray,
-        looming_hz: FloatArray,
-        looming_std_hz: FloatArray,
-        bearing_rad: FloatArray,
-    ) -> "HopEvidence":
-        """Return the evidence of hops, one a row, from what the window model and the front-end said.
-
-        The only way from either to a sequence: a model that learns one and reads another is worth nothing.
-        """
-        # In double precision: streams on disk keep half of it, and its logarithm would have the other half's.
-        energy = np.asarray(band_log_energy, np.float64)
-        return cls(
-            sides=sides,
-            visible=visible,
-            level=np.log(np.asarray(feature, np.float64)).mean(axis=1),
-            loudness=energy.mean(axis=1),
-            prominence=np.log(prominence),
-            looming_hz=looming_hz,
-            looming_std_hz=looming_std_hz,
-            bearing_rad=bearing_rad,
-            bands=np.stack([part.mean(axis=1) for part in np.array_split(energy, BANDS, axis=1)], axis=1),
-        )
 
 
 _BANDS = tuple(f"band_{number}" for number in range(1, BANDS + 1))
@@ -101,7 +50,9 @@ INPUTS = (
 )
 
 
-# What is kept of a hop, without gaps: the first five change, the first three have a highest.
+# What is kept of a hop: log ratios of either side and of visible, nats; mean of the log of the 60 values,
+# mean log energy of the bands, log of the peak-to-median ratio; 1/TTA, its deviation, bearing, left positive;
+# log energy of four groups of neighbouring bands, low ones first. The first five change, three have a top.
 COLUMNS = (
     *("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing"),
     *_BANDS,
@@ -146,15 +97,38 @@ _ORDER = (_of_side("left", "right"), _of_side("right", "left"))
 _MIRRORED = np.where(np.isin(INPUTS, _SIGNED), -1.0, 1.0)
 
 
-def columns_of(evidence: HopEvidence) -> FloatArray:
-    """Return evidence as columns without gaps, shape (n, 13), as `COLUMNS` names them."""
+def hop_columns(
+    sides: FloatArray,
+    visible: FloatArray,
+    *,
+    feature: FloatArray,
+    band_log_energy: FloatArray,
+    prominence: FloatArray,
+    looming_hz: FloatArray,
+    looming_std_hz: FloatArray,
+    bearing_rad: FloatArray,
+) -> FloatArray:
+    """Return the evidence of hops, one a row without gaps, shape (n, 13), as `COLUMNS` names them.
+
+    The only way from the window model and the front-end to a sequence: a model that learns one and reads
+    another is worth nothing. `sides`, shape (n, 2), are log ratios of hidden on the left and on the right to
+    visible or none, `visible` that of visible to none. NaN is a looming rate or a bearing that was refused.
+    """
+    # In double precision: streams on disk keep half of it, and its logarithm would have the other half's.
+    energy = np.asarray(band_log_energy, np.float64)
     # Where nothing could be read the rate is 0 and its deviation that of knowing nothing.
-    refused = ~np.isfinite(evidence.looming_hz)
-    rate = np.where(refused, 0.0, evidence.looming_hz)
-    spread = np.where(refused, 10.0, np.minimum(evidence.looming_std_hz, 10.0))
-    azimuth = np.where(np.isfinite(evidence.bearing_rad), evidence.bearing_rad, 0.0)
-    single = [evidence.visible, evidence.level, evidence.loudness, evidence.prominence, rate, spread, azimuth]
-    return np.concatenate([evidence.sides, np.stack(single, axis=1), evidence.bands], axis=1)
+    refused = ~np.isfinite(looming_hz)
+    single = [
+        visible,
+        np.log(np.asarray(feature, np.float64)).mean(axis=1),
+        energy.mean(axis=1),
+        np.log(prominence),
+        np.where(refused, 0.0, looming_hz),
+        np.where(refused, 10.0, np.minimum(looming_std_hz, 10.0)),
+        np.where(np.isfinite(bearing_rad), bearing_rad, 0.0),
+    ]
+    bands = [part.mean(axis=1) for part in np.array_split(energy, BANDS, axis=1)]
+    return np.concatenate([sides, np.stack([*single, *bands], axis=1)], axis=1)
 
 
 def streets_own(columns: FloatArray) -> FloatArray:
@@ -162,16 +136,14 @@ def streets_own(columns: FloatArray) -> FloatArray:
     return np.asarray(columns[:, _OWN])
 
 
-def sequence_inputs(evidence: HopEvidence) -> FloatArray:
-    """Return the inputs of both sides at every hop, shape (n, 2, inputs).
+def sequence_inputs(columns: FloatArray) -> FloatArray:
+    """Return the inputs of both sides at every hop of a stream, shape (n, 2, inputs), from its `hop_columns`.
 
     Examples
     --------
-    >>> flat = HopEvidence(np.zeros((5, 2)), *np.ones((7, 5)), bands=np.ones((5, 4)))
-    >>> sequence_inputs(flat).shape == (5, 2, len(INPUTS))
+    >>> sequence_inputs(np.ones((5, len(COLUMNS)))).shape == (5, 2, len(INPUTS))
     True
     """
-    columns = columns_of(evidence)
     own, ends = streets_own(columns), range(1, len(columns) + 1)
     # Each hop as a reader reads it: a model is trained on what it is given later, to the bit.
     rows = [last_inputs(columns[max(n - MEMORY_HOPS, 0) : n], own[max(n - QUIET_HOPS, 0) : n]) for n in ends]

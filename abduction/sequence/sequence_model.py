@@ -18,7 +18,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-from .sequence_inputs import INPUTS, SIDES, HopEvidence, sequence_inputs
+from .sequence_inputs import INPUTS, SIDES, sequence_inputs
 
 # A file from elsewhere must not make a walk of any length or size.
 MOST_TREES, MOST_NODES, MOST_INPUTS = 4096, 255, 512
@@ -56,14 +56,12 @@ class BoostedTrees:
     baseline: FloatArray  # shape (classes,)
 
     def __post_init__(self) -> None:
-        trees, nodes = np.shape(self.split)
+        grid = trees, nodes = np.shape(self.split)
         if not (0 < trees <= MOST_TREES and 0 < nodes <= MOST_NODES):
-            raise InvalidArgumentError(
-                f"split: expected at most {MOST_TREES} trees of {MOST_NODES} nodes, got {(trees, nodes)}"
-            )
+            most = f"at most {MOST_TREES} trees of {MOST_NODES} nodes"
+            raise InvalidArgumentError(f"split: expected {most}, got {grid}")
         for name in ("split", "yes", "no", "tree_class"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.intp))
-        grid = (trees, nodes)
         freeze_arrays(self, threshold=grid, value=grid, baseline=(len(self.baseline),))
         here = np.arange(nodes)
         for name in ("yes", "no"):
@@ -75,10 +73,8 @@ class BoostedTrees:
             raise InvalidArgumentError("no: expected a leaf to lead to itself on both ways")
         if self.split.shape != grid or self.split.min() < 0 or self.split.max() >= MOST_INPUTS:
             raise InvalidArgumentError(f"split: expected numbers of inputs below {MOST_INPUTS}")
-        if (
-            self.tree_class.shape != (trees,)
-            or not np.isin(self.tree_class, np.arange(len(self.baseline))).all()
-        ):
+        known = np.arange(len(self.baseline))
+        if self.tree_class.shape != (trees,) or not np.isin(self.tree_class, known).all():
             raise InvalidArgumentError(f"tree_class: expected {trees} numbers of classes")
 
     def scores(self, X: FloatArray) -> FloatArray:
@@ -235,18 +231,14 @@ class SequenceModel:
             raise InvalidArgumentError(f"share: expected positive numbers, got {self.share.min()}")
         if self.inputs != INPUTS[: len(self.inputs)]:
             raise InvalidArgumentError(f"inputs: expected the first of {list(INPUTS)}, got {self.inputs}")
-        got, sizes = (
-            (int(self.trees.split.max()) + 1, len(self.trees.baseline)),
-            (len(self.inputs), len(GROUPS)),
-        )
-        if got[0] > sizes[0] or got[1] != sizes[1]:
-            raise InvalidArgumentError(
-                f"trees: expected {sizes[0]} inputs and {sizes[1]} groups, got {got[0]} and {got[1]}"
-            )
+        read, groups = int(self.trees.split.max()) + 1, len(self.trees.baseline)
+        if read > len(self.inputs) or groups != len(GROUPS):
+            expected = f"{len(self.inputs)} inputs and {len(GROUPS)} groups"
+            raise InvalidArgumentError(f"trees: expected {expected}, got {read} and {groups}")
 
-    def posterior(self, evidence: HopEvidence) -> SequencePosterior:
-        """Return what is believed at every hop of a stream, by what was heard until then."""
-        return self.of_inputs(sequence_inputs(evidence))
+    def posterior(self, columns: FloatArray) -> SequencePosterior:
+        """Return what is believed at every hop of a stream, `hop_columns`, by what was heard until then."""
+        return self.of_inputs(sequence_inputs(columns))
 
     def of_inputs(self, inputs: FloatArray) -> SequencePosterior:
         """Return what is believed by rows of inputs, shape (n, 2, inputs)."""

@@ -9,18 +9,7 @@ from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable
 from worldstate.ground.checks import freeze_arrays
 from worldstate.ground.serialisation import ADDED, Count
 
-from .sequence_inputs import (
-    COLUMNS,
-    MEMORY_HOPS,
-    QUIET_HOPS,
-    RECENT_HOPS,
-    SIDES,
-    USUAL,
-    HopEvidence,
-    columns_of,
-    last_inputs,
-    streets_own,
-)
+from . import sequence_inputs as inputs
 from .sequence_model import GROUPS, SequenceAlarm, SequenceModel
 from .street_sides import StreetListener
 
@@ -39,20 +28,19 @@ class SequenceHistory:
     0
     """
 
-    # shapes (up to 81, 13), as `columns_of`, and (up to 600, 9), as `streets_own`; the last hop last
-    recent: FloatArray = field(default_factory=partial(np.zeros, (0, len(COLUMNS))))
-    minute: FloatArray = field(default_factory=partial(np.zeros, (0, len(USUAL))))
+    # shapes (up to 81, 13), as `hop_columns`, and (up to 600, 9), as `streets_own`; the last hop last
+    recent: FloatArray = field(default_factory=partial(np.zeros, (0, len(inputs.COLUMNS))))
+    minute: FloatArray = field(default_factory=partial(np.zeros, (0, len(inputs.USUAL))))
     missed: Count = field(default=0, metadata=ADDED)  # Hops since the last one that was heard
 
     def __post_init__(self) -> None:
         # An empty list in a file has no second axis.
-        for name, width in (("recent", len(COLUMNS)), ("minute", len(USUAL))):
+        for name, width in (("recent", len(inputs.COLUMNS)), ("minute", len(inputs.USUAL))):
             object.__setattr__(self, name, np.reshape(getattr(self, name), (-1, width)))
-        if len(self.recent) > MEMORY_HOPS or len(self.minute) > QUIET_HOPS or self.hops > len(self.minute):
-            raise InvalidArgumentError(
-                f"history: expected at most {MEMORY_HOPS} hops in a minute of {QUIET_HOPS}, "
-                f"got {len(self.recent)} in {len(self.minute)}"
-            )
+        minute = len(self.minute)
+        if self.hops > inputs.MEMORY_HOPS or minute > inputs.QUIET_HOPS or self.hops > minute:
+            most = f"at most {inputs.MEMORY_HOPS} hops in a minute of {inputs.QUIET_HOPS}"
+            raise InvalidArgumentError(f"history: expected {most}, got {self.hops} in {minute}")
 
     @property
     def hops(self) -> int:
@@ -65,16 +53,14 @@ class SequenceHistory:
         Those before are forgotten after three seconds without sound.
         """
         missed = self.missed + 1
-        recent = self.recent if missed < RECENT_HOPS else self.recent[:0]
+        recent = self.recent if missed < inputs.RECENT_HOPS else self.recent[:0]
         return SequenceHistory(recent, self.minute, missed)
 
-    def heard(self, evidence: HopEvidence) -> "SequenceHistory":
-        """Return the history one hop on."""
-        columns = columns_of(evidence)
-        return SequenceHistory(
-            np.concatenate([self.recent[1 - MEMORY_HOPS :], columns]),
-            np.concatenate([self.minute[1 - QUIET_HOPS :], streets_own(columns)]),
-        )
+    def heard(self, columns: FloatArray) -> "SequenceHistory":
+        """Return the history one hop on, of `hop_columns` of one row."""
+        recent = np.concatenate([self.recent[1 - inputs.MEMORY_HOPS :], columns])
+        minute = np.concatenate([self.minute[1 - inputs.QUIET_HOPS :], inputs.streets_own(columns)])
+        return SequenceHistory(recent, minute)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +80,7 @@ class SequenceReading:
     alarm: SequenceAlarm | None = None
 
     def __post_init__(self) -> None:
-        freeze_arrays(self, groups=(len(SIDES), len(GROUPS)), share=(len(GROUPS),))
+        freeze_arrays(self, groups=(len(inputs.SIDES), len(GROUPS)), share=(len(GROUPS),))
         if (self.groups < 0.0).any() or not np.allclose(self.groups.sum(axis=1), 1.0, atol=1e-6):
             raise InvalidArgumentError("groups: expected probabilities that sum to one on each side")
         if (self.share <= 0.0).any():
@@ -110,7 +96,7 @@ class SequenceReader:
     >>> stump = dict(split=[[0, 0, 0]], threshold=[[0.5, 0, 0]], yes=[[1, 1, 2]], no=[[2, 1, 2]])
     >>> trees = BoostedTrees(**stump, value=[[0.0, -1.0, 1.0]], tree_class=[0], baseline=[0.0] * len(GROUPS))
     >>> reader = SequenceReader(SequenceModel(trees, np.full(len(GROUPS), 1 / len(GROUPS))))
-    >>> hop = HopEvidence(np.array([[2.0, -2.0]]), *np.ones((7, 1)), bands=np.ones((1, 4)))
+    >>> hop = np.ones((1, len(inputs.COLUMNS)))
     >>> [isinstance(reader.read(hop), SequenceReading) for _ in range(10)].count(True)
     1
     """
@@ -134,16 +120,16 @@ class SequenceReader:
         if self.street is not None and not self.history.hops:
             self.street.interrupt()
 
-    def read(self, evidence: HopEvidence, feature: FloatArray | None = None) -> SequenceReading | NotUsable:
+    def read(self, columns: FloatArray, feature: FloatArray | None = None) -> SequenceReading | NotUsable:
         """Take the next hop in; return what it says together with those before.
 
         `feature` is that of its window, shape (azimuths,), by which the street tells the sides.
         """
-        self.history = history = self.history.heard(evidence)
+        self.history = history = self.history.heard(columns)
         if history.hops < LEAST_HOPS:
             return TOO_FEW
         model = self._model
-        groups = model.of_inputs(last_inputs(history.recent, history.minute)).groups[0]
+        groups = model.of_inputs(inputs.last_inputs(history.recent, history.minute)).groups[0]
         if self.street is not None and feature is not None:
             groups = self.street.turned(groups, feature)
         return SequenceReading(groups, model.share, model.margin_s, model.alarm)

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import freeze_arrays, in_range
+from worldstate.ground.checks import freeze_arrays
 
 from .sequence_inputs import SIDES
 from .sequence_model import COMING_S, GROUPS
@@ -43,7 +43,7 @@ def arrival_pattern(feature: FloatArray) -> FloatArray:
     return np.asarray(sectors - sectors.mean(axis=-1, keepdims=True))
 
 
-def somebody_comes(groups: FloatArray) -> FloatArray:
+def coming_probability(groups: FloatArray) -> FloatArray:
     """Return the probability that a vehicle comes, shape (...,) of posteriors (..., 2, groups)."""
     return np.asarray((groups[..., :_COMING].sum(axis=-1) + groups[..., _OTHER]).mean(axis=-1))
 
@@ -63,11 +63,6 @@ class StreetSides:
     weights: FloatArray  # shape (12,): Per nat of a sector
     offset: float
     certainty: float  # In [0, 1]: of few passes, less
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, weights=(SECTORS,))
-        in_range("offset", self.offset, -1e9, 1e9)
-        in_range("certainty", self.certainty, 0.0, 1.0)
 
     def log_ratio(self, feature: FloatArray) -> FloatArray:
         """Return the log-odds of left against right by the windows' own patterns, shape (n,)."""
@@ -174,9 +169,8 @@ class SidePatterns:
         about = np.array(self.squares) - crossed - crossed.T + (means.T * weights) @ means
         scatter = about / weights.sum()
         even = max(float(np.trace(scatter)) / SECTORS, _LEAST_SCATTER)
-        direction = np.linalg.solve(
-            (1.0 - _ROUND) * scatter + _ROUND * even * np.eye(SECTORS), means[0] - means[1]
-        )
+        rounded = (1.0 - _ROUND) * scatter + _ROUND * even * np.eye(SECTORS)
+        direction = np.linalg.solve(rounded, means[0] - means[1])
         offset, certainty = -0.5 * direction @ means.sum(axis=0), 1.0 / (1.0 + _DOUBT * (1.0 / weights).sum())
         return StreetSides(direction, float(offset), float(certainty))
 
@@ -191,7 +185,7 @@ class StreetHearing:
 
     Examples
     --------
-    >>> StreetHearing(SidePatterns("roof")).hops
+    >>> len(StreetHearing(SidePatterns("roof")).recent)
     0
     """
 
@@ -203,13 +197,8 @@ class StreetHearing:
     def __post_init__(self) -> None:
         object.__setattr__(self, "recent", np.reshape(self.recent, (-1, SECTORS + 1)))
         freeze_arrays(self, recent=(None, SECTORS + 1))
-        if self.hops > HEARD_HOPS:
-            raise InvalidArgumentError(f"recent: expected at most {HEARD_HOPS} hops, got {self.hops}")
-
-    @property
-    def hops(self) -> int:
-        """Number of hops that are kept."""
-        return len(self.recent)
+        if len(self.recent) > HEARD_HOPS:
+            raise InvalidArgumentError(f"recent: expected at most {HEARD_HOPS} hops, got {len(self.recent)}")
 
 
 class StreetListener:
@@ -236,7 +225,7 @@ class StreetListener:
 
         Shapes: groups (2, groups), feature (azimuths,), positive.
         """
-        before, now = self.hearing, np.append(arrival_pattern(feature[None])[0], somebody_comes(groups))
+        before, now = self.hearing, np.append(arrival_pattern(feature[None])[0], coming_probability(groups))
         left, right = (min(one + 1, HEARD_HOPS) for one in before.since)
         recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now[None]])
         self.hearing = StreetHearing(before.known, recent, (left, right))

@@ -11,19 +11,7 @@ from worldstate.ground import InvalidArgumentError, finite_array
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
-from .ensemble import (
-    KINDS,
-    PRIOR_S,
-    SEGMENTS,
-    SHAPE,
-    SHAPE_CHANGE,
-    EnsembleModel,
-    Expert,
-    SiteReference,
-    expert_views,
-    mirror_features,
-    split_reference,
-)
+from . import ensemble
 from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, mirrored_classes
 
 # Of a simulated window beside a real one, and the part of it that says the other side. At weights from .5
@@ -50,8 +38,8 @@ RECIPES = (
     Recipe("mean", 1e-3),
     Recipe("median", 1e-3),
     Recipe("quiet", 1e-3),
-    Recipe(SHAPE, 1e-1),
-    Recipe(SHAPE_CHANGE, 1e-2),
+    Recipe(ensemble.SHAPE, 1e-1),
+    Recipe(ensemble.SHAPE_CHANGE, 1e-2),
 )
 
 
@@ -109,7 +97,7 @@ class SiteEnsembleClassifier:
     (40, 4)
     """
 
-    model_: EnsembleModel
+    model_: ensemble.EnsembleModel
 
     def __init__(
         self, recipes: Sequence[Recipe] = RECIPES, simulated: SimulatedWindows | None = None
@@ -151,14 +139,15 @@ class SiteEnsembleClassifier:
         1992.
         """
         inputs = finite_array("X", X, (None, None))
-        if inputs.shape[1] % (SEGMENTS * (1 + len(KINDS))):
+        if inputs.shape[1] % (ensemble.SEGMENTS * (1 + len(ensemble.KINDS))):
             raise InvalidArgumentError(f"X: expected windows with a reference, got shape {inputs.shape}")
         codes = _codes(checked_labels(y, len(inputs)))
         sites = None if groups is None else np.asarray(groups)
-        windows, empty = split_reference(inputs)[0], codes == NONE
-        prior_s = PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
-        levels, reference, codes = _with_mirror_images(*split_reference(inputs), codes)
-        home, silence = SiteReference.from_row(reference.mean(axis=0)), levels[codes == NONE].mean(axis=0)
+        windows, empty = ensemble.split_reference(inputs)[0], codes == NONE
+        prior_s = ensemble.PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
+        levels, reference, codes = _with_mirror_images(*ensemble.split_reference(inputs), codes)
+        home = ensemble.SiteReference.from_row(reference.mean(axis=0))
+        silence = levels[codes == NONE].mean(axis=0)
         weights = np.ones(len(codes))
         if self.simulated is not None and sites is not None:
             more = _simulated_rows(self.simulated.at(sites), home)
@@ -167,8 +156,8 @@ class SiteEnsembleClassifier:
             )
         # The four of the data, and what else there are windows of; scikit-learn sorts its columns the same.
         known = np.union1d(np.arange(len(CLASSES)), codes)
-        views = expert_views({recipe.view for recipe in self.recipes}, levels, reference)
-        self.model_ = EnsembleModel(
+        views = ensemble.expert_views({recipe.view for recipe in self.recipes}, levels, reference)
+        self.model_ = ensemble.EnsembleModel(
             tuple(_fit_expert(recipe, views[recipe.view], codes, weights) for recipe in self.recipes),
             np.bincount(codes, weights)[known] / weights.sum(),
             home,
@@ -213,19 +202,19 @@ def _with_mirror_images(
     levels: FloatArray, reference: FloatArray, codes: IndexArray
 ) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Append the mirror image of every window, front and none included: no class becomes more frequent."""
-    mirrored_reference = mirror_features(reference, SEGMENTS * len(KINDS))
+    mirrored_reference = ensemble.mirror_features(reference, ensemble.SEGMENTS * len(ensemble.KINDS))
     return (
-        np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
+        np.concatenate([levels, ensemble.mirror_features(levels, ensemble.SEGMENTS)]),
         np.concatenate([reference, mirrored_reference]),
         np.concatenate([codes, _mirrored(codes)]),
     )
 
 
 def _simulated_rows(
-    windows: SimulatedWindows, home: SiteReference
+    windows: SimulatedWindows, home: ensemble.SiteReference
 ) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
     """Return log-levels, references, classes and weights, hazards of the other side behind the windows."""
-    levels, reference = split_reference(windows.X)
+    levels, reference = ensemble.split_reference(windows.X)
     reference = np.where(np.isnan(reference), home.row, reference)
     codes = _codes(windows.y)
     other = _mirrored(codes)
@@ -260,7 +249,7 @@ def _prior_s(levels: FloatArray, sites: AnyArray) -> float:
     patterns = levels - levels.mean(axis=1, keepdims=True)
     parts = [patterns[sites == site] for site in np.unique(sites)]
     if len(parts) < 2 or min(map(len, parts)) < 2:
-        return PRIOR_S
+        return ensemble.PRIOR_S
     within = float(np.mean([part.var(axis=0, ddof=1).mean() for part in parts]))
     scatter = float(np.var([part.mean(axis=0) for part in parts], axis=0, ddof=1).mean())
     between = scatter - within * float(np.mean([1.0 / len(part) for part in parts]))
@@ -268,12 +257,12 @@ def _prior_s(levels: FloatArray, sites: AnyArray) -> float:
     return _WINDOW_S * within / max(between, within / _LONGEST)
 
 
-def _fit_expert(recipe: Recipe, seen: FloatArray, codes: IndexArray, weights: FloatArray) -> Expert:
+def _fit_expert(recipe: Recipe, seen: FloatArray, codes: IndexArray, weights: FloatArray) -> ensemble.Expert:
     mean, scale = standardisation(seen, weights)
     regression = optional("sklearn.linear_model").LogisticRegression
     machine = regression(C=1.0 / (recipe.ridge * weights.sum()), max_iter=_ITERATIONS)
     machine.fit((seen - mean) / scale, codes, weights)
-    return Expert(recipe.view, mean, scale, machine.coef_, machine.intercept_)
+    return ensemble.Expert(recipe.view, mean, scale, machine.coef_, machine.intercept_)
 
 
 def standardisation(inputs: FloatArray, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:

@@ -134,11 +134,9 @@ class SignatureModel:
     domain: ModelDomain | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        features, pairs = np.size(self.mean), len(PAIRS)
+        features, pairs, known = np.size(self.mean), len(PAIRS), (len(CLASSES),)
         freeze_arrays(self, mean=(features,), scale=(features,), coefficients=(pairs, features))
-        freeze_arrays(
-            self, intercepts=(pairs,), slopes=(pairs,), offsets=(pairs,), class_prior=(len(CLASSES),)
-        )
+        freeze_arrays(self, intercepts=(pairs,), slopes=(pairs,), offsets=(pairs,), class_prior=known)
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
         if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):

@@ -227,9 +227,8 @@ class OnnxDetector:
             raise InvalidArgumentError("model: expected one input of shape (1, 3, height, width)")
         self._labels, self._session = labels, session
         self._input = str(inputs[0].name)
-        self._size = tuple(
-            side if isinstance(side, int) and side > 0 else SIDE_PX for side in inputs[0].shape[2:]
-        )
+        sides = inputs[0].shape[2:]
+        self._size = tuple(side if isinstance(side, int) and side > 0 else SIDE_PX for side in sides)
 
     def detect(self, frame: ImageArray, /) -> DetectionFrame:
         """Return the detections of the model.

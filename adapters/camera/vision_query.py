@@ -16,14 +16,8 @@ from worldstate.abduction.co_evidence import (
     Unqueried,
     default_miss_rates,
 )
-from worldstate.ground import (
-    InputFileError,
-    InvalidArgumentError,
-    NotUsable,
-    nanoseconds,
-    seconds,
-    wrap_angle,
-)
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
+from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
 from .detections import DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
@@ -211,12 +205,8 @@ class VisionQuery:
         if beta is None:
             return Unqueried("sector outside the field of view")
         clutter = self._clutter(d)
-        found = any(
-            sighting.moving
-            and sighting.label in labels
-            and sector.touches(sighting.azimuth_rad, sighting.width_rad)
-            for sighting in self.sightings(stamp_ns)
-        )
+        moving = (one for one in self.sightings(stamp_ns) if one.moving and one.label in labels)
+        found = any(sector.touches(one.azimuth_rad, one.width_rad) for one in moving)
         return Present(beta, clutter) if found else Absent(beta, clutter)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
@@ -308,9 +298,8 @@ class VisionQuery:
             return None
         angles = self.camera.off_axis(in_view.midpoints(SAMPLES))
         kept = self.keep.labels
-        seen = float(
-            np.mean([self.miss_rate.over(angles, d, one).mean() if one in kept else 1.0 for one in labels])
-        )
+        betas = [self.miss_rate.over(angles, d, one).mean() if one in kept else 1.0 for one in labels]
+        seen = float(np.mean(betas))
         share = in_view.half_width_rad / sector.half_width_rad
         return share * seen + (1.0 - share)
 

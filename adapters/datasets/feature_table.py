@@ -244,6 +244,5 @@ def t0_of(path: str | Path, line: int, row: dict[str, str]) -> int | None:
     try:
         return int(row["T0"]) if row.get("T0") else None
     except ValueError as error:
-        raise InputFileError(
-            path, f"line {line}: expected T0 as an integer, got {row['T0'][:40]!r}"
-        ) from error
+        problem = f"expected T0 as an integer, got {row['T0'][:40]!r}"
+        raise InputFileError(path, f"line {line}: {problem}") from error

@@ -273,10 +273,8 @@ def check_channels(path: Path, array: MicrophoneArray) -> None:
         if audio.channels != array.n_microphones:
             wanted = f"expected --array FILE, or {ARRAY_NAME} beside it, for its {audio.channels} channels"
             other = f"{array.name}, the array of the model, has {array.n_microphones}"
-            ways = (
-                "With it `worldstate array bearings` needs no model; `worldstate model make` makes one for it"
-            )
-            raise InputFileError(path, f"{wanted}; {other}. {ways}")
+            ways = "`worldstate array bearings` needs no model; `worldstate model make` makes one for it"
+            raise InputFileError(path, f"{wanted}; {other}. With it {ways}")
 
 
 def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:

@@ -20,30 +20,18 @@ from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
 from worldstate.state.world_state import WorldState, snapshot_schema
 
-from .scene import (
-    CompressedImage,
-    Rgba,
-    SceneItem,
-    SceneLine,
-    SceneSolid,
-    SceneText,
-    SceneTime,
-    SceneUpdate,
-    Xyz,
-    scene_update,
-    srp_scene,
-)
+from . import scene
 
 SNAPSHOT_TOPIC, SCENE_TOPIC = "/worldstate/snapshot", "/worldstate/scene"
 SRP_TOPIC, IMAGE_TOPIC = "/worldstate/srp", "/camera/image"
 # OVAD's images, 1936 pixels wide, are shown in a third of a screen: halved they take 77 kB in a log, not 245.
 _WIDEST_PX, _QUALITY = 1000, 80
-Told: TypeAlias = WorldState | SceneUpdate | CompressedImage
+Told: TypeAlias = WorldState | scene.SceneUpdate | scene.CompressedImage
 # The name that a viewer knows each by.
 _SCHEMA_NAMES: dict[type, str] = {
     WorldState: "worldstate.Snapshot",
-    SceneUpdate: "foxglove.SceneUpdate",
-    CompressedImage: "foxglove.CompressedImage",
+    scene.SceneUpdate: "foxglove.SceneUpdate",
+    scene.CompressedImage: "foxglove.CompressedImage",
 }
 
 
@@ -89,12 +77,12 @@ def state_messages(state: WorldState) -> Iterator[LogMessage]:
     [('/worldstate/snapshot', 'worldstate.Snapshot'), ('/worldstate/scene', 'foxglove.SceneUpdate')]
     """
     yield LogMessage(SNAPSHOT_TOPIC, state.stamp_ns, state)
-    yield LogMessage(SCENE_TOPIC, state.stamp_ns, scene_update(state))
+    yield LogMessage(SCENE_TOPIC, state.stamp_ns, scene.scene_update(state))
 
 
 def srp_message(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> LogMessage:
     """Return the power of the sound over azimuth as a line about the array."""
-    return LogMessage(SRP_TOPIC, state.stamp_ns, srp_scene(state, azimuths_rad, srp))
+    return LogMessage(SRP_TOPIC, state.stamp_ns, scene.srp_scene(state, azimuths_rad, srp))
 
 
 def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterator[LogMessage]]:
@@ -124,7 +112,8 @@ def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterato
 def image_message(stamp_ns: int, jpeg: bytes) -> LogMessage:
     """Return an image of the camera."""
     text = base64.b64encode(jpeg).decode("ascii")
-    return LogMessage(IMAGE_TOPIC, stamp_ns, CompressedImage(SceneTime.of_ns(stamp_ns), "camera", text))
+    image = scene.CompressedImage(scene.SceneTime.of_ns(stamp_ns), "camera", text)
+    return LogMessage(IMAGE_TOPIC, stamp_ns, image)
 
 
 TIMELINE = "stream"
@@ -154,7 +143,7 @@ def _drawn(rr: ModuleType, topic: str, value: Told) -> Iterator[tuple[str, objec
     """Yield what is drawn of a message, each with its place; what an earlier scene drew is removed."""
     if isinstance(value, WorldState):
         yield topic, rr.TextDocument(value.to_json(), media_type="application/json")
-    elif isinstance(value, CompressedImage):
+    elif isinstance(value, scene.CompressedImage):
         yield topic, rr.EncodedImage(contents=base64.b64decode(value.data), media_type="image/jpeg")
     else:
         yield topic, rr.Clear(recursive=True)
@@ -166,7 +155,7 @@ def _drawn(rr: ModuleType, topic: str, value: Told) -> Iterator[tuple[str, objec
                 yield place, rr.AnyValues(**{pair.key: pair.value for pair in item.metadata})
 
 
-def _shapes(rr: ModuleType, item: SceneItem) -> Iterator[tuple[str, object]]:
+def _shapes(rr: ModuleType, item: scene.SceneItem) -> Iterator[tuple[str, object]]:
     for number, one in enumerate(item.triangles):
         corners = _points(one.points)
         triangles = np.arange(len(corners)).reshape(-1, 3)
@@ -180,10 +169,8 @@ def _shapes(rr: ModuleType, item: SceneItem) -> Iterator[tuple[str, object]]:
         ahead = (arrow.shaft_length + arrow.head_length, 0.0, 0.0)
         yield "arrow", rr.Arrows3D(vectors=[ahead], colors=[_color(arrow.color)])
     if item.cubes:
-        centers, sizes = (
-            _points(one.pose.position for one in item.cubes),
-            _points(one.size for one in item.cubes),
-        )
+        centers = _points(one.pose.position for one in item.cubes)
+        sizes = _points(one.size for one in item.cubes)
         yield "boxes", rr.Boxes3D(centers=centers, sizes=sizes, colors=_colors(item.cubes))
     if item.texts:
         places, labels = _points(one.pose.position for one in item.texts), [one.text for one in item.texts]
@@ -191,16 +178,18 @@ def _shapes(rr: ModuleType, item: SceneItem) -> Iterator[tuple[str, object]]:
         yield "text", rr.Points3D(places, labels=labels, colors=colors, radii=0.1, show_labels=True)
 
 
-def _points(points: Iterable[Xyz]) -> FloatArray:
+def _points(points: Iterable[scene.Xyz]) -> FloatArray:
     return np.array([(one.x, one.y, one.z) for one in points], dtype=np.float64).reshape(-1, 3)
 
 
-def _color(color: Rgba) -> tuple[int, int, int, int]:
+def _color(color: scene.Rgba) -> tuple[int, int, int, int]:
     red, green, blue, opaque = (round(255 * part) for part in (color.r, color.g, color.b, color.a))
     return red, green, blue, opaque
 
 
-def _colors(shapes: Iterable[SceneLine | SceneSolid | SceneText]) -> list[tuple[int, int, int, int]]:
+def _colors(
+    shapes: Iterable[scene.SceneLine | scene.SceneSolid | scene.SceneText],
+) -> list[tuple[int, int, int, int]]:
     return [_color(one.color) for one in shapes]
 
 
@@ -248,9 +237,8 @@ def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int
     try:
         server = foxglove.start_server(name="worldstate", port=port, context=context)
     except (RuntimeError, OverflowError) as error:
-        raise InvalidArgumentError(
-            f"--export foxglove: expected a free port, got {port} ({error})"
-        ) from error
+        problem = f"expected a free port, got {port} ({error})"
+        raise InvalidArgumentError(f"--export foxglove: {problem}") from error
     channels: dict[str, Any] = {}
     begun_s: float | None = None
 

@@ -279,9 +279,8 @@ def _ego() -> SceneArrow:
 
 def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:
     """Draw the edge as a line and what lies behind it as a sector."""
-    edge = SceneLine(
-        0, (_at(occluder.edge_azimuth_rad, 4.0), _at(occluder.edge_azimuth_rad, SECTOR_M)), _ink(_GREY)
-    )
+    near, far = (_at(occluder.edge_azimuth_rad, radius_m) for radius_m in (4.0, SECTOR_M))
+    edge = SceneLine(0, (near, far), _ink(_GREY))
     behind = _sector(hidden_sector(occluder), SECTOR_M, Rgba(*_GREY, 0.12), "occluder")
     pairs = _pairs(direction=occluder.direction, assumed=occluder.assumed)
     return _item(state, f"occluder {occluder.id}", metadata=pairs, lines=(edge,), triangles=(behind,))
@@ -302,9 +301,8 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
     said = f"{cue.direction}: risk {_short(cue.risk)}"
     if cue.within is not None and "3" in cue.within:
         said += f", in 3 s {_short(cue.within['3'])}"
-    text = _text(
-        cue.azimuth_rad, CUE_M + 2.0, said + (" ADVISORY" if raised else ""), _RED if raised else _GREY
-    )
+    said += " ADVISORY" if raised else ""
+    text = _text(cue.azimuth_rad, CUE_M + 2.0, said, _RED if raised else _GREY)
     pairs = _pairs(risk=cue.risk, confidence=cue.confidence, advisory=raised, within=cue.within)
     return _item(state, f"cue {cue.direction}", metadata=pairs, triangles=(shape,), texts=(text,))
 

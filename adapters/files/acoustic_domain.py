@@ -8,14 +8,7 @@ import numpy as np
 
 from worldstate.abduction.signature.published_signature import EgoMotion, ModelDomain
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.frontend.direction.feature import (
-    FEATURE_BAND_HZ,
-    FEATURE_NFFT,
-    FEATURE_RATE_HZ,
-    FEATURE_VERSION,
-    RATE_TOLERANCE,
-    feature_nfft,
-)
+from worldstate.frontend.direction import feature as published
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import IndexArray
@@ -32,13 +25,13 @@ def domain_of(
     array: MicrophoneArray,
     rates_hz: Sequence[float],
     environments: Sequence[str],
-    feature: str = FEATURE_VERSION,
+    feature: str = published.FEATURE_VERSION,
 ) -> ModelDomain:
     """Return the domain of windows that an array heard at these rates, the ego as the environments say."""
-    alike = [_rate_of_long_frames(rate, feature_nfft(rate)) for rate in rates_hz]
-    low, high = (1.0 - RATE_TOLERANCE) * min(alike), (1.0 + RATE_TOLERANCE) * max(alike)
+    alike = [_rate_of_long_frames(rate, published.feature_nfft(rate)) for rate in rates_hz]
+    low, high = (1.0 - published.RATE_TOLERANCE) * min(alike), (1.0 + published.RATE_TOLERANCE) * max(alike)
     motion = ego_motion_of(environments)
-    return ModelDomain(array.name, array.positions_m, (low, high), FEATURE_BAND_HZ, feature, motion)
+    return ModelDomain(array.name, array.positions_m, (low, high), published.FEATURE_BAND_HZ, feature, motion)
 
 
 def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
@@ -49,7 +42,7 @@ def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
 
 def ovad_domain(environments: Sequence[str]) -> ModelDomain:
     """Return the domain of the windows released with OVAD."""
-    return domain_of(ovad_array(), [FEATURE_RATE_HZ], environments)
+    return domain_of(ovad_array(), [published.FEATURE_RATE_HZ], environments)
 
 
 def check_array(domain: ModelDomain, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
@@ -113,15 +106,14 @@ def feature_order(
     """
     low, high = domain.sample_rate_hz
     if not low <= _rate_of_long_frames(sample_rate_hz, settings.nfft) <= high:
+        made_for = f"{low:.0f} to {high:.0f} Hz and frames of {published.FEATURE_NFFT}"
         expected = (
-            f"a model made for {low:.0f} to {high:.0f} Hz and frames of {FEATURE_NFFT} expects such sound"
+            f"a model made for {made_for} expects such sound, or a half, a quarter or an eighth of both"
         )
         got = f"{sample_rate_hz:g} Hz and frames of {settings.nfft}"
-        raise OutOfDomainError(
-            f"sample rate: {expected}, or a half, a quarter or an eighth of both, got {got}. {way_out}"
-        )
+        raise OutOfDomainError(f"sample rate: {expected}, got {got}. {way_out}")
     made_with = _feature(domain.feature, domain.band_hz)
-    got = _feature(settings.feature_version, FEATURE_BAND_HZ)
+    got = _feature(settings.feature_version, published.FEATURE_BAND_HZ)
     if got != made_with:
         raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {way_out}")
     order = check_array(domain, array, way_out)
@@ -138,7 +130,7 @@ def _feature(version: str, band_hz: tuple[float, float]) -> str:
 def _rate_of_long_frames(sample_rate_hz: float, nfft: int) -> float:
     """Rate at which 512 samples last as long as a frame: ``512 f_s / N``."""
     # What the feature depends on: a model hears sound of 6 kHz in frames of 64 as it hears that of 48 kHz.
-    return sample_rate_hz * FEATURE_NFFT / nfft
+    return sample_rate_hz * published.FEATURE_NFFT / nfft
 
 
 def check_tables(model: ModelDomain, table: ModelDomain) -> None:
@@ -151,10 +143,8 @@ def check_tables(model: ModelDomain, table: ModelDomain) -> None:
     """
     order = check_array(model, array_of(table))
     if (np.diff(order) != 1).any():
-        raise OutOfDomainError(
-            "the table's microphones are the model's in another order: extract the features again with the "
-            "channels in the model's order"
-        )
+        advice = "extract the features again with the channels in the model's order"
+        raise OutOfDomainError(f"the table's microphones are the model's in another order: {advice}")
     expected, got = (_feature(one.feature, one.band_hz) for one in (model, table))
     if got != expected:
         raise OutOfDomainError(f"feature: expected {expected}, got {got}")

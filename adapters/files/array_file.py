@@ -184,10 +184,8 @@ def _csv_columns(path: Path, first: list[str]) -> tuple[list[int], bool]:
     behind = len(first) == 4 and _number(first[3]) is None
     columns = [0, 1, 2] if len(first) == 3 or behind else [1, 2, 3]
     if len(first) not in (3, 4) or any(_number(first[column]) is None for column in columns):
-        problem = (
-            f"expected microphones as XML, JSON or CSV with the columns x, y, z, got {','.join(first)!r:.60}"
-        )
-        raise InputFileError(path, problem)
+        expected = "microphones as XML, JSON or CSV with the columns x, y, z"
+        raise InputFileError(path, f"expected {expected}, got {','.join(first)!r:.60}")
     return columns, False
 
 

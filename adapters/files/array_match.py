@@ -58,9 +58,8 @@ def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:
         return f"{array.n_microphones} microphones, expected {len(expected_m)}"
     expected, found = _centred(expected_m), array.centred_m
     largest_m = float(np.linalg.norm(found - expected, axis=1).max())
-    return "; ".join(
-        filter(None, (f"microphones up to {1e3 * largest_m:.0f} mm elsewhere", _cause(expected, found)))
-    )
+    apart = f"microphones up to {1e3 * largest_m:.0f} mm elsewhere"
+    return "; ".join(filter(None, (apart, _cause(expected, found))))
 
 
 def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:

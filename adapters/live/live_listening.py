@@ -87,9 +87,5 @@ class CostMeter:
         """
         wall_s, cpu_s = time.monotonic() - self._wall_s, time.process_time() - self._cpu_s
         load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-        return {
-            "wall_s": wall_s,
-            "cpu_s": cpu_s,
-            "cpu_share": cpu_s / wall_s if wall_s else 0.0,
-            "load": load,
-        }
+        share = cpu_s / wall_s if wall_s else 0.0
+        return {"wall_s": wall_s, "cpu_s": cpu_s, "cpu_share": share, "load": load}

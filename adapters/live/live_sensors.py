@@ -150,9 +150,7 @@ class OdometrySocket(DatagramSocket[OdometryRecord]):
     """
 
     def __init__(self, address: str, stamp_ns: Callable[[float], int]) -> None:
-        super().__init__(
-            address, stamp_ns, lambda record: decode(OdometryRecord, record, "datagram"), "--odometry"
-        )
+        super().__init__(address, stamp_ns, lambda one: decode(OdometryRecord, one, "datagram"), "--odometry")
 
 
 def _bound_socket(address: str, option: str) -> socket.socket:

@@ -10,15 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.audio.sound_file import (
-    MAX_CHANNELS,
-    Audio,
-    Encoding,
-    RawPcm,
-    SoundStream,
-    check_finite,
-    constant_channels,
-)
+from worldstate.adapters.audio import sound_file
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
@@ -148,7 +140,7 @@ _LOG = logging.getLogger(__name__)
 
 AUDIO_KINDS = AUDIO, STAMPED_PCM, PCM
 # Formats that audio_common names; a compressed one has lost the phase between microphones.
-ENCODINGS: dict[str, Encoding] = {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"}
+ENCODINGS: dict[str, sound_file.Encoding] = {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"}
 MAX_RATE_HZ = 10_000_000
 # Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
 LONGEST_GAP_S = 2.0
@@ -174,7 +166,7 @@ class AudioBlock:
 
 
 @dataclass(frozen=True, slots=True)
-class BagSound(SoundStream):
+class BagSound(sound_file.SoundStream):
     """A topic of a bag that holds sound, on the clock of its stamps."""
 
     path: Path
@@ -196,7 +188,7 @@ class BagSound(SoundStream):
             yield from audio_blocks(bag, self.topic)
 
 
-class BagAudio(Audio):
+class BagAudio(sound_file.Audio):
     """Sound of a bag that is being read; lost messages are filled with silence."""
 
     def __init__(self, sound: BagSound) -> None:
@@ -206,7 +198,7 @@ class BagAudio(Audio):
             counted = bag.count(sound.topic) * len(parts[0].samples)
         first = np.concatenate([part.samples for part in parts])
         self.sample_rate_hz, self.channels = parts[0].sample_rate_hz, first.shape[1]
-        self.silent_channels = constant_channels(first)
+        self.silent_channels = sound_file.constant_channels(first)
         # As many as there are while all are as long as the first; less than a second is counted exactly.
         self.frames = max(counted, len(first)) if len(first) >= self.sample_rate_hz else len(first)
 
@@ -244,15 +236,15 @@ def audio_blocks(bag: BagReader, topic: str) -> Iterator[AudioBlock]:
         if got != (wanted := (first.sample_rate_hz, first.samples.shape[1])):
             told = "expected {} Hz and {} channels as in the first message of {}, got {} and {}"
             raise InputFileError(bag.path, told.format(*wanted, topic, *got))
-        check_finite(bag.path, block.samples, taken)
+        sound_file.check_finite(bag.path, block.samples, taken)
         taken += len(block.samples)
         yield block
 
 
 def _own_block(path: Path, message: Any) -> AudioBlock:
     rate_hz, channels, data = int(message.sample_rate), int(message.channels), message.data
-    if not (1 <= rate_hz <= MAX_RATE_HZ and 1 <= channels <= MAX_CHANNELS):
-        expected = f"expected 1 to {MAX_RATE_HZ} samples a second and 1 to {MAX_CHANNELS} channels"
+    if not (1 <= rate_hz <= MAX_RATE_HZ and 1 <= channels <= sound_file.MAX_CHANNELS):
+        expected = f"expected 1 to {MAX_RATE_HZ} samples a second and 1 to {sound_file.MAX_CHANNELS} channels"
         raise InputFileError(path, f"{expected}, got {rate_hz} and {channels}")
     if len(data) % channels or not len(data):
         raise InputFileError(path, f"expected samples of {channels} channels, got {len(data)} numbers")
@@ -264,7 +256,7 @@ def _own_block(path: Path, message: Any) -> AudioBlock:
     return AudioBlock(stamp_of(message.header), rate_hz, np.ascontiguousarray(samples))
 
 
-def _pcm_info(bag: BagReader, topic: str) -> RawPcm:
+def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
     """Return how the bytes of audio_common are to be read, as its AudioInfo says."""
     where = bag.topic("the topic of AudioInfo", None, PCM_INFO)
     said = None if where is None else next(bag.messages(where), None)
@@ -277,10 +269,10 @@ def _pcm_info(bag: BagReader, topic: str) -> RawPcm:
         problem = f"{where}: expected one of {', '.join(ENCODINGS)}, uncompressed (wave), got {got}"
         raise InputFileError(bag.path, problem)
     encoding = ENCODINGS[info.sample_format]
-    return RawPcm(io.BytesIO(), int(info.sample_rate), int(info.channels), encoding, str(bag.path))
+    return sound_file.RawPcm(io.BytesIO(), int(info.sample_rate), int(info.channels), encoding, str(bag.path))
 
 
-def _pcm_block(info: RawPcm, message: Any, recorded_ns: int) -> AudioBlock:
+def _pcm_block(info: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioBlock:
     stamped = hasattr(message, "header")
     data = bytes(message.audio.data if stamped else message.data)
     if not data or len(data) % info.frame_bytes:
@@ -390,8 +382,8 @@ def _array(bag: BagReader) -> MicrophoneArray | None:
     if said is None:
         return None
     places = said[1].positions
-    if len(places) > MAX_CHANNELS:
-        raise InputFileError(bag.path, f"{topic}: expected at most {MAX_CHANNELS} microphones")
+    if len(places) > sound_file.MAX_CHANNELS:
+        raise InputFileError(bag.path, f"{topic}: expected at most {sound_file.MAX_CHANNELS} microphones")
     positions_m = np.array([[one.x, one.y, one.z] for one in places], dtype=np.float64).reshape(-1, 3)
     return MicrophoneArray(positions_m, str(said[1].name or topic))
 

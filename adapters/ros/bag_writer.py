@@ -98,10 +98,7 @@ def write_bag(
 
     The stamps of detections and speeds count from the start of the recording; `start_ns` is added to all.
     """
-    with (
-        open_sound(sound, array.n_microphones, strict=False) as audio,
-        bag_writer(path, storage) as write,
-    ):
+    with open_sound(sound, array.n_microphones, strict=False) as audio, bag_writer(path, storage) as write:
         write(ARRAY_TOPIC, types.ARRAY, start_ns, _array(array, start_ns))
         rate_hz, taken = audio.sample_rate_hz, 0
         events = heapq.merge(
@@ -170,12 +167,8 @@ def _driven(ego: OdometryLog | None, start_ns: int) -> Iterator[_Event]:
     for told in ego.told:
         stamp_ns = start_ns + told.stamp_ns
         twist = {"linear": {"x": told.speed_mps}, "angular": {"z": told.yaw_rate_rad_s}}
-        values = {
-            "header": header(stamp_ns, "odom"),
-            "child_frame_id": "base_link",
-            "twist": {"twist": twist},
-        }
-        yield stamp_ns, ODOMETRY_TOPIC, types.ODOMETRY, values
+        frames = {"header": header(stamp_ns, "odom"), "child_frame_id": "base_link"}
+        yield stamp_ns, ODOMETRY_TOPIC, types.ODOMETRY, frames | {"twist": {"twist": twist}}
 
 
 ADVISORIES_TOPIC, OBJECTS_TOPIC = "/worldstate/advisories", "/worldstate/objects"

@@ -260,14 +260,11 @@ class _CameraEntry(CameraRecord):
 
     def setup(self, folder: Path) -> CameraSetup:
         """Return what belongs to the camera, its files in a folder."""
-        rate_hz = self.image_rate_hz
-        return CameraSetup(
-            _beside(folder, self.detections),
-            None if rate_hz is None else in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True),
-            _beside(folder, self.miss_rates),
-            DetectionFilter(frozenset(self.classes), self.min_score, self.min_box_px),
-            self.labels,
-        )
+        if (rate_hz := self.image_rate_hz) is not None:
+            in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True)
+        detections, rates = (_beside(folder, file) for file in (self.detections, self.miss_rates))
+        boxes = DetectionFilter(frozenset(self.classes), self.min_score, self.min_box_px)
+        return CameraSetup(detections, rate_hz, rates, boxes, self.labels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,15 +294,10 @@ class _CarFile:
                 origin_m = (0.0, 0.0, 0.0) if self.array is None else self.array.position_m
                 cameras[record.name] = _relative(record, origin_m)
                 setups[record.name] = record.setup(folder)
-        return CarSensors(
-            array,
-            cameras,
-            setups,
-            model=_beside(folder, self.model),
-            odometry=_beside(folder, self.odometry),
-            measurements={name: folder / file for name, file in self.measurements.items()},
-            crossing_m=in_range("car.crossing_m", self.crossing_m, 1.0, 100.0),
-        )
+        model, odometry = (_beside(folder, file) for file in (self.model, self.odometry))
+        measured = {name: folder / file for name, file in self.measurements.items()}
+        crossing_m = in_range("car.crossing_m", self.crossing_m, 1.0, 100.0)
+        return CarSensors(array, cameras, setups, model, odometry, measured, crossing_m)
 
 
 def _beside(folder: Path, file: str | None) -> Path | None:

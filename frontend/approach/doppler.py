@@ -284,9 +284,8 @@ def _wrong_level(level_db: FloatArray, speed: RadialSpeed) -> NotUsable | None:
     correlation = gain * float(np.linalg.norm(centred) / max(np.linalg.norm(measured), np.finfo(float).tiny))
     if _LEVEL_GAINS[0] <= gain <= _LEVEL_GAINS[1] and correlation >= _LEAST_CORRELATION:
         return None
-    return NotUsable(
-        f"the level does not follow the range of a pass-by: gain {gain:.2f}, correlation {correlation:.2f}"
-    )
+    fit = f"gain {gain:.2f}, correlation {correlation:.2f}"
+    return NotUsable(f"the level does not follow the range of a pass-by: {fit}")
 
 
 def _read_out(

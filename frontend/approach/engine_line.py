@@ -205,9 +205,7 @@ def measure_fundamental(
 
 
 def _partial(
-    windows: Windows,
-    demodulated: Complex128Array,
-    expected_hz: FloatArray,
+    windows: Windows, demodulated: Complex128Array, expected_hz: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return frequency, variance and power of a partial per window; infinite variance if too weak."""
     n, turns = windows.n, windows.rate_hz / (2 * np.pi)

@@ -158,12 +158,9 @@ def looming(
     rate = -source.slope / source.level
     gradient = np.array([-rate, -1.0]) / source.level
     log_std = max(exponential.scatter, floor_std)
-    return Looming(
-        inverse_tta_hz=rate,
-        std_hz=float(np.sqrt(gradient @ covariance @ gradient)),
-        log_slope_hz=exponential.slope,
-        log_slope_std_hz=float(log_std * np.sqrt(exponential.slope_variance)),
-    )
+    std_hz = float(np.sqrt(gradient @ covariance @ gradient))
+    slope_std_hz = float(log_std * np.sqrt(exponential.slope_variance))
+    return Looming(rate, std_hz, exponential.slope, slope_std_hz)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -129,11 +129,7 @@ def estimate_tone(samples: ArrayLike, sample_rate_hz: float) -> Tone:
 
 
 def climb(
-    y: FloatArray,
-    omega: float,
-    bounds: tuple[float, float],
-    tolerance: float = 1e-7,
-    steps: int = STEPS,
+    y: FloatArray, omega: float, bounds: tuple[float, float], tolerance: float = 1e-7, steps: int = STEPS
 ) -> tuple[float, complex, FloatArray]:
     r"""Fit one tone by Gauss-Newton from a coarse peak, unchecked: frequency, amplitude, what is left of y.
 
@@ -246,10 +242,7 @@ class ToneStage:
     """
 
     def __init__(
-        self,
-        array: MicrophoneArray,
-        sample_rate_hz: float,
-        band_hz: tuple[float, float] = ENGINE_BAND_HZ,
+        self, array: MicrophoneArray, sample_rate_hz: float, band_hz: tuple[float, float] = ENGINE_BAND_HZ
     ) -> None:
         low, high = band_hz
         in_range("tone_band_hz: lower end", low, _FEWEST_PERIODS / _WINDOW_S, high, open_high=True)
@@ -311,9 +304,8 @@ def _window(n_samples: float, decimator: Decimator) -> int:
     """Return the number of outputs that always fit into this many input samples."""
     count = int((n_samples - decimator.n_taps) // decimator.factor)
     if count < 2 * _PADDING * _RING[1]:
-        raise InvalidArgumentError(
-            f"tone_band_hz: expected a filter well below {n_samples:.0f} samples, got {decimator.n_taps}"
-        )
+        expected = f"a filter well below {n_samples:.0f} samples"
+        raise InvalidArgumentError(f"tone_band_hz: expected {expected}, got {decimator.n_taps}")
     return count
 
 

@@ -40,9 +40,8 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
 
     .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
     """
-    azimuth, elevation = np.broadcast_arrays(
-        np.asarray(azimuths_rad, dtype=np.float64), np.asarray(elevations_rad, dtype=np.float64)
-    )
+    angles = (np.asarray(one, dtype=np.float64) for one in (azimuths_rad, elevations_rad))
+    azimuth, elevation = np.broadcast_arrays(*angles)
     level = np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
@@ -102,15 +101,12 @@ class MicrophoneArray:
     def __post_init__(self) -> None:
         positions = finite_array("positions_m", self.positions_m, (None, 3)).copy()
         if not 2 <= len(positions) <= MAX_MICROPHONES:
-            raise InvalidArgumentError(
-                f"positions_m: expected 2 to {MAX_MICROPHONES} microphones, got {len(positions)}"
-            )
+            expected = f"2 to {MAX_MICROPHONES} microphones"
+            raise InvalidArgumentError(f"positions_m: expected {expected}, got {len(positions)}")
         spacings = nearest_spacings_m(positions)
         if spacings.min() == 0.0:
-            coincident = np.flatnonzero(spacings == 0.0).tolist()
-            raise InvalidArgumentError(
-                f"positions_m: expected different positions, got microphones {coincident} in one"
-            )
+            got = f"got microphones {np.flatnonzero(spacings == 0.0).tolist()} in one"
+            raise InvalidArgumentError(f"positions_m: expected different positions, {got}")
         positions.flags.writeable = False
         object.__setattr__(self, "positions_m", positions)
 
@@ -228,10 +224,7 @@ class MicrophoneArray:
         return np.asarray(-(directions @ self.positions_m.T) / SPEED_OF_SOUND_M_S)
 
     def steering(
-        self,
-        frequencies_hz: ArrayLike,
-        azimuths_rad: ArrayLike,
-        elevations_rad: ArrayLike = 0.0,
+        self, frequencies_hz: ArrayLike, azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0
     ) -> Complex128Array:
         r"""Return steering vectors at given frequencies and directions.
 

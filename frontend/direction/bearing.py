@@ -137,10 +137,7 @@ _ALL_ROUND_RAD = np.radians(np.arange(-180.0, 180.0, 10.0))
 
 
 def noise_prominence(
-    rows: Sequence[Steering],
-    array: MicrophoneArray,
-    frequencies_hz: FloatArray,
-    n_frames: float,
+    rows: Sequence[Steering], array: MicrophoneArray, frequencies_hz: FloatArray, n_frames: float
 ) -> float:
     r"""Return the peak-to-median ratio up to which a peak is taken for noise.
 
@@ -271,10 +268,7 @@ class AcousticBearing:
 
 
 def bearing_of(
-    spectrum: FloatArray,
-    peaks: Sequence[Peak],
-    azimuths_rad: FloatArray,
-    least_prominence: float,
+    spectrum: FloatArray, peaks: Sequence[Peak], azimuths_rad: FloatArray, least_prominence: float
 ) -> AcousticBearing:
     """Return the first of the peaks of a spectrum (A,) as a bearing; the middle of the grid if none."""
     uniform = float(azimuths_rad[-1] - azimuths_rad[0]) / np.sqrt(12.0)

@@ -61,10 +61,7 @@ def feature_nfft(sample_rate_hz: float) -> int:
 
 
 def feature_steering(
-    array: MicrophoneArray,
-    bins: range,
-    sample_rate_hz: float,
-    nfft: int = FEATURE_NFFT,
+    array: MicrophoneArray, bins: range, sample_rate_hz: float, nfft: int = FEATURE_NFFT
 ) -> Steering:
     r"""Return the beams at the thirty published azimuths.
 

@@ -58,11 +58,7 @@ def all_pairs(microphones: int) -> IndexArray:
     return np.column_stack(np.triu_indices(microphones, k=1))
 
 
-def gcc_delays(
-    spectra: ArrayLike,
-    frequencies_hz: ArrayLike,
-    max_delay_s: float,
-) -> PairDelays:
+def gcc_delays(spectra: ArrayLike, frequencies_hz: ArrayLike, max_delay_s: float) -> PairDelays:
     r"""Estimate the delay of every pair, between samples, by generalised cross-correlation.
 
     .. math:: \hat\tau_{ij} = \arg\max_{|\tau| \le \tau_{max}}

@@ -47,10 +47,8 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
     X = _checked_spectra(spectra)
     frames, _, microphones = X.shape
     if not 1 <= sources < microphones or sources > frames:
-        raise InvalidArgumentError(
-            f"sources: expected 1 .. {min(microphones - 1, frames)} for {frames} frames of {microphones} "
-            f"microphones, got {sources}"
-        )
+        most, heard = min(microphones - 1, frames), f"{frames} frames of {microphones} microphones"
+        raise InvalidArgumentError(f"sources: expected 1 .. {most} for {heard}, got {sources}")
     if frames >= microphones:
         return _leading(covariance(X), sources)
     by_bin = X.transpose(1, 2, 0)
@@ -175,9 +173,8 @@ def count_sources(eigenvalues: ArrayLike, frames: int) -> int:
     """
     values = finite_array("eigenvalues", np.atleast_2d(np.asarray(eigenvalues)), (None, None))
     if frames < 2 or values.min() < -1e-6 * values.max():
-        raise InvalidArgumentError(
-            f"eigenvalues: expected numbers >= 0 from two frames or more, got {frames}"
-        )
+        expected = "numbers >= 0 from two frames or more"
+        raise InvalidArgumentError(f"eigenvalues: expected {expected}, got {frames}")
     microphones = values.shape[1]
     ordered = np.sort(values, axis=1)[:, ::-1]
     score = _description_length if frames > 2 * microphones else _moment_score

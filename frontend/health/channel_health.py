@@ -131,11 +131,8 @@ class StillRuns:
         long = np.flatnonzero(lengths >= self._shortest(lengths[:-1]))
         self.runs = [(int(first + edges[i]), int(first + edges[i] + lengths[i] + 1)) for i in long]
         self._length = int(lengths[-1])
-        ended = [
-            Dropout("still", begin, stop - begin)
-            for begin, stop in self.runs
-            if stop < end or not self._length
-        ]
+        over = ((begin, stop) for begin, stop in self.runs if stop < end or not self._length)
+        ended = [Dropout("still", begin, stop - begin) for begin, stop in over]
         if not self._has_changed:
             ended = [one for one in ended if one.sample > 0 and one.sample >= first + moving[0]]
         self._has_changed |= bool(len(moving))

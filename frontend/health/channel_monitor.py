@@ -272,11 +272,7 @@ class ChannelMonitor:
         return self._dropout_finder.lost
 
     def push(
-        self,
-        samples: Float32Array,
-        energies: FloatArray,
-        powers: Float32Array,
-        matrices: Complex64Array,
+        self, samples: Float32Array, energies: FloatArray, powers: Float32Array, matrices: Complex64Array
     ) -> ArrayHealth:
         r"""Take the hop that `find_lost` took, its lost frames left out; return channels to keep and faults.
 
@@ -332,14 +328,9 @@ class ChannelMonitor:
         keep = ~bad
         for fault in faults:
             keep[fault.channel] &= fault.fault not in MASKED_FAULTS
-        return ArrayHealth(
-            ChannelMask(keep),
-            tuple(faults),
-            self._dropouts,
-            self._n_dropouts,
-            self._geometry_check.coherence,
-            self._clipping.newest_share,
-        )
+        dropouts = self._dropouts, self._n_dropouts
+        coherence, clipped = self._geometry_check.coherence, self._clipping.newest_share
+        return ArrayHealth(ChannelMask(keep), tuple(faults), *dropouts, coherence, clipped)
 
     def _single_channel_faults(self) -> list[ChannelFault]:
         """Faults seen on a channel by itself: clipping, offset, level, gusts."""

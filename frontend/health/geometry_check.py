@@ -331,9 +331,8 @@ class DelayCheck:
             return []
         whole = np.isfinite(values[:, known]).all(axis=1)
         values = np.where(known, values, 0.0)
-        return self._drift(values[whole], np.flatnonzero(whole), free) or self._late(
-            values[whole & np.array(self._far)], free
-        )
+        drifting = self._drift(values[whole], np.flatnonzero(whole), free)
+        return drifting or self._late(values[whole & np.array(self._far)], free)
 
     def _drift(self, values: FloatArray, seconds: IndexArray, free: FloatArray) -> list[ChannelFault]:
         if len(seconds) < _MIN_DRIFT_S:
@@ -379,11 +378,7 @@ _NOISE = 0.2
 _UNUSABLE = 1e3
 
 
-def position_weights(
-    array: MicrophoneArray,
-    frequencies_hz: FloatArray,
-    usable: BoolArray,
-) -> Float32Array:
+def position_weights(array: MicrophoneArray, frequencies_hz: FloatArray, usable: BoolArray) -> Float32Array:
     r"""Weights of all other microphones in the prediction at every position.
 
     .. math:: w_{pj} = -\frac{(\Gamma + \Lambda)^{-1}_{pj}}{(\Gamma + \Lambda)^{-1}_{pp}}, \qquad

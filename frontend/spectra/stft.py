@@ -43,15 +43,13 @@ def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Compl
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
     """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded."""
     low, high = (int(np.round(frequency / sample_rate_hz * nfft)) for frequency in band_hz)
+    got = f"got {band_hz} Hz"
     if not 0 <= low < high:
-        raise InvalidArgumentError(
-            f"band_hz: expected a band of at least one bin of {nfft}, got {band_hz} Hz"
-        )
+        raise InvalidArgumentError(f"band_hz: expected a band of at least one bin of {nfft}, {got}")
     if high > nfft // 2:
-        raise InvalidArgumentError(
-            f"band_hz: expected less than half the sample rate of {sample_rate_hz} Hz, got {band_hz} Hz: "
-            "choose a lower band, or sound of a higher rate (simulate: --bandwidth)"
-        )
+        expected = f"less than half the sample rate of {sample_rate_hz} Hz"
+        advice = "choose a lower band, or sound of a higher rate (simulate: --bandwidth)"
+        raise InvalidArgumentError(f"band_hz: expected {expected}, {got}: {advice}")
     return range(low, high)
 
 

@@ -9,12 +9,13 @@ import pytest
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import (
+    LINE_SPACING,
     GroundedObservation,
     GroundedSettings,
     Observable,
     car,
 )
-from worldstate.adapters.acoustic import LINE_SPACING, AcousticAdapter, Grounding, observe
+from worldstate.adapters.acoustic import AcousticAdapter, Grounding, observe
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main

@@ -1,14 +1,12 @@
 """A sequence model read hop by hop says what it says of the whole stream, from what a file can keep."""
 
 import json
-from dataclasses import fields
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sequence import evidence_of, sequence_model
 
-from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
 from worldstate.abduction.sequence.street_sides import (
     SECTORS,
@@ -18,12 +16,12 @@ from worldstate.abduction.sequence.street_sides import (
     StreetListener,
 )
 from worldstate.ground.serialisation import decode, encode
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
 
-def _hops(whole: HopEvidence) -> list[HopEvidence]:
-    columns = [getattr(whole, one.name) for one in fields(whole)]
-    return [HopEvidence(*(column[at : at + 1] for column in columns)) for at in range(len(whole))]
+def _hops(whole: FloatArray) -> list[FloatArray]:
+    return [whole[at : at + 1] for at in range(len(whole))]
 
 
 # Longer and shorter than the minute that is kept.

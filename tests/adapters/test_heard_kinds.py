@@ -9,8 +9,14 @@ from numpy.typing import ArrayLike
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.road_users import Foreign, RoadUserModel, WarningSignal
-from worldstate.adapters.acoustic import AcousticAdapter, asked_again, expected_labels, heard_kinds
+from worldstate.abduction.road_users import (
+    Foreign,
+    RoadUserModel,
+    WarningSignal,
+    expected_labels,
+    heard_kinds,
+)
+from worldstate.adapters.acoustic import AcousticAdapter, asked_again
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from sklearn.ensemble import HistGradientBoostingClassifier
 
-from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
 from worldstate.commissioning.sequence_training import (
     LabelledStream,
@@ -35,10 +34,10 @@ def _stream(rng: np.random.Generator, hops: int = 1200) -> LabelledStream:
     coming = np.stack([12.0 - time_s % 12.0, np.full(hops, np.inf)], axis=1)
     rises = np.clip(3.0 - coming[:, 0], -2.0, 3.0)
     sides = np.stack([rises, np.full(hops, -2.0)], axis=1) + rng.normal(size=(hops, 2))
-    rest = np.abs(rng.normal(size=(7, hops)))
+    rest = np.abs(rng.normal(size=(7, hops))).T
     nobody = np.full((hops, 2), -np.inf)
     return LabelledStream(
-        HopEvidence(sides, *rest, bands=rng.normal(size=(hops, 4))),
+        np.concatenate([sides, rest, rng.normal(size=(hops, 4))], axis=1),
         StreamTruth(coming, np.zeros(hops, bool), nobody, nobody, np.zeros((hops, 2), bool)),
     )
 

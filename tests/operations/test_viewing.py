@@ -105,7 +105,7 @@ def panels(states, tmp_path, monkeypatch):
         def lent(*rest):
             yield figure
 
-        monkeypatch.setattr(state_figure, "figure_file", lent)
+        monkeypatch.setattr(state_figure.style, "figure_file", lent)
         write_state_figure(states, tmp_path / "states.png", **parts)
         return figure.axes[:4]
 

@@ -35,15 +35,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.state_log import read_log, read_state_near
-    from worldstate.operations.recordings.evidence_report import (
-        common_lines,
-        evidence_report,
-        told_advisories,
-    )
+    from worldstate.operations.recordings import evidence_report
 
     listed, told = list[str](), {}
     if arguments.time is None:
-        found, stamp_ns = told_advisories((state for _, state in read_log(arguments.states)), arguments.side)
+        states = (state for _, state in read_log(arguments.states))
+        found, stamp_ns = evidence_report.told_advisories(states, arguments.side)
         which = "at the first onset" if found else "none; at the highest risk"
         listed = ["advisories", *(f"  {one.line()}" for one in found), f"  {which}, another by --time", ""]
         told = {"advisories": [asdict(one) for one in found]}
@@ -52,7 +49,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     state = read_state_near(arguments.states, stamp_ns)
     if arguments.side is not None:
         one_of("--side", arguments.side, [cue.direction for cue in state.cues])
-    reports = evidence_report(state, partial(read_state_near, arguments.states), arguments.side)
+    read = partial(read_state_near, arguments.states)
+    reports = evidence_report.evidence_report(state, read, arguments.side)
     now_s = ground.seconds(state.stamp_ns)
     written = state.to_dict()
     common = {key: written[key] for key in ("sensors", "searched", "events", "domain", "no_sequence")}
@@ -61,5 +59,5 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     return output.CommandResult(
         told | {"time_s": now_s, "sides": sides} | common,
         table={},
-        lines=[*listed, f"time  {now_s:.2f} s", *lines, *common_lines(state)],
+        lines=[*listed, f"time  {now_s:.2f} s", *lines, *evidence_report.common_lines(state)],
     )

@@ -1,4 +1,11 @@
-"""Entry point: one module per command, with `add_options` and `run` and a docstring that ends in examples."""
+"""Keep a structured world-state alive from sound when vision fails.
+
+example: worldstate demo --out out/demo
+
+exit codes: 0 done, 1 `array check` found a fault, 2 bad input (one line on
+standard error says what came and what was expected), 130 after Ctrl-C, 143
+after SIGTERM; unfinished files are removed in each case
+"""
 
 import json
 import sys
@@ -8,7 +15,8 @@ from importlib.resources import files
 from worldstate.cli.common.command import Program, run_program
 from worldstate.ground.errors import InvalidArgumentError
 
-# A group is a folder, a command is a module in it; each keeps its heavy imports inside `run`.
+# A group is a folder, a command is a module in it, with `add_options` and `run` and a docstring that ends in
+# examples; each keeps its heavy imports inside `run`.
 COMMANDS = (
     *("demo", "run", "live", "explain"),
     *("array check", "array bounds", "array bearings", "array align"),
@@ -27,36 +35,20 @@ GROUPS = {
 }
 # Former names of commands and options, read through the next minor version, and what stands in their place;
 # studies are commands of `worldstate-lab`, which the wheel of the library does not hold.
-FORMER, STUDIES, FORMER_OPTIONS = json.loads(
-    (files("worldstate") / "data" / "former_names.json").read_text("utf-8")
-).values()
-DESCRIPTION = "Keep a structured world-state alive from sound when vision fails."
-EPILOG = """\
-example: worldstate demo --out out/demo
+_NAMES = (files("worldstate") / "data" / "former_names.json").read_text("utf-8")
+FORMER, STUDIES, FORMER_OPTIONS = json.loads(_NAMES).values()
+DESCRIPTION, _, EPILOG = (__doc__ or "").strip().partition("\n\n")
 
-exit codes: 0 done, 1 `array check` found a fault, 2 bad input (one line on
-standard error says what came and what was expected), 130 after Ctrl-C, 143
-after SIGTERM; unfinished files are removed in each case"""
-
-
-PROGRAM = Program(
-    "worldstate",
-    DESCRIPTION,
-    EPILOG,
-    {words: "worldstate.cli." + words.replace(" ", ".").replace("-", "_") for words in COMMANDS},
-    GROUPS,
-    hidden=("completion",),
-    former_options=FORMER_OPTIONS,
-)
+_MODULES = {words: "worldstate.cli." + words.replace(" ", ".").replace("-", "_") for words in COMMANDS}
+PROGRAM = Program("worldstate", DESCRIPTION, EPILOG, _MODULES, GROUPS, ("completion",), FORMER_OPTIONS)
 
 
 def current_words(words: Sequence[str]) -> list[str]:
     """Return the words of a call with the former name of a command replaced; a study is refused."""
     first, *rest = words or [""]
     if first in STUDIES:
-        raise InvalidArgumentError(
-            f"{first}: expected `worldstate-lab {STUDIES[first]}`, of the distribution worldstate-lab"
-        )
+        successor = f"`worldstate-lab {STUDIES[first]}`, of the distribution worldstate-lab"
+        raise InvalidArgumentError(f"{first}: expected {successor}")
     if first in FORMER:
         print(f"worldstate: `{first}` is now `{FORMER[first]}`", file=sys.stderr)
         return [*FORMER[first].split(), *rest]

@@ -54,9 +54,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     listening.add_listen_options(parser)
     listening.add_memory_options(parser, "0")
     add = parser.add_argument
-    add(
-        "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
-    )
+    silent = "leave silent channels out instead of refusing the recording"
+    add("--mask-dead", action="store_true", help=silent)
     moves = "columns time_s, speed_mps; optional yaw_rate_rad_s, and x_m, y_m, yaw_rad where corners stand"
     add("--odometry", type=Path, metavar="CSV", help=moves)
     other = "what another sensor recorded, by a reader that an installed package brings; may be repeated"
@@ -91,11 +90,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
     if arguments.save_state is not None and report.end is not None:
         adapters.save_checkpoint(arguments.save_state, report.end)
-    summary = report.to_dict() | {
-        "array": inputs.stance(source.array),
-        "detections": sensors.box_counts(source, as_json=arguments.json),
-    }
-    return output.CommandResult(summary)
+    boxes = sensors.box_counts(source, as_json=arguments.json)
+    beside = {"array": inputs.stance(source.array), "detections": boxes}
+    return output.CommandResult(report.to_dict() | beside)
 
 
 def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "adapters.Source":

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_inputs import HopEvidence
+from worldstate.abduction.sequence.sequence_inputs import hop_columns
 from worldstate.abduction.sequence.sequence_model import SequenceModel, SequencePosterior
 from worldstate.abduction.signature.ensemble import KINDS, EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
@@ -90,10 +90,10 @@ def _path(array: MicrophoneArray, believed: MicrophoneArray, folder: Path, setti
     return folder / f"{settings.name}-{hashlib.sha256(made_with.encode()).hexdigest()[:12]}.npz"
 
 
-def stream_evidence(model: EnsembleModel, heard: HeardStream) -> HopEvidence:
+def stream_evidence(model: EnsembleModel, heard: HeardStream) -> FloatArray:
     """Return what a window model says along a stream, and what else the front-end heard."""
     hops, posteriors = heard.hops, posteriors_along(model, heard.hops.feature)
-    return HopEvidence.heard(
+    return hop_columns(
         side_ratios(posteriors, model.classes, model.class_prior),
         visible_ratios(posteriors, model.class_prior),
         feature=hops.feature,

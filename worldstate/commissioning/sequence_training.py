@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence, sequence_inputs
+from worldstate.abduction.sequence.sequence_inputs import SIDES, sequence_inputs
 from worldstate.abduction.sequence.sequence_model import (
     COMING_S,
     GROUPS,
@@ -99,7 +99,7 @@ _FIGURES = 7  # Of a number in the file: it is half as long, and no input is kno
 class LabelledStream:
     """Evidence of one stream, by a window model that did not learn from it, and the truth."""
 
-    evidence: HopEvidence
+    evidence: FloatArray  # As `hop_columns`
     truth: StreamTruth
     weight: float = 1.0  # Of each of its hops
 

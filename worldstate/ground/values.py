@@ -12,7 +12,7 @@ from .errors import InvalidArgumentError
 from .typing import FloatArray
 
 # A float stays a float, an array an array.
-AngleT = TypeVar("AngleT", float, FloatArray)
+RealT = TypeVar("RealT", float, FloatArray)
 
 # What a co-evidence channel last said of an entity: found, searched for and not found, not searched for.
 Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
@@ -56,12 +56,11 @@ def significant(values: FloatArray, figures: int) -> FloatArray:
     >>> significant(np.array([1234.5678, 0.00012345678]), 3)
     array([1.23e+03, 1.23e-04])
     """
-    return np.array([float(f"{value:.{figures}g}") for value in values.ravel().tolist()]).reshape(
-        values.shape
-    )
+    rounded = [float(f"{value:.{figures}g}") for value in values.ravel().tolist()]
+    return np.array(rounded).reshape(values.shape)
 
 
-def wrap_angle(angle_rad: AngleT) -> AngleT:
+def wrap_angle(angle_rad: RealT) -> RealT:
     """Wrap an angle in radians into (-pi, pi].
 
     Parameters

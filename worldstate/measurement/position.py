@@ -60,14 +60,11 @@ class Position:
         covariance = finite_array("covariance", self.covariance, (known, known))
         spread = np.linalg.eigvalsh(covariance)
         if not np.allclose(covariance, covariance.T, rtol=1e-9, atol=1e-9) or spread[0] < _LEAST_VARIANCE:
-            raise InvalidArgumentError(
-                "covariance: expected a symmetric matrix with eigenvalues of at least "
-                f"{_LEAST_VARIANCE}, got {covariance.tolist()}"
-            )
+            expected = f"a symmetric matrix with eigenvalues of at least {_LEAST_VARIANCE}"
+            raise InvalidArgumentError(f"covariance: expected {expected}, got {covariance.tolist()}")
         if spread[-1] > _LARGEST_VARIANCE:
-            raise InvalidArgumentError(
-                f"covariance: expected eigenvalues of at most {_LARGEST_VARIANCE:g}, got {spread[-1]:g}"
-            )
+            expected = f"eigenvalues of at most {_LARGEST_VARIANCE:g}"
+            raise InvalidArgumentError(f"covariance: expected {expected}, got {spread[-1]:g}")
         even = 0.5 * (covariance + covariance.T)
         object.__setattr__(self, "covariance", tuple(tuple(row) for row in even.tolist()))
         object.__setattr__(self, "position_m", pair("position_m", self.position_m, _FARTHEST_M))

@@ -25,16 +25,8 @@ from worldstate.ground.extras import optional
 from worldstate.measurement import Approach, Bearing, Position
 from worldstate.smoothing import factors as f
 
+from . import observations as obs
 from .factors import Factor
-from .observations import (
-    AngularHeight,
-    Observation,
-    Range,
-    SmoothedTrack,
-    SmoothingSettings,
-    cartesian,
-    moved,
-)
 
 
 def _parameters() -> Any:
@@ -51,7 +43,7 @@ def _parameters() -> Any:
 class FactorGraph:
     """gtsam's incremental fixed-lag smoother, with the factors and values that wait for its next update."""
 
-    def __init__(self, settings: SmoothingSettings) -> None:
+    def __init__(self, settings: obs.SmoothingSettings) -> None:
         import gtsam
 
         parameters = _parameters()
@@ -164,6 +156,7 @@ class FixedLagSmoother:
 
     Examples
     --------
+    >>> from worldstate.smoothing.observations import Range
     >>> smoother = FixedLagSmoother()
     >>> for hop in range(20):
     ...     far_m = 12.0 - 0.5 * hop
@@ -175,8 +168,8 @@ class FixedLagSmoother:
     True
     """
 
-    def __init__(self, settings: SmoothingSettings | None = None) -> None:
-        self.settings = settings or SmoothingSettings()
+    def __init__(self, settings: obs.SmoothingSettings | None = None) -> None:
+        self.settings = settings or obs.SmoothingSettings()
         self.n_dropped = 0
         self._graph = FactorGraph(self.settings)
         self._entities: dict[str, _Entity] = {}
@@ -218,7 +211,7 @@ class FixedLagSmoother:
         key = self._add_state(one, stamp_ns, belief.mean)
         self._graph.add(f.prior_factor(key, belief.mean, belief.covariance))
 
-    def update(self, stamp_ns: int, observations: Mapping[str, Sequence[Observation]]) -> None:
+    def update(self, stamp_ns: int, observations: Mapping[str, Sequence[obs.Observation]]) -> None:
         """Take in what was observed at one instant, of any number of entities.
 
         Parameters
@@ -244,7 +237,7 @@ class FixedLagSmoother:
         self._graph.update()
         self._forget()
 
-    def track(self, entity: str) -> SmoothedTrack:
+    def track(self, entity: str) -> obs.SmoothedTrack:
         """Return the corrected trajectory of an entity within the lag.
 
         Parameters
@@ -267,7 +260,7 @@ class FixedLagSmoother:
             raise InvalidArgumentError(f"entity: expected one of {self.entities}, got {entity!r:.40}")
         mean, covariance = self._graph.refined([one.keys[stamp] for stamp in one.stamps_ns])
         belief = MotionBelief(mean, 0.5 * (covariance + covariance.mT))
-        return SmoothedTrack(entity, np.array(one.stamps_ns, np.int64), belief)
+        return obs.SmoothedTrack(entity, np.array(one.stamps_ns, np.int64), belief)
 
     def _start(self, stamp_ns: int) -> None:
         if self._origin_ns is None:
@@ -290,7 +283,7 @@ class FixedLagSmoother:
         self._graph.add_variable(key, state, self._time_s(stamp_ns))
         return key
 
-    def _observe(self, entity: str, stamp_ns: int, every: Sequence[Observation]) -> None:
+    def _observe(self, entity: str, stamp_ns: int, every: Sequence[obs.Observation]) -> None:
         one = self._entities.get(entity)
         if one is None:
             one = self._first(entity, stamp_ns, every)
@@ -300,17 +293,16 @@ class FixedLagSmoother:
         for said in every:
             self._graph.add(self._factor(one, node, said))
 
-    def _first(self, entity: str, stamp_ns: int, every: Sequence[Observation]) -> _Entity:
+    def _first(self, entity: str, stamp_ns: int, every: Sequence[obs.Observation]) -> _Entity:
         """Begin an entity where it is first observed, with a prior that is wide in all else."""
         toward = next((one.azimuth_rad for one in every if isinstance(one, Bearing)), None)
-        log_m = math.log(next((one.range_m for one in every if isinstance(one, Range)), _START_M))
+        log_m = math.log(next((one.range_m for one in every if isinstance(one, obs.Range)), _START_M))
         place = next((one.position_m for one in every if isinstance(one, Position)), None)
         if place is not None:
             toward, log_m = math.atan2(place[1], place[0]), math.log(max(math.hypot(*place), 1.0))
         if toward is None:
-            raise InvalidArgumentError(
-                f"observations: expected {entity!r:.40} to begin with a bearing or position"
-            )
+            expected = f"{entity!r:.40} to begin with a bearing or position"
+            raise InvalidArgumentError(f"observations: expected {expected}")
         one = self._entities[entity] = _Entity()
         state = np.array([toward, 0.0, 0.0, log_m])
         prior = np.array([state[0], 0.0, 0.0, math.log(_START_M)])
@@ -324,7 +316,7 @@ class FixedLagSmoother:
         last_ns = one.stamps_ns[-1]
         key, step_s = one.keys[last_ns], seconds(stamp_ns - last_ns)
         before = f.Node(key, self._graph.value(key))
-        state = moved(before.state, step_s)
+        state = obs.moved(before.state, step_s)
         after = f.Node(self._add_state(one, stamp_ns, state), state)
         self._graph.add(f.motion_factor(before, after, step_s, f.motion_noise(self.settings, step_s)))
 
@@ -339,7 +331,7 @@ class FixedLagSmoother:
         key = one.keys[nearest]
         return f.Node(key, self._graph.value(key), seconds(stamp_ns - nearest))
 
-    def _factor(self, one: _Entity, node: f.Node, said: Observation) -> Factor:
+    def _factor(self, one: _Entity, node: f.Node, said: obs.Observation) -> Factor:
         match said:
             case Bearing():
                 return f.bearing_factor(node, said, self.settings)
@@ -347,12 +339,12 @@ class FixedLagSmoother:
                 return f.approach_factor(node, said, self.settings)
             case Position():
                 return f.position_factor(node, said)
-            case Range():
+            case obs.Range():
                 return f.range_factor(node, said, self.settings)
-            case AngularHeight():
+            case obs.AngularHeight():
                 return f.height_factor(node, self._height(one, said), said, self.settings)
 
-    def _height(self, one: _Entity, said: AngularHeight) -> int:
+    def _height(self, one: _Entity, said: obs.AngularHeight) -> int:
         """Return the key of an entity's height, which lives as long as its states."""
         if one.height_key is None:
             one.height_key, start = next(self._numbers), np.array([math.log(said.true_height_m)])
@@ -381,8 +373,8 @@ _ACCELERATION_PSD = 1.0
 
 
 def rts_track(
-    entity: str, start: MotionBelief, observed: Mapping[int, Sequence[Observation]]
-) -> SmoothedTrack:
+    entity: str, start: MotionBelief, observed: Mapping[int, Sequence[obs.Observation]]
+) -> obs.SmoothedTrack:
     """Return the smoothed track of a vehicle that a standing ego observes, by stamps in ns.
 
     Raises
@@ -392,6 +384,7 @@ def rts_track(
 
     Examples
     --------
+    >>> from worldstate.smoothing.observations import AngularHeight
     >>> start = MotionBelief.around((0.9, -0.1, -0.15, 3.2), (0.4, 0.25, 0.3, 0.6))
     >>> box = [Bearing(0.8, 0.01), AngularHeight(0.1, 0.05)]
     >>> track = rts_track("car", start, {0: [], 10**9: box})
@@ -400,7 +393,7 @@ def rts_track(
     """
     kalman = optional("filterpy.kalman").KalmanFilter(dim_x=4, dim_z=2)
     stamps_ns = sorted(observed)
-    mean, slope = cartesian(start.mean)
+    mean, slope = obs.cartesian(start.mean)
     kalman.x, kalman.P, kalman.H = mean, slope @ start.covariance @ slope.T, np.eye(2, 4)
     means, covariances, flows, noises = [], [], [], []
     for before_ns, stamp_ns in zip([stamps_ns[0], *stamps_ns], stamps_ns, strict=False):
@@ -415,13 +408,13 @@ def rts_track(
         noises.append(_ACCELERATION_PSD * unit)
     means, covariances, _, _ = kalman.rts_smoother(np.array(means), np.array(covariances), flows, noises)
     motion = polar_motion(CartesianBelief(means, covariances), 0.0)
-    return SmoothedTrack(entity, np.array(stamps_ns, np.int64), motion, "RTS smoother")
+    return obs.SmoothedTrack(entity, np.array(stamps_ns, np.int64), motion, "RTS smoother")
 
 
-def _placed(every: Sequence[Observation]) -> tuple[FloatArray, FloatArray] | None:
+def _placed(every: Sequence[obs.Observation]) -> tuple[FloatArray, FloatArray] | None:
     """Return position and covariance by the bearing and the height of a box, None without them."""
     toward = next((one for one in every if isinstance(one, Bearing)), None)
-    height = next((one for one in every if isinstance(one, AngularHeight)), None)
+    height = next((one for one in every if isinstance(one, obs.AngularHeight)), None)
     if toward is None or height is None:
         return None
     range_m = height.true_height_m / height.height_rad

@@ -54,9 +54,8 @@ class Moments:
 
     def plus(self, value: float, weight: float = 1.0) -> "Moments":
         """Return them with one observation more."""
-        return Moments(
-            self.weight + weight, self.total + weight * value, self.squares + weight * value * value
-        )
+        total, squares = self.total + weight * value, self.squares + weight * value * value
+        return Moments(self.weight + weight, total, squares)
 
     def faded(self, factor: float) -> "Moments":
         """Return them with everything weighed less."""
@@ -224,13 +223,8 @@ class LearnedArm:
 
     def faded(self, factor: float) -> "LearnedArm":
         """Return it with everything weighed less."""
-        return LearnedArm(
-            self.direction,
-            self.edge.faded(factor),
-            self.log_pace.faded(factor),
-            factor * self.arrivals,
-            factor * self.exposure_s,
-        )
+        edge, log_pace = self.edge.faded(factor), self.log_pace.faded(factor)
+        return LearnedArm(self.direction, edge, log_pace, factor * self.arrivals, factor * self.exposure_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
+from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
 from worldstate.abduction.sequence.street_sides import StreetListener
@@ -110,7 +110,7 @@ def measurements(
     heard: HeardStream,
     model: EnsembleModel,
     sequence: SequenceModel,
-    evidence: HopEvidence,
+    evidence: FloatArray,
     vision: CoEvidenceChannel | None,
     street: StreetListener | None = None,
 ) -> Iterator[Measurement]:

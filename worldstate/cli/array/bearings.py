@@ -32,19 +32,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.files.file_io import write_text
-    from worldstate.operations.recordings.bearing_track import (
-        bearings_csv,
-        track_bearings,
-        write_bearings_figure,
-    )
+    from worldstate.operations.recordings import bearing_track
 
     output.check_outputs(arguments, "out", figures=("figure",))
     with inputs.opened_front_end(arguments) as (audio, front_end), progress.sound_bar(audio) as bar:
-        track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
+        track = bearing_track.track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
         silent = list(audio.silent_channels)
-    write_text(arguments.out, bearings_csv(track))
+    write_text(arguments.out, bearing_track.bearings_csv(track))
     if arguments.figure is not None:
-        write_bearings_figure(track, arguments.figure, audio.path.name)
+        bearing_track.write_bearings_figure(track, arguments.figure, audio.path.name)
     summary = {
         "out": str(arguments.out),
         "array": inputs.stance(front_end.array),

@@ -41,25 +41,20 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from dataclasses import replace
 
-    from worldstate.operations.recordings.channel_report import (
-        as_json,
-        as_text,
-        rate_from_duration,
-        write_array_figure,
-    )
+    from worldstate.operations.recordings import channel_report
 
     output.check_outputs(arguments, figures=("figure",))
     with inputs.opened_front_end(arguments) as (audio, front_end):
         array, health = front_end.array, examine(audio, front_end)
         if arguments.duration is not None:
-            rate = rate_from_duration(
+            rate = channel_report.rate_from_duration(
                 audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
             )
             health = replace(health, sample_rate=rate)
         heard = health, audio, array, inputs.stance(array)
-        report, lines = as_json(*heard), list(as_text(*heard))
+        report, lines = channel_report.as_json(*heard), list(channel_report.as_text(*heard))
     if arguments.figure is not None:
-        write_array_figure(array, health, arguments.figure)
+        channel_report.write_array_figure(array, health, arguments.figure)
     return output.CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
 
 

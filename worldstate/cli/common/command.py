@@ -41,9 +41,8 @@ class Program:
     commands: Mapping[str, str]  # The words of a command to its module
     groups: Mapping[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()  # Left out of the overview
-    former_options: Mapping[str, str] = field(
-        default_factory=dict
-    )  # Options that are gone to their successors
+    # Options that are gone to their successors
+    former_options: Mapping[str, str] = field(default_factory=dict)
 
     def called(self, words: Sequence[str]) -> str | None:
         """Return the words of the command that a call names, None where it names none."""
@@ -79,14 +78,9 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of one command, with --json."""
 
     def __init__(self, program: str, module: ModuleType) -> None:
-        _, description, examples = _documentation(module.__doc__ or "")
-        super().__init__(
-            program,
-            description=description,
-            epilog=examples,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
+        _, told, examples = _documentation(module.__doc__ or "")
+        form = argparse.RawDescriptionHelpFormatter
+        super().__init__(program, description=told, epilog=examples, formatter_class=form, allow_abbrev=False)
         self.first: tuple[str, ...] = getattr(module, "FIRST_OPTIONS", ())
         self.add_argument("--json", action="store_true", help="print the result as one JSON object")
         if self.first:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from worldstate import adapters
 from worldstate.ground.errors import InvalidArgumentError
 
+from .inputs import describe
+
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_messages import LogMessage, LogSink
     from worldstate.state import WorldState
@@ -19,16 +21,6 @@ if TYPE_CHECKING:
 
 FOXGLOVE_PORT = 8765
 CROSSING_M = 9.0
-HELP = """\
---export NAME=TARGET sends states on, and may be repeated:
-  mcap=FILE            snapshots and scene for Foxglove
-  foxglove[=PORT]      the same on a websocket, in real time (8765)
-  rerun=FILE           the same for the Rerun viewer
-  osi=FILE             a trace of ASAM OSI SensorData
-  autoware=FILE        Autoware's PredictedObjects, one a line
-  odas=HOST:PORT       tracks as ODAS sends them; ODAS Studio listens at port 9000
-  rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3 in that storage
-  NAME=TARGET          what an exporter does that an installed package brings"""
 # Exporters of the library, with the optional module that each needs.
 EXPORTERS = {
     "mcap": "mcap", "foxglove": "foxglove", "rerun": "rerun", "osi": "osi3", "autoware": None, "odas": None,
@@ -40,8 +32,19 @@ _VIEWERS = "mcap", "rerun", "foxglove"
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Declare --out and --export, where states go; return their group."""
-    parser.description = f"{parser.description}\n\n{HELP}"
+    """Declare --out and --export, where states go; return their group.
+
+    --export NAME=TARGET sends states on, and may be repeated:
+      mcap=FILE            snapshots and scene for Foxglove
+      foxglove[=PORT]      the same on a websocket, in real time (8765)
+      rerun=FILE           the same for the Rerun viewer
+      osi=FILE             a trace of ASAM OSI SensorData
+      autoware=FILE        Autoware's PredictedObjects, one a line
+      odas=HOST:PORT       tracks as ODAS sends them; ODAS Studio listens at port 9000
+      rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3 in that storage
+      NAME=TARGET          what an exporter does that an installed package brings
+    """
+    describe(parser, add_output_options)
     group = parser.add_argument_group("output")
     group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     told = "send states to a viewer, a log or another stack; repeated"

@@ -1,8 +1,9 @@
 """What a command listens to, and by which microphones: INPUT, --array, where a bearing is looked for."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from inspect import getdoc
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -13,28 +14,30 @@ if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio, Encoding, SoundInput
     from worldstate.adapters.ros.bag_input import BagTopics
 
-SOUND_HELP = """\
-INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
-(out_multi.wav and, where there is one, camera_baseline_results.json), several files of one channel each in
-the order of the microphones, a bag of ROS 2 (its folder, .mcap or .db3), or raw samples on standard input:
-pcm:RATE:CHANNELS:FORMAT, with s16, s24, s32 (little-endian whole numbers) or f32 (floats) as FORMAT."""
-SOUND_EXAMPLE = """\
-  arecord -D hw:1 -t raw -f S32_LE -r 48000 -c 8 | {} pcm:48000:8:s32"""
-ARRAY_HELP = """\
---array FILE holds one microphone a channel, in the order of the channels, in metres:
-  XML   Acoular's and OVAD's <pos x= y= z= />: the array plane seen from behind, x right, y up, z forward
-  CSV   x,y,z a line, with or without header and names: base_link, x forward, y left, z up
-  JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too"""
+_EXAMPLE = "  arecord -D hw:1 -t raw -f S32_LE -r 48000 -c 8 | {} pcm:48000:8:s32"
 _RAW = "pcm:"
 _TOPICS = "audio", "detections", "odometry"
 # Below this a coordinate does not spread, metres.
 _FLAT_M = 0.005
 
 
+def describe(parser: argparse.ArgumentParser, declare: Callable[..., object]) -> None:
+    """Add to a command's description what stands below the first line of a function's docstring."""
+    _, _, told = (getdoc(declare) or "").partition("\n\n")
+    parser.description = f"{parser.description}\n\n{told}"
+
+
 def add_sound_options(parser: argparse.ArgumentParser) -> None:
-    """Declare INPUT and --topic."""
-    parser.description = f"{parser.description}\n\n{SOUND_HELP}"
-    parser.epilog = f"{parser.epilog}\n{SOUND_EXAMPLE.format(parser.prog)}"
+    """Declare INPUT and --topic.
+
+    INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
+    (out_multi.wav and, where there is one, camera_baseline_results.json), several files of one channel each
+    in the order of the microphones, a bag of ROS 2 (its folder, .mcap or .db3), or raw samples on standard
+    input: pcm:RATE:CHANNELS:FORMAT, with s16, s24, s32 (little-endian whole numbers) or f32 (floats) as
+    FORMAT.
+    """
+    describe(parser, add_sound_options)
+    parser.epilog = f"{parser.epilog}\n{_EXAMPLE.format(parser.prog)}"
     what = "sound file, recording folder, a file a microphone, bag, or pcm:RATE:CHANNELS:FORMAT"
     parser.add_argument("input", type=Path, nargs="+", metavar="INPUT", help=what)
     topic = "audio=, detections= or odometry=TOPIC of a bag (default: the only one of its type); repeated"
@@ -44,8 +47,14 @@ def add_sound_options(parser: argparse.ArgumentParser) -> None:
 def add_array_options(
     parser: argparse.ArgumentParser, default: str = "the data set's, OVAD's where it names none"
 ) -> None:
-    """Declare --array and --array-axes, and say in the help what the files look like."""
-    parser.description = f"{parser.description}\n\n{ARRAY_HELP}"
+    """Declare --array and --array-axes.
+
+    --array FILE holds one microphone a channel, in the order of the channels, in metres:
+      XML   Acoular's and OVAD's <pos x= y= z= />: the array plane seen from behind, x right, y up, z forward
+      CSV   x,y,z a line, with or without header and names: base_link, x forward, y left, z up
+      JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too
+    """
+    describe(parser, add_array_options)
     add = parser.add_argument
     add("--array", type=Path, metavar="FILE", help=f"microphone positions (default: {default})")
     axes = "x right, y up, z forward, or x forward, y left, z up (default: by the form of the file)"
@@ -111,10 +120,8 @@ def given_array(arguments: argparse.Namespace) -> "frontend.MicrophoneArray | No
 
 def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
     """Return where a bearing is looked for, all else by default."""
-    band = arguments.band
-    return adapters.ListenSettings(
-        band_hz=None if band is None else (band[0], band[1]), azimuth_span_deg=arguments.azimuth_span
-    )
+    band = None if arguments.band is None else (arguments.band[0], arguments.band[1])
+    return adapters.ListenSettings(band_hz=band, azimuth_span_deg=arguments.azimuth_span)
 
 
 def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, frontend.MicrophoneArray]":

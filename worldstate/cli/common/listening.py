@@ -41,10 +41,10 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
     add("--grounded", action="store_true", help=grounded)
     ego_noise = "learn the own vehicle's noise while nothing is there and hear past it (default: off)"
     add("--ego-noise", action="store_true", help=ego_noise)
-    place = (
-        "corners, lanes and rates of this place, JSON (default: a usual blind junction, and states say so)"
+    usual = "default: a usual blind junction, and states say so"
+    add(
+        "--context", type=Path, metavar="FILE", help=f"corners, lanes and rates of this place, JSON ({usual})"
     )
-    add("--context", type=Path, metavar="FILE", help=place)
     street = "edges, pace and sides of this place as `street learn` wrote them, in place of --context"
     add("--street", type=Path, metavar="JSON", help=street)
 

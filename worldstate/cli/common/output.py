@@ -79,9 +79,8 @@ def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[s
     given = vars(arguments)
     outputs = {name: given[name] for name in (*options, *figures) if given[name] is not None}
     outputs |= exported_files(arguments) if "export" in given else {}
-    lists = [
-        value if isinstance(value, list) else [value] for name, value in given.items() if name not in outputs
-    ]
+    others = (value for name, value in given.items() if name not in outputs)
+    lists = [value if isinstance(value, list) else [value] for value in others]
     inputs = [value for values in lists for value in values if isinstance(value, Path)]
     taken: dict[Path, str] = {}
     for name, path in outputs.items():

@@ -9,43 +9,28 @@ from typing import TYPE_CHECKING
 from worldstate import adapters
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
-from .inputs import add_array_options, given_array
+from .inputs import add_array_options, describe, given_array
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import SoundInput
     from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 
-CAR_HELP = """\
---car FILE alone says what a vehicle has, JSON in base_link (x forward, y left, z up), files beside it:
-  {"array": {"file": "mics.csv", "position_m": [1.2, 0, 1.6], "pitch_deg": -5},
-   "cameras": [{"name": "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90,
-                "position_m": [1.9, 0, 1.3], "stamp_offset_s": 0.04, "detections": "front.json"}],
-   "model": "mine.json", "odometry": "odometry.csv", "measurements": {"radar": "radar.csv"},
-   "crossing_m": 9}
-Every key is optional. An option in its place counts before it; --camera NAME names one of its cameras."""
-DETECTIONS_HELP = """\
---detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the
-number of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the first
-sample of the sound, ten a second; classes have COCO's numbers (car is 3) and YOLO's (car is 2). Up to the
-last image with a box, one that lists nothing was searched in vain; later ones were not asked."""
-LENS_HELP = """\
---camera takes JSON:
-{"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place of
-the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "roll_deg" (left side up), "position_m":
-[x, y, z] in base_link, "stamp_offset_s" (added to the stamps of its images: the clock of the sound); of its
-images "image_rate_hz" (10); of its boxes "classes" (["car", "motorcycle"]), "min_score" (0.75) and
-"min_box_px" (100: boxes must be higher); "miss_rates", a file that `worldstate model detector` wrote;
-"labels" (["car"]), the classes of an ONNX model. "cameras" of --car have the same keys."""
 # Background subtraction: its score is no confidence.
 MOVING = "motion", "knn"
 
 
 def add_sensor_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --array, --car and the camera of a recording."""
+    """Declare --array, --car and the camera of a recording.
+
+    --detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the
+    number of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the
+    first sample of the sound, ten a second; classes have COCO's numbers (car is 3) and YOLO's (car is 2). Up
+    to the last image with a box, one that lists nothing was searched in vain; later ones were not asked.
+    """
     add_array_options(parser)
     add_car_option(parser)
-    parser.description = f"{parser.description}\n\n{DETECTIONS_HELP}"
+    describe(parser, add_sensor_options)
     group = parser.add_argument_group("camera")
     told = "what its detector reported; NAME=PATH of a camera of --car, repeated: all these are asked"
     group.add_argument("--detections", type=Path, action="append", default=[], metavar="PATH", help=told)
@@ -53,15 +38,34 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_car_option(parser: argparse.ArgumentParser) -> None:
-    """Declare --car."""
-    parser.description = f"{parser.description}\n\n{CAR_HELP}"
+    """Declare --car.
+
+    --car FILE alone says what a vehicle has, JSON in base_link (x forward, y left, z up), files beside it:
+      {"array": {"file": "mics.csv", "position_m": [1.2, 0, 1.6], "pitch_deg": -5},
+       "cameras": [{"name": "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90,
+                    "position_m": [1.9, 0, 1.3], "stamp_offset_s": 0.04, "detections": "front.json"}],
+       "model": "mine.json", "odometry": "odometry.csv", "measurements": {"radar": "radar.csv"},
+       "crossing_m": 9}
+    Every key is optional. An option in its place counts before it; --camera NAME names one of its cameras.
+    """
+    describe(parser, add_car_option)
     add = parser.add_argument_group("vehicle").add_argument
     add("--car", type=Path, metavar="FILE", help="array, cameras and what they reported, odometry, model")
 
 
 def add_lens_options(parser: argparse.ArgumentParser, group: "argparse._ArgumentGroup") -> None:
-    """Declare --camera and --miss-rates."""
-    parser.description = f"{parser.description}\n\n{LENS_HELP}"
+    """Declare --camera and --miss-rates.
+
+    --camera takes JSON:
+    {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place
+    of the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "roll_deg" (left side up),
+    "position_m": [x, y, z] in base_link, "stamp_offset_s" (added to the stamps of its images: the clock of
+    the sound); of its images "image_rate_hz" (10); of its boxes "classes" (["car", "motorcycle"]),
+    "min_score" (0.75) and "min_box_px" (100: boxes must be higher); "miss_rates", a file that
+    `worldstate model detector` wrote; "labels" (["car"]), the classes of an ONNX model. "cameras" of --car
+    have the same keys.
+    """
+    describe(parser, add_lens_options)
     lens = "its lens (default: OVAD's camera), or the name of one of --car (default: the first)"
     group.add_argument("--camera", type=Path, metavar="JSON", help=lens)
     told = "how often it misses, as `model detector` wrote it"
@@ -70,10 +74,9 @@ def add_lens_options(parser: argparse.ArgumentParser, group: "argparse._Argument
 
 def add_detector_option(parser: argparse.ArgumentParser, default: str | None = "motion") -> None:
     """Declare --detector."""
-    kinds = (
-        "motion, knn: background subtraction by mixtures or neighbours; FILE.onnx: a model in YOLO's output"
-    )
-    told = f"{kinds} form; or the name of one that an installed package brings (default: {default or 'none'})"
+    moving = "motion, knn: background subtraction by mixtures or neighbours"
+    other = "FILE.onnx: a model in YOLO's output form; or the name of one that an installed package brings"
+    told = f"{moving}; {other} (default: {default or 'none'})"
     parser.add_argument("--detector", metavar="NAME", default=default, help=told)
 
 
@@ -167,13 +170,9 @@ def recorded(
     from dataclasses import replace
 
     given = given_sensors(arguments)
-    return adapters.open_source(
-        sound,
-        array=given.car.array,
-        detections=given.detections(),
-        camera=given.camera,
-        settings=replace(settings, boxes=given.setup.boxes, uncalibrated=True),
-    )
+    array, seen = given.car.array, given.detections()
+    heard = replace(settings, boxes=given.setup.boxes, uncalibrated=True)
+    return adapters.open_source(sound, array=array, detections=seen, camera=given.camera, settings=heard)
 
 
 def camera_source(

@@ -53,13 +53,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     make = sensors.detector_maker(arguments.detector, tuple(arguments.labels))
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
     with progress.progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
-        rates = operations.measure_absence(
-            scenes,
-            make,
-            np.random.default_rng(arguments.seed),
-            provenance=_provenance(arguments, len(scenes)),
-            on_frame=bar.advance,
-        )
+        rng, about = np.random.default_rng(arguments.seed), _provenance(arguments, len(scenes))
+        rates = operations.measure_absence(scenes, make, rng, provenance=about, on_frame=bar.advance)
     adapters.save_miss_rates(arguments.out, rates)
     if arguments.figure is not None:
         write_absence_figure(rates, arguments.figure)

@@ -34,9 +34,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_table_options(parser)
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    labels = (
-        "windows of recordings of one's own, learned as those of the table: what `label --windows` writes"
-    )
+    written = "what `label --windows` writes"
+    labels = f"windows of recordings of one's own, learned as those of the table: {written}"
     add("--labels", type=Path, nargs="+", default=[], metavar="CSV", help=labels)
     ids = "CSV files with a column ID: leave out the recordings of these windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
@@ -100,24 +99,19 @@ def read_beside(arguments: argparse.Namespace, table: "adapters.FeatureTable") -
     """Return the simulated windows that are to be learned beside a table, None without any."""
     import numpy as np
 
-    from worldstate.commissioning.heard_stream import HeardStream
-    from worldstate.commissioning.simulated_windows import (
-        N_OPEN,
-        learned_beside,
-        open_field_features,
-        open_field_windows,
-    )
+    from worldstate.commissioning import heard_stream, simulated_windows
     from worldstate.operations.training.site_references import simulated_beside
 
     tables = [adapters.read_features(path).group(arguments.group) for path in arguments.simulated or ()]
-    streams = [HeardStream.load(path) for path in arguments.streams or ()]
+    streams = [heard_stream.HeardStream.load(path) for path in arguments.streams or ()]
     if not streams:
         return simulated_beside(tables) if tables else None
     array = _array_of(table)
     moves = any(one.ego_moves for one in streams)
-    features = open_field_features(array, N_OPEN, np.random.default_rng(0), moving_ego=moves)
-    in_the_open = open_field_windows(features)
-    return learned_beside(streams, in_the_open, tables).beside(table.environments)
+    rng, count = np.random.default_rng(0), simulated_windows.N_OPEN
+    features = simulated_windows.open_field_features(array, count, rng, moving_ego=moves)
+    in_the_open = simulated_windows.open_field_windows(features)
+    return simulated_windows.learned_beside(streams, in_the_open, tables).beside(table.environments)
 
 
 def _array_of(table: "adapters.FeatureTable") -> "frontend.MicrophoneArray":

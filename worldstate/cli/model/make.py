@@ -59,33 +59,24 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")
     wrong = "hear one junction of the exam with a turned array and with wrong positions, too"
     add("--mounting-errors", action="store_true", help=wrong)
-    add(
-        "--quick", action="store_true", help="from minutes of sound: to try the command, not to use the model"
-    )
+    quick = "from minutes of sound: to try the command, not to use the model"
+    add("--quick", action="store_true", help=quick)
     add("--seed", type=int, default=1, help="another seed, other streams (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.commissioning.commission import LEARNING_STEPS, commission, exam_of
-    from worldstate.commissioning.heard_stream import exam_streams, learned_streams
-    from worldstate.commissioning.stream_exam import (
-        REFERENCE,
-        beside_reference,
-        exam_figures,
-        mounting_lines,
-        write_exam_figure,
-    )
+    from worldstate.commissioning import commission, heard_stream, stream_exam
 
     output.check_outputs(arguments, "out", "report", figures=("figure",))
     settings = _settings(arguments)
     folder = arguments.streams or arguments.out.with_suffix(".streams")
     array = inputs.given_array(arguments) or frontend.ovad_array()
     # Streams take nearly all of the time; what is learned from them counts as a few more.
-    steps = len(learned_streams(settings)) + LEARNING_STEPS
+    steps = len(heard_stream.learned_streams(settings)) + commission.LEARNING_STEPS
     with progress.progress_bar("commissioning", steps) as bar:
-        model = commission(
+        model = commission.commission(
             array,
             settings,
             folder,
@@ -99,19 +90,21 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     adapters.save_model(arguments.out, model)
     report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": model.provenance.fit_for_use}
     if arguments.exam:
-        with progress.progress_bar("exam", len(exam_streams(settings))) as bar:
-            examined = exam_of(array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance)
-        report |= exam_figures(examined)
+        with progress.progress_bar("exam", len(heard_stream.exam_streams(settings))) as bar:
+            examined = commission.exam_of(
+                array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance
+            )
+        report |= stream_exam.exam_figures(examined)
         if arguments.figure is not None:
-            write_exam_figure(examined, arguments.figure)
+            stream_exam.write_exam_figure(examined, arguments.figure)
     # The figures of the 56 microphones are those of a standing ego.
-    told, lines = report if settings.moving_ego else beside_reference(report), list[str]()
+    told, lines = report if settings.moving_ego else stream_exam.beside_reference(report), list[str]()
     if arguments.mounting_errors:
         mounted = _mounted(array, model, settings, folder)
         report["mounting"] = mounted
-        lines += ["", *mounting_lines(mounted)]
+        lines += ["", *stream_exam.mounting_lines(mounted)]
     if not settings.moving_ego:
-        report["reference"] = dict(REFERENCE)
+        report["reference"] = dict(stream_exam.REFERENCE)
     if arguments.report is not None:
         output.write_report(arguments.report, report)
     lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
@@ -132,13 +125,11 @@ def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":
 def _mounted(
     array: "frontend.MicrophoneArray", model: "adapters.Model", settings: "CommissionSettings", folder: Path
 ) -> "dict[str, Figures]":
-    from worldstate.commissioning.commission import exam_of_mountings
-    from worldstate.commissioning.heard_stream import mounting_streams
-    from worldstate.commissioning.stream_exam import exam_figures
+    from worldstate.commissioning import commission, heard_stream, stream_exam
 
-    with progress.progress_bar("mounting", len(mounting_streams(settings))) as bar:
-        heard = exam_of_mountings(array, model, settings, folder, on_step=bar.advance)
-    return {name: exam_figures(streams) for name, streams in heard.items()}
+    with progress.progress_bar("mounting", len(heard_stream.mounting_streams(settings))) as bar:
+        heard = commission.exam_of_mountings(array, model, settings, folder, on_step=bar.advance)
+    return {name: stream_exam.exam_figures(streams) for name, streams in heard.items()}
 
 
 def _settings(arguments: argparse.Namespace) -> "CommissionSettings":

@@ -87,12 +87,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
     settings = _settings(arguments)
     with progress.progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
+        array = inputs.given_array(arguments)
         rows = simulation.write_dataset(
-            arguments.out,
-            settings,
-            array=inputs.given_array(arguments),
-            jobs=arguments.jobs,
-            progress=lambda row: bar.advance(),
+            arguments.out, settings, array=array, jobs=arguments.jobs, progress=lambda row: bar.advance()
         )
     summary = {
         "out": str(arguments.out),
@@ -112,13 +109,8 @@ def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
         raise InvalidArgumentError("--minutes: expected without --static, --dynamic, --video and --scene")
     settings = _stream_settings(arguments)
     with progress.progress_bar("simulating", settings.duration_s) as bar:
-        stream = write_stream(
-            arguments.out,
-            settings,
-            array=inputs.given_array(arguments),
-            jobs=arguments.jobs,
-            progress=bar.advance,
-        )
+        array, jobs = inputs.given_array(arguments), arguments.jobs
+        stream = write_stream(arguments.out, settings, array=array, jobs=jobs, progress=bar.advance)
     write_stream_figure(stream, stream.folder / FIGURE_NAME)
     summary = {
         "out": str(stream.folder),

@@ -45,26 +45,24 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     import numpy as np
 
     from worldstate.adapters.datasets.ovad import read_true_tracks
-    from worldstate.operations.labelling.label_files import file_below, write_open_label, write_window_labels
-    from worldstate.operations.labelling.pass_labels import box_tracks, label_passes
-    from worldstate.operations.labelling.street_figure import write_pass_figure
+    from worldstate.operations.labelling import label_files, pass_labels, street_figure
 
     output.check_outputs(arguments, "out", "windows", figures=("figure",))
     source, detections = sensors.camera_source(arguments, inputs.sound_of(arguments))
-    file = None if arguments.windows is None else file_below(source.audio_path, arguments.windows)
-    tracks = box_tracks(detections, source.camera, source.settings.boxes)
+    file = None if arguments.windows is None else label_files.file_below(source.audio_path, arguments.windows)
+    tracks = pass_labels.box_tracks(detections, source.camera, source.settings.boxes)
     with progress.progress_bar("smoothing", len(tracks)) as bar:
-        passes = label_passes(tracks, source.camera.position_m[0], on_pass=bar.advance)
-    write_open_label(arguments.out, source.audio_path.name, passes)
+        passes = pass_labels.label_passes(tracks, source.camera.position_m[0], on_pass=bar.advance)
+    label_files.write_open_label(arguments.out, source.audio_path.name, passes)
     if arguments.figure is not None:
         truth = read_true_tracks(source.audio_path.parent)
-        write_pass_figure(passes, arguments.figure, source.audio_path.name, truth)
+        street_figure.write_pass_figure(passes, arguments.figure, source.audio_path.name, truth)
     summary: dict[str, object] = {"out": str(arguments.out), "n_tracks": len(tracks), "n_passes": len(passes)}
     if passes:
         summary["t0_std_s"] = float(np.median([one.t0.std_s for one in passes]))
     if file is not None:
         rows = _windows(arguments, source, tracks, passes, file)
-        write_window_labels(arguments.windows, rows)
+        label_files.write_window_labels(arguments.windows, rows)
         summary |= {"windows": str(arguments.windows), "n_windows": len(rows)}
     lines = [
         f"{one.t0.time_s:9.2f} s +- {one.t0.std_s:.2f}  {one.arm:5}  {one.label}, {one.track.smoother}"

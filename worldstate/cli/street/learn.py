@@ -66,20 +66,13 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     write_street(arguments.out, street)
     if arguments.figure is not None:
         _draw(arguments, [before, *stages], street)
-    found = {arm.direction: _figures(arm) for arm in street.arms}
-    return output.CommandResult(
-        {
-            "out": str(arguments.out),
-            "n_passes": len(stages),
-            "arms": found,
-            "sides_heard": street.patterns.sides() is not None,
-        },
-        lines=[f"{len(stages)} passes", *(_line(arm) for arm in street.arms), _heard(street)],
-    )
+    arms, heard = {arm.direction: _figures(arm) for arm in street.arms}, street.patterns.sides() is not None
+    found = {"out": str(arguments.out), "n_passes": len(stages), "arms": arms, "sides_heard": heard}
+    lines = [f"{len(stages)} passes", *(_line(arm) for arm in street.arms), _heard(street)]
+    return output.CommandResult(found, lines=lines)
 
 
 def _check(arguments: argparse.Namespace) -> None:
-
     ground.in_range("--days", arguments.days, 0.0, 1e5)
     if arguments.detections and len(arguments.input) > 1:
         raise InvalidArgumentError("--detections: expected one INPUT with it, they are of one recording")

@@ -6,12 +6,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.bounds.cramer_rao import (
-    bearing_crb_rad2,
-    broadside_rad,
-    radial_speed_crb_m2_s2,
-    tone_crb_hz2,
-)
+from worldstate.frontend.bounds import cramer_rao
 
 # Samples of one second; the bound depends on the duration and SNR times the number of samples only.
 TONE_RATE_HZ = 48_000.0
@@ -104,8 +99,8 @@ class ArrayBounds:
         >>> round(two.radial_speed_std_m_s(10.0), 5)
         0.00055
         """
-        variance = tone_crb_hz2(10.0 ** (snr_db / 10.0), int(TONE_RATE_HZ), TONE_RATE_HZ)
-        return float(np.sqrt(radial_speed_crb_m2_s2(variance, self.frequency_hz)))
+        variance = cramer_rao.tone_crb_hz2(10.0 ** (snr_db / 10.0), int(TONE_RATE_HZ), TONE_RATE_HZ)
+        return float(np.sqrt(cramer_rao.radial_speed_crb_m2_s2(variance, self.frequency_hz)))
 
     def to_dict(self) -> dict[str, object]:
         """Return the same as JSON-able values, azimuths as text.
@@ -161,7 +156,7 @@ def array_bounds(array: MicrophoneArray, frequency_hz: float, azimuths_deg: Sequ
         mean_spacing_m=array.mean_spacing_m,
         alias_hz=array.alias_hz(),
         ambiguity=array.ambiguity,
-        broadside_deg=float(np.degrees(broadside_rad(array.positions_m))),
+        broadside_deg=float(np.degrees(cramer_rao.broadside_rad(array.positions_m))),
         frequency_hz=frequency_hz,
         sigma_deg={azimuth: _constant_deg(array, frequency_hz, azimuth) for azimuth in azimuths_deg},
     )
@@ -169,6 +164,6 @@ def array_bounds(array: MicrophoneArray, frequency_hz: float, azimuths_deg: Sequ
 
 def _constant_deg(array: MicrophoneArray, frequency_hz: float, azimuth_deg: float) -> float | None:
     """Bound at 2 N SNR = 1; a million degrees is a division by nothing."""
-    variance = bearing_crb_rad2(array.positions_m, np.radians(azimuth_deg), frequency_hz, 0.5, 1)
+    variance = cramer_rao.bearing_crb_rad2(array.positions_m, np.radians(azimuth_deg), frequency_hz, 0.5, 1)
     sigma = float(np.degrees(np.sqrt(variance)))
     return sigma if sigma < 1e6 else None

@@ -12,6 +12,7 @@ from zlib import crc32
 
 import numpy as np
 
+from worldstate.abduction.cueing import thresholds
 from worldstate.abduction.cueing.cueing_policy import (
     AdaptiveBudget,
     CueingPolicies,
@@ -19,11 +20,6 @@ from worldstate.abduction.cueing.cueing_policy import (
     sustained_statistic,
 )
 from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, correlation_time_hops, fit_risk_map
-from worldstate.abduction.cueing.thresholds import (
-    conformal_threshold,
-    neyman_pearson_threshold,
-    recordings_needed,
-)
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
@@ -106,12 +102,12 @@ class CueingSettings:
     def threshold(self, hazard_free: Sequence[FloatArray], alpha: float) -> float:
         """Return gamma(alpha) on recordings; above all of them where no threshold has the guarantee."""
         if self.method == "plain":
-            return neyman_pearson_threshold(hazard_free, alpha, self.sustain_hops)
+            return thresholds.neyman_pearson_threshold(hazard_free, alpha, self.sustain_hops)
         blocks = [block for stream in hazard_free for block in cut(stream, self.block_hops)]
-        gamma = conformal_threshold(blocks, alpha, self.sustain_hops, self.confidence)
+        gamma = thresholds.conformal_threshold(blocks, alpha, self.sustain_hops, self.confidence)
         if np.isfinite(gamma):
             return gamma
-        return neyman_pearson_threshold(hazard_free, 0.0, self.sustain_hops)
+        return thresholds.neyman_pearson_threshold(hazard_free, 0.0, self.sustain_hops)
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,7 +339,7 @@ def _warnings(
     if few := caution(blocks, f"pieces of {settings.block_s:g} s"):
         yield few
     for alpha in settings.alphas if conformal else ():
-        need = recordings_needed(alpha, settings.confidence)
+        need = thresholds.recordings_needed(alpha, settings.confidence)
         if blocks < need:
             yield (
                 f"alpha {alpha:g}: the guarantee needs {need} pieces of {settings.block_s:g} s "

@@ -173,13 +173,8 @@ def measure_absence(
             on_frame()
     if not tally.looks:
         raise InputFileError(scenes[0].reference.source, "expected moving objects in view, found none")
-    return MissRates(
-        azimuth_deg=tally.edges_deg,
-        families=tally.counts(),
-        provenance=provenance or {},
-        health=_health(scenes, rng),
-        repeats=REPEATS,
-    )
+    health = _health(scenes, rng)
+    return MissRates(tally.edges_deg, tally.counts(), provenance or {}, health, REPEATS)
 
 
 class AbsenceTally:

@@ -102,16 +102,10 @@ def _moving_boxes(
             edges = camera.azimuth(np.clip([left_px, right_px], 0.0, camera.width_px))
             middle = float(edges.mean())
             whole = top_px > _BORDER_PX and bottom_px < camera.height_px - _BORDER_PX
-            boxes.append(
-                AzimuthBox(
-                    time_s,
-                    float(edges[0]) if left_px > _BORDER_PX else math.nan,
-                    float(edges[1]) if right_px < camera.width_px - _BORDER_PX else math.nan,
-                    middle,
-                    (bottom_px - top_px) / focal_px if whole else math.nan,
-                    frame.labels[i],
-                )
-            )
+            left_rad = float(edges[0]) if left_px > _BORDER_PX else math.nan
+            right_rad = float(edges[1]) if right_px < camera.width_px - _BORDER_PX else math.nan
+            height_rad = (bottom_px - top_px) / focal_px if whole else math.nan
+            boxes.append(AzimuthBox(time_s, left_rad, right_rad, middle, height_rad, frame.labels[i]))
         yield time_s, boxes
 
 
@@ -161,9 +155,7 @@ class PassLabel:
 
 
 def label_passes(
-    tracks: Sequence[BoxTrack],
-    camera_ahead_m: float = 0.0,
-    on_pass: Callable[[], None] = lambda: None,
+    tracks: Sequence[BoxTrack], camera_ahead_m: float = 0.0, on_pass: Callable[[], None] = lambda: None
 ) -> list[PassLabel]:
     """Return the labels of all vehicles that came out of an arm, in the order of their boxes.
 

@@ -97,9 +97,8 @@ def draw_passes(axes: "Axes", passes: Sequence[PassLabel], truth: Sequence[TrueT
         if not occluder.assumed:
             draw_edge(axes, occluder, "0.5")
     for one in passes:
-        draw_track(
-            axes, one.track, one.track.time_s < one.t0.time_s, _COLOURS[one.arm], f"{one.arm}, smoothed"
-        )
+        hidden = one.track.time_s < one.t0.time_s
+        draw_track(axes, one.track, hidden, _COLOURS[one.arm], f"{one.arm}, smoothed")
         _draw_truth(axes, one, truth)
     axes.plot(0.0, 0.0, "k^", markersize=9)
     span = {"xlim": (_FARTHEST_M, -_FARTHEST_M), "ylim": (-4.0, 25.0)}

@@ -12,7 +12,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.sequence.street_sides import PassSound, arrival_pattern, somebody_comes
+from worldstate.abduction.sequence.street_sides import PassSound, arrival_pattern, coming_probability
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
@@ -44,12 +44,9 @@ def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
     # A first box may show no edge of this arm.
     outwards_rad = one.edge_rad if one.arm == "left" else -one.edge_rad
-    return StreetPass(
-        "left" if one.arm == "left" else "right",
-        one.edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None,
-        pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None,
-        sound,
-    )
+    edge_rad = one.edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None
+    usual_hz = pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None
+    return StreetPass("left" if one.arm == "left" else "right", edge_rad, usual_hz, sound)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +122,8 @@ def heard_street(source: Source, model: Model) -> HeardStreet | None:
         _LOG.warning(_UNHEARD, "the recording is too short")
         return None
     time_s, features, groups = map(np.array, zip(*read, strict=True))
-    return HeardStreet(time_s, arrival_pattern(features), somebody_comes(groups), heard_with(model.domain))
+    patterns, coming = arrival_pattern(features), coming_probability(groups)
+    return HeardStreet(time_s, patterns, coming, heard_with(model.domain))
 
 
 def write_street(path: str | Path, street: LearnedStreet) -> None:

@@ -203,9 +203,8 @@ class ApproachTable:
     def sides(self) -> Figures:
         """Return how often single vehicles are announced from the other side, and both of two are found."""
         singles, both = (self.of_flow(flow).outcomes for flow in ("single", "both"))
-        near = [
-            one.every_side for one in both if one.approach.entries_s[-1] - one.approach.entries_s[0] < NEAR_S
-        ]
+        gaps_s = (one.approach.entries_s[-1] - one.approach.entries_s[0] for one in both)
+        near = [one.every_side for one, gap_s in zip(both, gaps_s, strict=True) if gap_s < NEAR_S]
         return {
             "singles": len(singles),
             "other_side_too": mean_of([one.other_side for one in singles]),

@@ -40,11 +40,7 @@ def bearings_csv(track: HopTable) -> str:
 
 
 def track_bearings(
-    audio: Audio,
-    front_end: FrontEnd,
-    *,
-    count: bool = False,
-    on_second: Callable[[], None] = lambda: None,
+    audio: Audio, front_end: FrontEnd, *, count: bool = False, on_second: Callable[[], None] = lambda: None
 ) -> HopTable:
     """Read the bearing of every hop of an open recording, and count the sources of every second."""
     rows: list[tuple[float, ...]] = []
@@ -58,11 +54,9 @@ def track_bearings(
 def write_bearings_figure(track: HopTable, path: Path, title: str) -> None:
     """Draw azimuth over time with its standard deviation, darker where more prominent."""
     with figure_file(path, 9.0, 3.6) as figure:
-        axes = figure.subplots()
-        axes.errorbar(track.time_s, track.azimuth_deg, track.std_deg, fmt="none", ecolor="0.85", zorder=1)
-        dots = axes.scatter(
-            track.time_s, track.azimuth_deg, 9.0, track.prominence, cmap="viridis_r", zorder=2
-        )
+        axes, places = figure.subplots(), (track.time_s, track.azimuth_deg)
+        axes.errorbar(*places, track.std_deg, fmt="none", ecolor="0.85", zorder=1)
+        dots = axes.scatter(*places, 9.0, track.prominence, cmap="viridis_r", zorder=2)
         figure.colorbar(dots, ax=axes, label="prominence")
         axes.set(xlabel="time (s)", ylabel="azimuth, left positive (deg)", title=title)
 

@@ -16,16 +16,7 @@ from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import Via, encode
 from worldstate.ground.values import NotUsable, seconds
-from worldstate.operations.figure_style import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    figure_file,
-    legend_beside,
-)
+from worldstate.operations import figure_style as style
 
 # Of a rate by another clock: an error of four standard deviations is significant, one false report in 16,000.
 _SIGNIFICANT = 4.0
@@ -46,12 +37,12 @@ _LISTED_DROPOUTS = 100
 _COLOURS = {
     "dead": "gray",
     "intermittent": "silver",
-    "noisy": RED,
-    "inverted": PURPLE,
-    "swapped": ORANGE,
+    "noisy": style.RED,
+    "inverted": style.PURPLE,
+    "swapped": style.ORANGE,
     "clipped": "tab:brown",
-    "offset": SKY,
-    "level": BLUE,
+    "offset": style.SKY,
+    "level": style.BLUE,
 }
 # Areas of markers, points squared: one that holds a number of two digits, one that fits a line of the legend,
 # and how much smaller a second fault is drawn on the first.
@@ -198,22 +189,15 @@ class HealthLog:
     def summary(self) -> RecordingHealth:
         """Return the verdicts so far."""
         latest = self._latest
-        return RecordingHealth(
-            verdicts=self._verdicts(),
-            dropouts=tuple(self._dropouts[:_LISTED_DROPOUTS]),
-            n_dropouts=latest.n_dropouts if latest else 0,
-            n_hops=self._n_hops,
-            coherence=latest.coherence if latest else NotUsable("nothing heard"),
-        )
+        dropouts, count = tuple(self._dropouts[:_LISTED_DROPOUTS]), latest.n_dropouts if latest else 0
+        coherence = latest.coherence if latest else NotUsable("nothing heard")
+        return RecordingHealth(self._verdicts(), dropouts, count, self._n_hops, coherence)
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
         explained = {(channel, other) for channel, fault in self._seen for other in _EXPLAINS.get(fault, ())}
-        kept = [
-            verdict
-            for verdict in ordered
-            if (verdict.channel, verdict.fault) not in explained and not self._is_other_half(verdict)
-        ]
+        own = (verdict for verdict in ordered if (verdict.channel, verdict.fault) not in explained)
+        kept = [verdict for verdict in own if not self._is_other_half(verdict)]
         return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in _one_cause(kept))
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:
@@ -242,10 +226,10 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
     """Draw the microphones across their two widest axes, coloured by fault, channels counted from 1."""
     across, up = sorted(np.argsort(array.aperture_m)[-2:].tolist())
     place = array.centred_m[:, [across, up]]
-    with figure_file(path, 7.5, 6.0) as figure:
+    with style.figure_file(path, 7.5, 6.0) as figure:
         axes = figure.add_subplot()
-        axes.scatter(place[:, 0], place[:, 1], s=_AREA, color=GREEN, alpha=0.35, lw=0)
-        axes.scatter([], [], s=_LEGEND_AREA, color=GREEN, alpha=0.35, lw=0, label="well")
+        axes.scatter(place[:, 0], place[:, 1], s=_AREA, color=style.GREEN, alpha=0.35, lw=0)
+        axes.scatter([], [], s=_LEGEND_AREA, color=style.GREEN, alpha=0.35, lw=0, label="well")
         drawn: Counter[int] = Counter()
         for fault in sorted({verdict.fault for verdict in health.verdicts}):
             channels = [verdict.channel for verdict in health.verdicts if verdict.fault == fault]
@@ -267,7 +251,7 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
         if across == 1:
             axes.invert_xaxis()  # left is left
         axes.set_title(f"{array.n_microphones} microphones {_VIEWS[across, up]}; channels from 1")
-        legend_beside(axes)
+        style.legend_beside(axes)
 
 
 def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stance: str) -> dict[str, object]:
@@ -335,10 +319,8 @@ def _cards(verdicts: tuple[ChannelVerdict, ...]) -> list[list[ChannelVerdict]]:
 def _advice(verdict: ChannelVerdict) -> str:
     value, std = verdict.value, verdict.std or 0.0
     other = (verdict.looks_like or 0) + 1
-    late, drift = (
-        f"{1e3 * abs(value):.2f} +- {1e3 * std:.2f} ms",
-        f"{1e6 * abs(value):.0f} +- {1e6 * std:.0f}",
-    )
+    late = f"{1e3 * abs(value):.2f} +- {1e3 * std:.2f} ms"
+    drift = f"{1e6 * abs(value):.0f} +- {1e6 * std:.0f}"
     return {
         Fault.DEAD: "silent: check plug, cable, phantom power",
         Fault.INTERMITTENT: f"out or crackling in {100 * value:.0f} % of the time: check plug and cable",

@@ -221,16 +221,8 @@ def hop_stream(
     if not measured:
         raise InvalidArgumentError(f"{name}: expected at least one hop, so at least one second of sound")
     seen = [any(sighting.moving for sighting in one.sightings) for one in measured]
-    rows = (
-        (
-            seconds(one.stamp_ns),
-            one.signature.log_likelihoods,
-            *_answer(one.co_evidence),
-            _approach(one),
-            *flags,
-        )
-        for one, *flags in zip(measured, seen, seen if there is None else there, strict=True)
-    )
+    flags = zip(seen, seen if there is None else there, strict=True)
+    rows = [(*_measured(one), *both) for one, both in zip(measured, flags, strict=True)]
     entry_s = float("nan") if t0_s is None else t0_s
     return HopTable.of_rows(STREAM_COLUMNS, rows).replace(name=name, label=label, t0_s=entry_s)
 
@@ -267,6 +259,8 @@ def _answer(co_evidence: CoEvidence) -> tuple[int, float, float]:
     return UNQUERIED, 1.0, 0.0
 
 
-def _approach(measurement: Measurement) -> float:
-    approach = measurement.approach
-    return np.nan if isinstance(approach, NotUsable) else approach.inverse_tta_hz / approach.std_hz
+def _measured(one: Measurement) -> tuple[Any, ...]:
+    """Return the columns of a hop but for the last two."""
+    heard, approach = one.signature.log_likelihoods, one.approach
+    rate = np.nan if isinstance(approach, NotUsable) else approach.inverse_tta_hz / approach.std_hz
+    return seconds(one.stamp_ns), heard, *_answer(one.co_evidence), rate

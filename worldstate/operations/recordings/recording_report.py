@@ -138,10 +138,7 @@ class RecordingReport:
 
 
 def run_recording(
-    source: Source,
-    *,
-    states_path: Path | None = None,
-    on_hop: Callable[[Step], None] = lambda step: None,
+    source: Source, *, states_path: Path | None = None, on_hop: Callable[[Step], None] = lambda step: None
 ) -> RecordingReport:
     """Listen to `source` to its end.
 
@@ -191,11 +188,5 @@ def run_recording(
             on_hop(step)
             end = step.checkpoint
     elapsed_s, last_ns = time.perf_counter() - started, max(meter.last_ns, source.start_ns)
-    return RecordingReport(
-        warning=meter.summary(),
-        hops=meter.states,
-        peak_risk=meter.peak_risk,
-        realtime_factor=seconds(last_ns - source.start_ns) / elapsed_s,
-        health=health.summary(),
-        end=end,
-    )
+    factor = seconds(last_ns - source.start_ns) / elapsed_s
+    return RecordingReport(meter.summary(), meter.states, meter.peak_risk, factor, health.summary(), end)

@@ -77,9 +77,8 @@ def learned_while_listening(table: FeatureTable, rng: np.random.Generator) -> li
 def _stream(table: FeatureTable, others: BoolArray, rng: np.random.Generator) -> IndexArray:
     hazards, empty = (np.flatnonzero(others & flags) for flags in (table.hazards, table.hazard_free))
     if not empty.size:
-        raise InvalidArgumentError(
-            f"{table.environments[others][0]}: expected hazard-free windows to compose a stream of, got none"
-        )
+        site = table.environments[others][0]
+        raise InvalidArgumentError(f"{site}: expected hazard-free windows to compose a stream of, got none")
     kind, which = rng.random((2, STREAM_WINDOWS))
     comes = (kind < STREAM_HAZARDS) & bool(hazards.size)
     # Hazards first, so that a number in [0, 1) picks one of either.
@@ -95,8 +94,7 @@ def _recordings(table: FeatureTable) -> list[tuple[BoolArray, BoolArray]]:
         mine = keys == key
         others = (table.environments == table.environments[mine][0]) & ~mine
         if not others.any():
-            raise InvalidArgumentError(
-                f"recording {key}: expected another recording of its junction, to compare it with"
-            )
+            expected = "another recording of its junction, to compare it with"
+            raise InvalidArgumentError(f"recording {key}: expected {expected}")
         parts.append((mine, others))
     return parts

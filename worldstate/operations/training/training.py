@@ -316,10 +316,8 @@ def _calibrated(
     table: FeatureTable, passes: list[FloatArray], alpha: float, miss_rate: float
 ) -> WindowCalibration:
     hazards, hazard_free = (np.tile(flags, len(passes)) for flags in (table.hazards, table.hazard_free))
-    pooled = np.concatenate(passes)
-    return calibrate_windows(
-        pooled, hazards, hazard_free, alpha=alpha, miss_rate=miss_rate, fit_map=fit_platt
-    )
+    every = np.concatenate(passes)
+    return calibrate_windows(every, hazards, hazard_free, alpha=alpha, miss_rate=miss_rate, fit_map=fit_platt)
 
 
 def _figures(table: FeatureTable, passes: list[FloatArray]) -> dict[str, float]:

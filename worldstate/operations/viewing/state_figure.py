@@ -20,22 +20,7 @@ from worldstate.frontend.settings import HOP_RATE_HZ, WINDOW_HOPS
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import LEAST_HEARD, InputFileError, seconds
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.operations.figure_style import (
-    BLUE,
-    GREEN,
-    HOP_S,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    draw_bars,
-    draw_power,
-    figure_file,
-    figure_style,
-    legend_beside,
-    name_rows,
-    with_gaps,
-)
+from worldstate.operations import figure_style as style
 from worldstate.state import Entity, Occluder, RiskCue, WorldState
 
 if TYPE_CHECKING:
@@ -43,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Of the sides, told apart from red and blue, which say hidden and in view.
-_SIDE_COLORS = (PURPLE, GREEN, ORANGE, SKY)
+_SIDE_COLORS = (style.PURPLE, style.GREEN, style.ORANGE, style.SKY)
 _WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
 # Longest title in one line above a figure of this width.
 _TITLE_CHARACTERS = 100
@@ -54,11 +39,11 @@ _SIZE_IN, _MOVING_DPI = (7.2, 5.2), 80
 # An entity less likely than this is drawn, and not named.
 _TOLD = 0.2
 _LEGEND = (
-    ("hidden", RED, 0.35),
-    ("in view", BLUE, 0.35),
-    ("risk of a side, red if raised", ORANGE, 0.4),
-    ("searched, nothing found", GREEN, 0.25),
-    ("searched, found", PURPLE, 0.25),
+    ("hidden", style.RED, 0.35),
+    ("in view", style.BLUE, 0.35),
+    ("risk of a side, red if raised", style.ORANGE, 0.4),
+    ("searched, nothing found", style.GREEN, 0.25),
+    ("searched, found", style.PURPLE, 0.25),
     ("behind an occluder", "0.5", 0.2),
 )
 
@@ -139,12 +124,12 @@ def write_state_figure(
     ...     (Path(folder) / "quiet.png").stat().st_size > 10_000
     True
     """
-    with figure_file(path, 10.0, 8.6 if sound is None else 9.6) as figure:
+    with style.figure_file(path, 10.0, 8.6 if sound is None else 9.6) as figure:
         heights = (1.0 if sound is None else 1.4, 0.42, 0.6, 0.6)
         azimuths, rows, existence, risk = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         if sound is not None:
             label = "power of the sound over its median over azimuth, each window at its middle"
-            draw_power(azimuths, sound.time_s, sound.azimuths_rad, sound.power, label)
+            style.draw_power(azimuths, sound.time_s, sound.azimuths_rad, sound.power, label)
         _draw_truth(azimuths, truth)
         _draw_azimuths(azimuths, states)
         _draw_rows(rows, states)
@@ -154,18 +139,18 @@ def write_state_figure(
             entry = axes.axvline(t0_s, color="black", lw=1.2, ls="--")
             entry.set_label("line-of-sight entry $T_0$" if axes is azimuths else "")
         for axes in (azimuths, existence, risk):
-            legend_beside(axes)
+            style.legend_beside(axes)
         # The first window begins a second before its decision.
-        span_s = _times(states)[0] - _WINDOW_S, _times(states)[-1] + HOP_S
+        span_s = _times(states)[0] - _WINDOW_S, _times(states)[-1] + style.HOP_S
         risk.set(xlabel="time (s), end of the decision window", xlim=span_s)
         figure.suptitle(title if len(title) <= _TITLE_CHARACTERS else "..." + title[-_TITLE_CHARACTERS:])
 
 
 def _draw_truth(axes: "Axes", truth: Sequence[TrueTrack]) -> None:
     for track in truth:
-        for shown, style, name in ((~track.in_view, ":", "out of sight"), (track.in_view, "-", "in sight")):
+        for shown, dashes, name in ((~track.in_view, ":", "out of sight"), (track.in_view, "-", "in sight")):
             line = np.where(shown, np.degrees(track.azimuth_rad), np.nan)
-            axes.plot(track.time_s, line, style, color="black", lw=2.0, label=f"vehicle, truth, {name}")
+            axes.plot(track.time_s, line, dashes, color="black", lw=2.0, label=f"vehicle, truth, {name}")
 
 
 def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
@@ -182,8 +167,8 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
                 row = seconds(state.stamp_ns), *np.degrees([one.azimuth_rad, *sector]).tolist()
                 tracks.setdefault((one.id, one.status == "hidden"), []).append(row)
     for (_, hidden), rows in tracks.items():
-        color, label = (RED, "hidden") if hidden else (BLUE, "in view")
-        time_s, azimuth, low, high = with_gaps(np.array(rows)).T
+        color, label = (style.RED, "hidden") if hidden else (style.BLUE, "in view")
+        time_s, azimuth, low, high = style.with_gaps(np.array(rows)).T
         axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
         axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
     axes.set(ylabel="azimuth (deg)\nleft positive", ylim=(-95, 95), yticks=range(-90, 91, 45))
@@ -194,12 +179,12 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     names = [f"advisory {side}" for side in _sides(states)]
     for row, side in enumerate(_sides(states)):
         on = [any(c.direction == side and c.advisory for c in state.cues) for state in states]
-        draw_bars(axes, _times(states), on, row, _SIDE_COLORS[row])
+        style.draw_bars(axes, _times(states), on, row, _SIDE_COLORS[row])
     # A look stands in every snapshot until the next one.
     looks = {(one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched}
     for sensor in sorted({sensor for sensor, _, _ in looks}):
         row = len(names)
-        for found, color in ((True, BLUE), (False, "0.75")):
+        for found, color in ((True, style.BLUE), (False, "0.75")):
             at_s = [seconds(stamp_ns) for name, stamp_ns, was in looks if name == sensor and was == found]
             axes.plot(at_s, [row] * len(at_s), "|", color=color, ms=9 if found else 4)
         names.append(f"{sensor} (blue: found)")
@@ -207,17 +192,17 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     deaf = [any(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]
     for on, color, name in ((foreign, "0.6", "foreign sound"), (deaf, "0.3", "could not be heard")):
         if any(on):
-            draw_bars(axes, _times(states), on, len(names), color, height=0.6)
+            style.draw_bars(axes, _times(states), on, len(names), color, height=0.6)
             names.append(name)
-    name_rows(axes, names)
+    style.name_rows(axes, names)
 
 
 def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
     rows = [(seconds(state.stamp_ns), *_existence(state, _sides(states))) for state in states]
-    time_s, *columns = with_gaps(np.array(rows)).T
+    time_s, *columns = style.with_gaps(np.array(rows)).T
     for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
         axes.plot(time_s, column, color=color, label=f"somebody hidden, {side}")
-    axes.plot(time_s, columns[-1], color=BLUE, ls=":", label="the likeliest in view")
+    axes.plot(time_s, columns[-1], color=style.BLUE, ls=":", label="the likeliest in view")
     axes.set(ylabel="existence\nprobability", ylim=(-0.02, 1.02))
 
 
@@ -235,7 +220,7 @@ def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
     for row, side in enumerate(_sides(states)):
         cues = [next((one for one in state.cues if one.direction == side), None) for state in states]
         told = [(np.nan, np.nan) if c is None else (c.risk, (c.within or {}).get("3", np.nan)) for c in cues]
-        time_s, risk, within = with_gaps(np.column_stack([_times(states), told])).T
+        time_s, risk, within = style.with_gaps(np.column_stack([_times(states), told])).T
         axes.plot(time_s, risk, color=_SIDE_COLORS[row], label=f"risk, {side}")
         if np.isfinite(within).any():
             axes.plot(time_s, within, color=_SIDE_COLORS[row], ls="--", label=f"in view within 3 s, {side}")
@@ -252,16 +237,12 @@ def _times(states: Sequence[WorldState]) -> list[float]:
 
 def write_birds_eye(state: WorldState, path: Path, *, title: str = "") -> None:
     """Draw one snapshot from above, the ego at the bottom, its left to the left."""
-    with figure_file(path, *_SIZE_IN) as figure:
+    with style.figure_file(path, *_SIZE_IN) as figure:
         _draw(figure, state, title)
 
 
 def write_animation(
-    states: Sequence[WorldState],
-    path: Path,
-    *,
-    title: str = "",
-    on_frame: Callable[[], None] = lambda: None,
+    states: Sequence[WorldState], path: Path, *, title: str = "", on_frame: Callable[[], None] = lambda: None
 ) -> None:
     """Draw every snapshot from above into a GIF that plays at the speed of the recording."""
     check_gif(path)
@@ -270,7 +251,7 @@ def write_animation(
 
     span_s = seconds(states[-1].stamp_ns - states[0].stamp_ns)
     writer = PillowWriter(fps=max(round((len(states) - 1) / span_s), 1) if span_s > 0.0 else 1)
-    with figure_style(), atomic_path(path) as temporary:
+    with style.figure_style(), atomic_path(path) as temporary:
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         with writer.saving(figure, str(temporary), dpi=_MOVING_DPI):
             for state in states:
@@ -292,7 +273,7 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     for occluder in state.context.occluders:
         _draw_occluder(axes, occluder)
     for view in state.searched:
-        _wedge(axes, view.sector_rad, SEARCHED_M, PURPLE if view.found else GREEN, 0.25)
+        _wedge(axes, view.sector_rad, SEARCHED_M, style.PURPLE if view.found else style.GREEN, 0.25)
     for cue in state.cues:
         _draw_cue(axes, cue)
     for entity in (part for one in state.entities if one.moving for part in one.on_each_side()):
@@ -316,19 +297,19 @@ def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
     """Draw the risk, and say it on the cue's own side below the ego, where no sector lies."""
     raised = cue.advisory is not None
     sector = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
-    _wedge(axes, sector, CUE_M, RED if raised else ORANGE, 0.05 + 0.5 * cue.risk)
+    _wedge(axes, sector, CUE_M, style.RED if raised else style.ORANGE, 0.05 + 0.5 * cue.risk)
     within = "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
     said = f"{cue.direction}{': ADVISORY' if raised else ''}\nrisk {cue.risk:.2f}{within}"
     left = cue.azimuth_rad > 0.0
     axes.text(
-        -37 if left else 37, -2.5, said, color=RED if raised else "0.2", ha="left" if left else "right",
+        -37 if left else 37, -2.5, said, color=style.RED if raised else "0.2", ha="left" if left else "right",
         va="top", weight="bold" if raised else "normal",
     )  # fmt: skip
 
 
 def _draw_entity(axes: "Axes", entity: Entity) -> None:
     hidden = entity.status == "hidden"
-    color, density = RED if hidden else BLUE, entity.existence_probability
+    color, density = style.RED if hidden else style.BLUE, entity.existence_probability
     sector = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
     _wedge(axes, sector, SECTOR_M, color, 0.05 + 0.3 * density)
     axes.plot(*zip((0.0, 0.0), _at(entity.azimuth_rad, SECTOR_M), strict=True), color=color, alpha=density)
@@ -340,8 +321,8 @@ def _draw_entity(axes: "Axes", entity: Entity) -> None:
         axes.plot(-entity.position_m[1], entity.position_m[0], "s", color=color, ms=9)
     if density >= _TOLD:
         x, y = _at(entity.azimuth_rad, SECTOR_M + 5.0)
-        style = {"color": color, "fontsize": 9, "ha": "center", "va": "bottom"}
-        axes.text(min(max(x, -31.0), 31.0), y, label_of(entity), style)
+        text = {"color": color, "fontsize": 9, "ha": "center", "va": "bottom"}
+        axes.text(min(max(x, -31.0), 31.0), y, label_of(entity), text)
 
 
 def _draw_legend(axes: "Axes") -> None:
