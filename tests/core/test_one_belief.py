@@ -104,6 +104,19 @@ def test_an_alarm_depends_on_time_not_on_how_many_measurements_carry_it(seed: in
             crowded = crowded.update(extra[rng.integers(3)])
 
 
+@pytest.mark.parametrize("rate_hz", [2, 5, 10, 20, 40, 100])
+def test_the_rule_of_single_windows_asks_for_time_however_often_they_come(rate_hz: int) -> None:
+    heard = SignatureEvidence(("left", "right"), (6.0, 0.0), 0.0, 0.0)
+    world, advised_s = WorldFilter(), list[float]()
+    for number in range(2 * rate_hz):
+        stamp_ns = 10**9 + number * 10**9 // rate_hz
+        world = world.update(Measurement(stamp_ns, heard, Unqueried("-"), SILENT, SILENT))
+        if any(cue.advisory for cue in world.state.cues):
+            advised_s.append(1e-9 * (stamp_ns - 10**9))
+    assert 0.2 - 1e-9 <= advised_s[0] <= max(0.3, 1.0 / rate_hz)
+    assert len(advised_s) == 2 * rate_hz - round(advised_s[0] * rate_hz)
+
+
 @given(SEEDS)
 @settings(max_examples=4, deadline=None)
 def test_single_windows_move_nothing_where_a_sequence_is_read(seed: int) -> None:

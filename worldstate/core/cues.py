@@ -64,7 +64,9 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     if not measurement.heard.usable and memory.last.instant is not None:
         # What could not be heard neither raises an alarm nor ends one: silence does, after a second.
         is_news = last is not None and _news_ends_ns(last) >= stamp_ns
-        memory.rules[source] = replace(rule, statistic=last.statistic if last and is_news else ())
+        memory.rules[source] = replace(
+            rule, statistic=last.statistic if last and is_news else (), hop_ns=stamp_ns
+        )
         return
     update_rule(memory, source, rule, measurement.signature, measurement.co_evidence, model)
     if model.policy.adaptive is not None:
@@ -93,9 +95,7 @@ def update_rule(
     ratio, heard_nats = posterior.log_lambda, posterior_of(log_prior, said, NO_LOOK).log_lambda
     statistic, bounded = min(posterior.hidden_total, 1.0), ratio if math.isfinite(ratio) else None
     memory.last.instant = Instant(statistic, bounded, heard_nats)
-    last = memory.rules.get(source)
-    every = (statistic,) if last is None else (*last.statistic, statistic)
-    memory.rules[source] = replace(rule, statistic=every[-model.policy.sustain_hops :])
+    memory.rules[source] = rule.after(memory.rules.get(source), statistic, model.policy.sustain_hops)
 
 
 def advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:

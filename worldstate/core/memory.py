@@ -1,6 +1,6 @@
 """The state that the filter carries from one call to the next."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeAlias, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
@@ -15,7 +15,7 @@ from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing, Heard
 from worldstate.state import Context, Event, Relation
 
-from .sequence_memory import SequenceMemory
+from .sequence_memory import HOP_NS, SLACK_NS, SequenceMemory
 
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
 NEWS_HOLDS_NS = nanoseconds(1.0)
@@ -33,12 +33,29 @@ class SourceRule:
     """
 
     stamp_ns: int  # Of its last measurement
-    # Of as many measurements as the rule asks for, the last one last.
+    # Of as many hops of .1 s as the rule asks for, the last one last, which began then.
     statistic: tuple[Probability, ...] = ()
+    hop_ns: int = 0
     fault: str | None = None  # What was wrong with it then
     announced: tuple[Count, ...] = ()  # Sides on which its messages announce vehicles; empty of what hears
     heard: Heard = field(default=Heard())  # How well it could hear, and since when so
     heard_ns: int = 0
+
+    def after(self, last: "SourceRule | None", statistic: float, hops: int) -> "SourceRule":
+        """Return the rule with a statistic more, after that of the source's last measurement.
+
+        Time counts, not measurements: in one hop the least, and in a hop without one the less of its
+        neighbours. Of silence that ends an alarm nothing is known.
+        """
+        if last is None or not last.statistic:
+            return replace(self, statistic=(statistic,), hop_ns=self.stamp_ns)
+        since_ns = self.stamp_ns - last.hop_ns
+        steps = (since_ns + SLACK_NS) // HOP_NS if since_ns <= NEWS_HOLDS_NS else 1
+        less = min(last.statistic[-1], statistic)
+        if steps < 1:
+            return replace(self, statistic=(*last.statistic[:-1], less), hop_ns=last.hop_ns)
+        every = (*last.statistic, *[less] * (min(steps, hops) - 1), statistic)
+        return replace(self, statistic=every[-hops:], hop_ns=self.stamp_ns)
 
     def sustained(self, hops: int) -> float:
         """Return the least statistic of so many hops, 0 where there are fewer."""

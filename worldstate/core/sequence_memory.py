@@ -103,7 +103,7 @@ class ArrivalRate:
 
 
 # In seconds what the alarm's threshold was set with in hops; less by the rounding of stamps.
-_HOP_NS, _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 100_000_000, 300_000_000, 1_000_000_000, 5_000_000
+HOP_NS, _SMOOTHED_NS, _HELD_NS, SLACK_NS = 100_000_000, 300_000_000, 1_000_000_000, 5_000_000
 _WAY_NS = 10_000_000_000  # Longer than any vehicle that is expected takes
 _UNDECIDED = (-math.log(1e9),) * len(SIDES)
 # A look says what is in view then, not what will be: multiplied into the belief hop by hop, looks at one
@@ -312,7 +312,7 @@ class SequenceMemory:
 
     def has_news(self, stamp_ns: int) -> bool:
         """Tell whether anything was measured for as long as an alarm holds."""
-        return bool(self.recent) and stamp_ns <= self.recent[-1][0] + _HELD_NS + _SLACK_NS
+        return bool(self.recent) and stamp_ns <= self.recent[-1][0] + _HELD_NS + SLACK_NS
 
     def decided_at(self, stamp_ns: int) -> tuple[float, ...]:
         """Return what is held against the threshold, nothing without news."""
@@ -328,7 +328,7 @@ class SequenceMemory:
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
         """Return for each side when its alarm ends: a second after it was last above the threshold."""
-        ends_ns = (None if over_ns is None else over_ns + _HELD_NS + _SLACK_NS for over_ns in self.over_ns)
+        ends_ns = (None if over_ns is None else over_ns + _HELD_NS + SLACK_NS for over_ns in self.over_ns)
         return tuple(None if end_ns is None or end_ns < stamp_ns else end_ns for end_ns in ends_ns)
 
     def log_odds(self, context: Context) -> dict[str, FloatArray]:
@@ -366,8 +366,8 @@ def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context)
     by hop, so that one long step leads where many short ones do.
     """
     since_ns = stamp_ns - step_ns
-    first_ns = max(stamp_ns - _WAY_NS, since_ns + _HOP_NS)
-    for end_ns in (*range(first_ns, stamp_ns - _SLACK_NS, _HOP_NS), stamp_ns):
+    first_ns = max(stamp_ns - _WAY_NS, since_ns + HOP_NS)
+    for end_ns in (*range(first_ns, stamp_ns - SLACK_NS, HOP_NS), stamp_ns):
         kept, since_ns = _one_step(kept, end_ns, end_ns - since_ns, context), end_ns
     return kept
 
@@ -456,10 +456,10 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     into view from that side, and of the less likely side no more than that two come.
     """
     left, right = list(kept.log_odds(context).values())[-1].tolist()
-    since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
+    since_ns = kept.stamp_ns - _SMOOTHED_NS + SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
     # Of each hop the last one: however many measurements there are, time counts.
-    of_hop = {(kept.stamp_ns - one[0] + _SLACK_NS) // _HOP_NS: one for one in recent}.values()
+    of_hop = {(kept.stamp_ns - one[0] + SLACK_NS) // HOP_NS: one for one in recent}.values()
     rows = [
         [one[1 + k] for one in of_hop if ns is None or one[0] >= ns] for k, ns in enumerate(kept.emerged_ns)
     ]
