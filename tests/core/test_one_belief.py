@@ -104,6 +104,21 @@ def test_an_alarm_depends_on_time_not_on_how_many_measurements_carry_it(seed: in
             crowded = crowded.update(extra[rng.integers(3)])
 
 
+def test_what_a_risk_has_denied_does_not_decide_once_time_has_lifted_the_risk() -> None:
+    """A threshold below the usual log-odds: what is heard is above it and beside a risk below .1."""
+    groups = np.full((2, len(GROUPS)), 1e-4)
+    groups[:, :COMING], groups[:, -1] = 0.06 / COMING, 0.0
+    groups[:, -1] = 1.0 - groups.sum(axis=1)
+    said = SequenceReading(groups, SHARE, 0.1, SequenceAlarm(-6.0, 20.0))
+    heard, world = hop(np.random.default_rng(1), 1, sequence=False), WorldFilter()
+    for number in range(1, 8):
+        look = replace(heard, stamp_ns=number * 10**8, sightings=(), look=None, co_evidence=Unqueried("-"))
+        world = world.update(replace(look, sequence=said))
+    before, lifted = world.state, world.predict_to(world.stamp_ns + 9 * 10**8).state
+    assert max(cue.risk for cue in before.cues) < 0.1 < min(cue.risk for cue in lifted.cues)
+    assert broken_laws(before, None) == broken_laws(lifted, before) == []
+
+
 @pytest.mark.parametrize("rate_hz", [2, 5, 10, 20, 40, 100])
 def test_the_rule_of_single_windows_asks_for_time_however_often_they_come(rate_hz: int) -> None:
     heard = SignatureEvidence(("left", "right"), (6.0, 0.0), 0.0, 0.0)
@@ -281,6 +296,28 @@ def test_a_second_vehicle_believed_apart_is_not_unheard_because_the_first_masks_
     right = {one.direction: one for one in before.entities}["right"]
     assert right.id in {one.id for one in world.state.entities if one.status == "hidden"}
     assert cue_of(world.state, "right").risk > 0.85 * cue_of(before, "right").risk
+
+
+def test_a_second_vehicle_keeps_its_place_at_half_the_chance_while_the_first_masks_it() -> None:
+    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    kept_s, right = 0.0, ""
+    for number in range(1, 80):
+        seen = 10 <= number < 20
+        answer = Present(0.04, 0.01) if seen else Absent(0.04, 0.01)
+        boxes = (Sighting(0.53 - 0.04 * (number - 10), 0.02, "car", 0.9),) if seen else ()
+        said = TWO if number < 10 else both_sides((0.07, 0.07), (0.0, 0.0), "coming_3s")
+        look = Look("camera", number * 10**8, answer)
+        world = world.update(
+            Measurement(number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=look, sequence=said)
+        )
+        there = {one.id: one for one in world.state.entities}
+        right = (
+            next((name for name, one in there.items() if one.direction == "right"), "")
+            if number < 10
+            else right
+        )
+        kept_s = 0.1 * (number - 10) if right in there else kept_s
+    assert kept_s == pytest.approx(5.0, abs=0.11)
 
 
 def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_that_follow() -> None:

@@ -22,8 +22,10 @@ from worldstate.state import Event
 from worldstate.state.entity import EventKind
 
 from .memory import Memory
+from .sequence_memory import EMERGED_NS
 
 # After a hand-over no birth on its side: the window still holds the sound from before it.
+_MASKED = 0.5  # Of the existence below which a hidden entity ends
 _REARM_NS = nanoseconds(1.0)
 # A moving entity out of sight for so long may be the one now heard hidden nearby: more than one image at
 # 10 Hz, since a single miss is no occlusion, and less than a following vehicle takes, which would get its id.
@@ -82,7 +84,14 @@ def _goes_on(
     of_side = tracks.of_side(row)
     tracks.existence[row] = existence = memory.sides.existence(of_side)
     named = any(alarmed[k] for k in _sides(site) if of_side in (k, None))
-    return existence >= site.settings.death_probability or named
+    least = site.settings.death_probability
+    if memory.sequence is not None and of_side is not None:
+        # Beside a vehicle that has just come into view on the other side it is masked: that its chance is low
+        # by then is less evidence against it.
+        since_ns = memory.sequence.since_emerged_ns(memory.stamp_ns)
+        masked = min(ns for k, ns in enumerate(since_ns) if k != of_side) <= EMERGED_NS
+        least *= _MASKED if masked else 1.0
+    return existence >= least or named
 
 
 def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> list[int]:

@@ -48,7 +48,7 @@ _STEP_NATS = 0.1  # The chain is computed anew for every prior: a few are enough
 _FOLLOWED, _FOLLOWED_SHAPE = 1.0 / 6.0, 6.0
 # So long after one the reading knows by itself that vehicles come here: moved by the street's traffic as well
 # it has .19 on the other side where .13 is true, seconds after a vehicle (ten streams of exam seeds 1 and 6).
-_EMERGED_NS = 5_000_000_000
+EMERGED_NS = 5_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +307,7 @@ class SequenceMemory:
 
     def read_nats(self, context: Context) -> list[float]:
         """Return by how much a reading is moved: not at all where it has just heard a vehicle itself."""
-        just_emerged = min(self.since_emerged_ns(self.stamp_ns)) <= _EMERGED_NS
+        just_emerged = min(self.since_emerged_ns(self.stamp_ns)) <= EMERGED_NS
         return [0.0] * len(SIDES) if just_emerged else self.learned_nats(context)
 
     def has_news(self, stamp_ns: int) -> bool:
@@ -466,11 +466,11 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     decided, over_ns, alarm = np.array([float(np.mean(row)) for row in rows]), kept.over_ns, kept.alarm
     if alarm is not None:
         decided = alarm.deciding(decided, kept.posterior.groups[0], np.array(kept.read_nats(context)))
-        sides = zip(decided >= alarm.threshold_nats, over_ns, kept.sides.risks, strict=True)
-        # A risk that denies an alarm ends it: it is not held, and does not come back by itself.
-        over_ns = tuple(
-            None if risk < LEAST_RISK else kept.stamp_ns if over else ns for over, ns, risk in sides
-        )
+        over, denied = decided >= alarm.threshold_nats, np.array(kept.sides.risks) < LEAST_RISK
+        # A risk that denies an alarm ends it: it is not held, and time alone does not bring it back.
+        sides = zip(over, denied, over_ns, strict=True)
+        over_ns = tuple(None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides)
+        decided = np.where(over & denied, _UNDECIDED, decided)
     after = replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns)
     # The belief is the same: what was derived of it, half of the time of a step, is not derived again.
     vars(after).update(vars(kept) | vars(after))
