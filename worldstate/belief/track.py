@@ -55,9 +55,8 @@ class Track:
     existence: Probability
     created_ns: int  # Birth and last measurement that moved it
     updated_ns: int
-    side: Count = (
-        0  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
-    )
+    # Index of the approach side that it is hidden on, came from, or first appeared nearest to.
+    side: Count = 0
     seen: bool = False  # Whether vision has it; before that its existence is read from the explanation belief
     motion: MotionBelief = field(default=IN_VIEW, metadata=FLAT)  # Azimuth, rates, log range
     labels: tuple[Label, ...] = ((UNKNOWN, 1.0),)  # Class probabilities, sorted by label
@@ -149,6 +148,11 @@ class Tracks:
         columns["motion"] = self.motion.each()
         columns["place"] = [self.place(row) if is_placed else None for row, is_placed in enumerate(placed)]
         return tuple(starmap(Track, zip(*(columns[name] for name in Track.__slots__), strict=True)))
+
+    def row(self, number: int) -> Track:
+        """Return one of the entities by itself."""
+        (one,) = self.taken([number]).rows()
+        return one
 
     def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":
         """Return the columns of some of them."""

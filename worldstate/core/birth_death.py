@@ -22,11 +22,10 @@ from worldstate.state import Event
 from worldstate.state.entity import EventKind
 
 from .memory import Memory
-from .sequence_memory import EMERGED_NS
 
 # After a hand-over no birth on its side: the window still holds the sound from before it.
-_MASKED = 0.5  # Of the existence below which a hidden entity ends
 _REARM_NS = nanoseconds(1.0)
+_MASKED = 0.5  # Of the existence below which a hidden entity ends, beside a vehicle just come into view
 # A moving entity out of sight for so long may be the one now heard hidden nearby: more than one image at
 # 10 Hz, since a single miss is no occlusion, and less than a following vehicle takes, which would get its id.
 REOCCLUSION_NS, _REOCCLUSION_END_NS = nanoseconds(0.15), nanoseconds(3.0)
@@ -85,12 +84,10 @@ def _goes_on(
     tracks.existence[row] = existence = memory.sides.existence(of_side)
     named = any(alarmed[k] for k in _sides(site) if of_side in (k, None))
     least = site.settings.death_probability
-    if memory.sequence is not None and of_side is not None:
-        # Beside a vehicle that has just come into view on the other side it is masked: that its chance is low
-        # by then is less evidence against it.
-        since_ns = memory.sequence.since_emerged_ns(memory.stamp_ns)
-        masked = min(ns for k, ns in enumerate(since_ns) if k != of_side) <= EMERGED_NS
-        least *= _MASKED if masked else 1.0
+    # One that has just come into view on the other side masks it: that its chance is low by then is less
+    # evidence against it.
+    if of_side is not None and memory.sequence is not None and memory.sequence.just_emerged(but=of_side):
+        least *= _MASKED
     return existence >= least or named
 
 
@@ -121,7 +118,7 @@ def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeom
         # A detector adds to the kinds at the hand-over.
         one = replace(one, labels=measurement.kinds or one.labels, sources=(measurement.source,))
     else:
-        (one,) = tracks.taken([row]).rows()
+        one = tracks.row(row)
         tracks = tracks.without([row])
     # What came into view from here before was another vehicle: the new one starts without its mass.
     if isinstance(memory.belief, WindowBelief):

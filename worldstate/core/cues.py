@@ -224,7 +224,7 @@ def _cue(
     evidence: EvidenceTerms,
 ) -> RiskCue:
     row = hidden_on(memory.tracks, k)
-    track = None if row is None else memory.tracks.taken([row]).rows()[0]
+    track = None if row is None else memory.tracks.row(row)
     azimuth_rad, std_rad, source = hidden_azimuth(k, track, memory.sequence, model.site)
     within, interval_s = times
     arrival_s = None

@@ -27,13 +27,7 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.side_belief import TIE, SideBelief
-from worldstate.ground import (
-    NANOSECONDS_PER_SECOND,
-    FloatArray,
-    InvalidArgumentError,
-    finite_array,
-    seconds,
-)
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, nanoseconds, seconds
 from worldstate.ground.serialisation import Probability
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
@@ -48,7 +42,7 @@ _STEP_NATS = 0.1  # The chain is computed anew for every prior: a few are enough
 _FOLLOWED, _FOLLOWED_SHAPE = 1.0 / 6.0, 6.0
 # So long after one the reading knows by itself that vehicles come here: moved by the street's traffic as well
 # it has .19 on the other side where .13 is true, seconds after a vehicle (ten streams of exam seeds 1 and 6).
-EMERGED_NS = 5_000_000_000
+_EMERGED_NS = 5_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +71,8 @@ class ArrivalRate:
 
     def after(self, since_last_ns: float) -> "ArrivalRate":
         """Return the rate after one more arrival, so long after the last one."""
-        return replace(
-            self,
-            count=self.count + 1.0,
-            followed=self.followed + (since_last_ns <= FOLLOWS_S * NANOSECONDS_PER_SECOND),
-        )
+        is_follower = since_last_ns <= nanoseconds(FOLLOWS_S)
+        return replace(self, count=self.count + 1.0, followed=self.followed + is_follower)
 
     @property
     def follower_share(self) -> float:
@@ -251,6 +242,11 @@ class SequenceMemory:
         """Return how long before a time a vehicle last came into view from each side."""
         return [math.inf if ns is None else stamp_ns - ns for ns in self.emerged_ns]
 
+    def just_emerged(self, but: int | None = None) -> bool:
+        """Tell whether a vehicle has just come into view, from any side but one."""
+        since_ns = self.since_emerged_ns(self.stamp_ns)
+        return min(ns for k, ns in enumerate(since_ns) if k != but) <= _EMERGED_NS
+
     def handed_over(
         self, kept: Mapping[int, float], apart: Collection[int], stamp_ns: int
     ) -> "SequenceMemory":
@@ -307,8 +303,7 @@ class SequenceMemory:
 
     def read_nats(self, context: Context) -> list[float]:
         """Return by how much a reading is moved: not at all where it has just heard a vehicle itself."""
-        just_emerged = min(self.since_emerged_ns(self.stamp_ns)) <= EMERGED_NS
-        return [0.0] * len(SIDES) if just_emerged else self.learned_nats(context)
+        return [0.0] * len(SIDES) if self.just_emerged() else self.learned_nats(context)
 
     def has_news(self, stamp_ns: int) -> bool:
         """Tell whether anything was measured for as long as an alarm holds."""

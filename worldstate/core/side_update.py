@@ -49,9 +49,8 @@ def heard_beside(memory: Memory, measurement: Measurement) -> Heard:
 
     The belief moves by the sequence's own reading, which was learned where vehicles mask one another.
     """
-    heard = measurement.heard
-    tracks = memory.tracks
-    near = tracks.moving & (tracks.last_seen_ns >= measurement.stamp_ns - _JUST_LEFT_NS)
+    heard, tracks = measurement.heard, memory.tracks
+    near = tracks.moving & (tracks.unseen_ns(measurement.stamp_ns) <= _JUST_LEFT_NS)
     in_view = float(tracks.existence[near].max(initial=0.0))
     if memory.sequence is not None:
         in_view = max(in_view, memory.sequence.in_view)

@@ -34,6 +34,7 @@ from .sequence_memory import SequenceMemory
 # Beyond two seconds vehicles at junctions have turned or braked.
 _AFTER_S = np.array([1.0, 2.0])
 _CUBES = _AFTER_S**3 / 3.0
+_SOONER, _LATER = (f"{after_s:g}" for after_s in _AFTER_S)
 Forecast: TypeAlias = dict[str, tuple[float, float]]
 
 
@@ -61,7 +62,8 @@ def forecasts(tracks: Tracks) -> list[Forecast]:
     # Full precision would take twice as long to write.
     rows = np.stack([azimuth_rad, np.sqrt(variance)], axis=-1)
     return [
-        {"1": (mean, std), "2": (then, then_std)} for (mean, std), (then, then_std) in rows.round(6).tolist()
+        {_SOONER: (mean, std), _LATER: (then, then_std)}
+        for (mean, std), (then, then_std) in rows.round(6).tolist()
     ]
 
 
@@ -86,10 +88,8 @@ def entities_of(tracks: Tracks, memory: Memory, site: SiteGeometry) -> tuple[Ent
     # All at once: a number taken out of an array by itself costs as much as a row.
     stds = np.sqrt(tracks.covariance.diagonal(axis1=1, axis2=2))
     lists = (array.round(_DIGITS).tolist() for array in (tracks.mean, stds, tracks.covariance[:, *_UPPER]))
-    shares, moments = (
-        hidden_shares(tracks, memory.sides).tolist(),
-        zip(*lists, forecasts(tracks), strict=True),
-    )
+    shares = hidden_shares(tracks, memory.sides).tolist()
+    moments = zip(*lists, forecasts(tracks), strict=True)
     build = partial(_entity, memory, memory.sides, site)
     return tuple(map(build, tracks.rows(), shares, moments))
 
