@@ -134,14 +134,21 @@ class SiteEstimate:
         Derived here: see the head of `worldstate.abduction.signature.site_estimate`; gains by experiment. The
         weight is that of C. Morris, "Parametric empirical Bayes inference", J. Am. Stat. Assoc. 78, 1983.
         """
-        if self.level.shape != model.empty.shape:
-            raise InvalidArgumentError(f"model: expected {self.level.size} features, got {model.n_features}")
+        return self.beside(model.home, model.empty, model.prior_s)
+
+    def beside(self, home: SiteReference, empty: FloatArray, prior_s: float) -> SiteReference:
+        """Return the reference beside training sites, before there is a model of them: as `reference`.
+
+        Shapes: empty (features,).
+        """
+        if self.level.shape != empty.shape:
+            raise InvalidArgumentError(f"model: expected {self.level.size} features, got {empty.size}")
         if not self.heard_s:
-            return model.home
-        difference = self.level - model.empty
+            return home
+        difference = self.level - empty
         level = difference.mean()
         offset = _LEVEL_GAIN * level + (difference - level)
-        return model.home.shifted(self.heard_s / (self.heard_s + model.prior_s) * offset)
+        return home.shifted(self.heard_s / (self.heard_s + prior_s) * offset)
 
 
 HOP_S = 0.1

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,12 +12,24 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 from worldstate_lab.cli.main import main as lab
 from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate
+from worldstate_lab.features.methods import methods
 from worldstate_lab.features.published_classifier import PublishedClassifier
 
+from worldstate.abduction.cueing.risk_map import fit_platt
+from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
-from worldstate.operations.training.training import N_FOLDS, folds_by_recording, recording_labels
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.training.site_references import STREAMS
+from worldstate.operations.training.training import (
+    N_FOLDS,
+    calibrate_passes,
+    calibrate_windows,
+    fit_ensemble,
+    folds_by_recording,
+    recording_labels,
+)
 
 JUNCTIONS = ("SA1", "SB1", "SB2")
 KEYS = {
@@ -103,6 +116,45 @@ def test_nothing_is_predicted_by_what_it_was_trained_on(protocol):
     for predictions in passes.values():
         np.testing.assert_allclose(predictions.probabilities.sum(axis=1), 1.0)
         assert ((predictions.risk >= 0) & (predictions.risk <= 1)).all()
+
+
+@pytest.mark.parametrize("reference", ["run", "cold", "curated"])
+def test_a_threshold_is_set_on_windows_compared_as_those_that_it_is_for(reference):
+    made_up = made_up_table(spread=0.5)
+    table = replace(made_up, features=np.exp(made_up.features))
+    method = methods()[f"ensemble_{reference}"]
+    train, rng = method.prepare(table), np.random.default_rng(0)
+    passes = method.passes(train, rng, "lojo", method.asks(train, rng))
+    assert len(passes) == (STREAMS if reference == "run" else 1)
+    for site in JUNCTIONS:
+        here = train.environments == site
+        model = fit_ensemble(train.select(~here))
+        expected = model.explain(train.features[here] if reference == "curated" else table.features[here])
+        if reference != "run":
+            np.testing.assert_allclose(passes[0][here], expected)
+        else:
+            assert all(np.abs(one[here] - expected).max() > 1e-3 for one in passes)
+            assert np.abs(passes[0][here] - passes[1][here]).max() > 1e-3
+
+
+def test_a_threshold_is_the_mean_over_streams_and_half_way_between_both_folds():
+    """Beside a level whose passes are far apart: a mean in log-odds would lie elsewhere."""
+    table, rng = made_up_table(), np.random.default_rng(3)
+    levels = [[rng.dirichlet(np.ones(4), len(table)) for _ in range(n)] for n in (2, 3)]
+    learned = calibrate_passes(table, levels, alpha=0.1, miss_rate=0.0)
+    sorted_scores = [
+        [np.sort(hazard_statistic(one, 0.0)[table.hazard_free])[::-1] for one in level] for level in levels
+    ]
+    # Just above the first window that a tenth of them cannot pay for.
+    paid = int(0.1 * table.hazard_free.sum())
+    expected = np.mean([np.mean([one[paid] for one in level]) for level in sorted_scores])
+    assert learned.gamma == pytest.approx(expected, abs=1e-12)
+    pooled = np.concatenate(levels[1])
+    flags = np.tile(table.hazards, 3), np.tile(table.hazard_free, 3)
+    alone = calibrate_windows(pooled, *flags, alpha=0.1, miss_rate=0.0, fit_map=fit_platt)
+    assert learned.risk_map == alone.risk_map
+    with pytest.raises(InvalidArgumentError, match="pass"):
+        calibrate_passes(table, [[], levels[1]], alpha=0.1, miss_rate=0.0)
 
 
 def most_probable(row):

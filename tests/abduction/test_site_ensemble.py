@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.special import log_softmax
 
 from worldstate.abduction.signature.ensemble import (
+    KINDS,
     VIEWS,
     EnsembleModel,
     SiteReference,
@@ -20,12 +21,14 @@ from worldstate.abduction.signature.ensemble import (
     site_reference,
 )
 from worldstate.abduction.signature.ensemble_training import (
+    HEARD_PART,
     OTHER_SIDE,
     RECIPES,
     Recipe,
     SimulatedWindows,
     SiteEnsembleClassifier,
 )
+from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.window_classes import CLASSES, WINDOW_CLASSES, mirrored_classes
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
@@ -34,6 +37,7 @@ from worldstate.operations.training.site_references import (
     learned_while_listening,
     with_site_references,
 )
+from worldstate.operations.training.training import fit_ensemble
 
 
 def windows(rng, n=200, spread=0.8):
@@ -128,6 +132,50 @@ def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too(
     # What stands in for a site, and how fast one is learned, is of real windows alone.
     np.testing.assert_array_equal(with_all.home.row, without.home.row)
     assert with_all.prior_s == without.prior_s
+
+
+def test_a_window_is_learned_compared_with_what_was_heard_before_it_too():
+    """Before anything was heard that is the training sites' mean: the same as windows of no street beside."""
+    X, y = windows(np.random.default_rng(12))
+    groups, nothing = np.tile(["SA1", "SA2"], 100), SiteEstimate.start(60)
+    nowhere = np.hstack([X[:, :60], np.full((len(X), 180), np.nan)])
+    part = np.full(len(y), HEARD_PART / (1.0 - HEARD_PART))
+    beside = SimulatedWindows(nowhere, y, groups, part, np.zeros(len(y)))
+    twice = SiteEnsembleClassifier(simulated=beside).fit(X, y, groups).model_
+    heard = SiteEnsembleClassifier().fit(X, y, groups, [nothing] * len(X)).model_
+    np.testing.assert_allclose(heard.predict_proba(X), twice.predict_proba(X), atol=1e-4)
+    np.testing.assert_allclose(heard.class_prior, twice.class_prior, rtol=1e-12)
+    # What stands in for a site is of the references behind the windows alone, and each window weighs one.
+    plain = SiteEnsembleClassifier().fit(X, y, groups).model_
+    np.testing.assert_array_equal(heard.home.row, plain.home.row)
+    assert np.abs(heard.predict_proba(X) - plain.predict_proba(X)).max() > 0.01
+
+
+def test_what_was_heard_is_compared_as_in_use():
+    """The reference of an estimate is the same from a model as from what its fit is made of."""
+    rng = np.random.default_rng(13)
+    model = SiteEnsembleClassifier().fit(*windows(rng)).model_
+    one = SiteEstimate.start(60).updated(rng.uniform(0.1, 1.0, 60), 1.0, SiteEstimateSettings())
+    there = one.beside(model.home, model.empty, model.prior_s)
+    np.testing.assert_array_equal(one.reference(model).row, there.row)
+    assert not np.allclose(there.row, model.home.row)
+    with pytest.raises(InvalidArgumentError, match="60"):
+        SiteEstimate.start(30).beside(model.home, model.empty, model.prior_s)
+
+
+def test_a_moving_ego_holds_its_level_views_back_less():
+    labels, _, recordings, features = made_up_junctions()
+    models = {}
+    for kind in ("S", "D"):
+        sites = [f"{kind}A{i % 2}" for i in range(len(labels))]
+        models[kind] = fit_ensemble(with_site_references(table(labels, sites, recordings, features)))
+    norms = {
+        kind: {one.view: np.linalg.norm(one.weights) for one in model.experts}
+        for kind, model in models.items()
+    }
+    for recipe in RECIPES:
+        ratio = norms["D"][recipe.view] / norms["S"][recipe.view]
+        assert ratio > 1.05 if recipe.view in KINDS else ratio == pytest.approx(1.0)
 
 
 def test_streets_that_a_table_does_not_have_are_learned_whatever_is_held_out():
@@ -253,6 +301,16 @@ def test_what_a_stream_taught_holds_nothing_of_the_recording_that_is_scored(reco
     )
     for row in mine:
         np.testing.assert_array_equal(before[row].level, after[row].level)
+
+
+def test_without_an_empty_window_elsewhere_nothing_was_heard_or_it_is_an_error():
+    labels, sites, recordings, features = made_up_junctions()
+    labels = ["left" if name == "none" else name for name in labels]
+    streets = table(labels, sites, recordings, features)
+    with pytest.raises(InvalidArgumentError, match="hazard-free"):
+        learned_while_listening(streets, np.random.default_rng(0))
+    learned = learned_while_listening(streets, np.random.default_rng(0), or_nothing=True)
+    assert {one.heard_s for one in learned} == {0.0}
 
 
 def test_a_stream_is_ten_windows_of_mostly_empty_street():

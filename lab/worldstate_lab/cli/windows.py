@@ -19,7 +19,8 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
   --reference cold     the mean of the training sites: a car in its first second
   --reference curated  all windows of the junction's other recordings, half of them hazards: no car has it
 
-Thresholds and risk maps are set on inner out-of-fold scores, compared as under `run`, as in `train`.
+Thresholds and risk maps are set on inner out-of-fold scores of windows compared as the scored ones are, under
+`run` with five drawn streams, as in `model fit`.
 Figures are means over the seeds; intervals are the middle 95 % of 500 bootstrap samples of recordings, the
 same for every method.
 

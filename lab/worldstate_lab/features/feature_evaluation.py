@@ -5,7 +5,7 @@ recording (protocol ``cv``), junction (``lojo``) or kind of driving (``transfer`
 from inner out-of-fold scores of the training windows.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, cast
 
@@ -18,7 +18,7 @@ from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
-from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.files.model_file import Model
 from worldstate.ground.checks import finite_array, in_range
@@ -28,11 +28,11 @@ from worldstate.operations.training.site_references import asked_while_listening
 from worldstate.operations.training.training import (
     MISS_RATES,
     WindowCalibration,
-    between,
-    calibrate_windows,
+    asked_on_streams,
+    calibrate_passes,
     folds_by_recording,
     junction_folds,
-    out_of_fold,
+    out_of_fold_each,
 )
 from worldstate_lab.features.published_classifier import Classifier
 
@@ -49,13 +49,15 @@ class WindowMethod:
     """One way from windows to risk."""
 
     make: Callable[[np.random.Generator], Classifier]  # Makes an untrained classifier
-    # What the scored windows are compared with, None where the method compares with nothing. Training has the
-    # curated windows in any case, as in `model fit`.
+    # What the scored windows are compared with, None where the method compares with nothing. Training is the
+    # same in any case, as in `model fit`.
     reference: Reference | None = None
     # Whether it is made for sites unlike those of training: threshold and map come from folds like the outer
     # ones alone, and under `transfer` risks are shifted until hazards are as frequent as in training. Else
     # the threshold of an ensemble stands between junctions left out and recordings left out.
     afar: bool = False
+    # How it is trained, where windows and labels are not all that it takes; `make` otherwise.
+    fit: Callable[[FeatureTable], Classifier] | None = None
 
     def prepare(self, table: FeatureTable) -> FeatureTable:
         """Return the table that the classifier sees, of the table as read."""
@@ -63,16 +65,32 @@ class WindowMethod:
 
     def trained(self, table: FeatureTable, rng: np.random.Generator) -> Classifier:
         """Return a classifier trained on a prepared table."""
+        if self.fit is not None:
+            return self.fit(table)
         return self.make(rng).fit(table.features, table.labels, table.environments)
 
     def posteriors(self, table: FeatureTable, rng: np.random.Generator, inner: Protocol = "cv") -> FloatArray:
         """Return posteriors of each window of a prepared table out of fold, shape (n, 4)."""
-        folds, ask = folds_of(inner, table, rng), _asked_plainly(table)
-        # An ensemble's threshold is of windows compared as under `run`, as in `model fit`. A generator of its
-        # own: what is drawn to ask moves no fold.
-        if self.reference is not None and not self.afar:
-            ask = _of_ensemble(asked_while_listening(table, rng.spawn(1)[0]))
-        return out_of_fold(table, folds, lambda part: self.trained(part, rng), ask)
+        return self.passes(table, rng, inner, self.asks(table, rng)[:1])[0]
+
+    def passes(
+        self, table: FeatureTable, rng: np.random.Generator, inner: Protocol, asks: Sequence[Ask]
+    ) -> list[FloatArray]:
+        """Return posteriors out of fold for each way to ask, each of shape (n, 4)."""
+        folds = folds_of(inner, table, rng)
+        return out_of_fold_each(table, folds, lambda part: self.trained(part, rng), asks)
+
+    def asks(self, table: FeatureTable, rng: np.random.Generator) -> list[Ask]:
+        """Return how inner folds of a prepared table are asked: compared as the scored windows are."""
+        # Thresholds of windows compared as under `run` cost .06 of the windows where the scored ones are
+        # compared with curated ones: a threshold holds for the reference that it was set under. Generators
+        # of their own: what is drawn to ask moves no fold.
+        if self.afar or self.reference in (None, "curated"):
+            return [_asked_plainly(table)]
+        if self.reference == "run":
+            return [_of_ensemble(one) for one in asked_on_streams(table, rng)]
+        windows = table.features[:, :N_FEATURES]
+        return [lambda classifier, rows: classifier.predict_proba(windows[rows])]
 
     def calibrations(
         self, train: FeatureTable, protocol: Protocol, rng: np.random.Generator, alpha: float
@@ -82,18 +100,13 @@ class WindowMethod:
         # From the most careful to the boldest.
         both = self.reference is not None and not self.afar and like_outer == "lojo"
         inner: tuple[Protocol, ...] = ("lojo", "cv") if both else (like_outer,)
-        scores = [self.posteriors(train, rng, one) for one in inner]
+        asks = self.asks(train, rng)
+        scores = [self.passes(train, rng, one, asks) for one in inner]
         fit_map = fit_isotonic if self.reference is None else fit_platt
         found = {}
         for beta in MISS_RATES:
-            levels = [
-                calibrate_windows(
-                    one, train.hazards, train.hazard_free, alpha=alpha, miss_rate=beta, fit_map=fit_map
-                )
-                for one in scores
-            ]
-            learned = between(levels)
-            mean_risk = float(learned.risk_map(hazard_statistic(scores[-1], beta)).mean())
+            learned = calibrate_passes(train, scores, alpha=alpha, miss_rate=beta, fit_map=fit_map)
+            mean_risk = float(learned.risk_map(hazard_statistic(np.concatenate(scores[-1]), beta)).mean())
             found[beta] = learned, mean_risk
         return found
 

@@ -15,7 +15,7 @@ from worldstate.abduction.signature.ensemble_training import (
 )
 from worldstate.abduction.signature.window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.training.training import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE
+from worldstate.operations.training.training import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE, trained_ensemble
 from worldstate_lab.features.published_classifier import Classifier, PublishedClassifier
 
 from .feature_evaluation import Predictions, Protocol, Reference, WindowMethod
@@ -72,7 +72,10 @@ def _distant_site(rng: np.random.Generator) -> Classifier:
 
 def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod]:
     """Return the methods by name, the ensembles of them trained on simulated windows too."""
-    ensemble = WindowMethod(partial(_site_ensemble, simulated=simulated))
+    # Trained as `model fit` does.
+    ensemble = WindowMethod(
+        partial(_site_ensemble, simulated=simulated), fit=partial(trained_ensemble, simulated=simulated)
+    )
     # The pattern alone, for a moving ego: streets of a standing one cost it (docs/signature.md).
     distant = WindowMethod(_distant_site, afar=True)
     return {

@@ -15,6 +15,8 @@ from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 # What a vehicle has heard of a street after its first ten seconds: nearly always an empty street.
 STREAM_WINDOWS = 10
 STREAM_HAZARDS = 0.05
+# Thresholds are set on so many drawn streams: gamma then depends less on which windows one street is made of.
+STREAMS = 5
 _WINDOW_S = 1.0
 
 
@@ -56,8 +58,12 @@ def asked_while_listening(
     return posteriors
 
 
-def learned_while_listening(table: FeatureTable, rng: np.random.Generator) -> list[SiteEstimate]:
+def learned_while_listening(
+    table: FeatureTable, rng: np.random.Generator, *, or_nothing: bool = False
+) -> list[SiteEstimate]:
     """Return for each window what `run` has learned of its junction from a stream before it.
+
+    Where no other recording has an empty window that is an error, or with `or_nothing` nothing was heard.
 
     Shapes: table (n, 60).
     """
@@ -67,6 +73,8 @@ def learned_while_listening(table: FeatureTable, rng: np.random.Generator) -> li
     learned = [start] * len(table)
     for mine, others in _recordings(table):
         estimate = start
+        if or_nothing and not (others & table.hazard_free).any():
+            continue
         for row in _stream(table, others, rng):
             estimate = estimate.updated(table.features[row], _WINDOW_S, settings)
         for row in np.flatnonzero(mine):
