@@ -10,11 +10,11 @@ of the guard are the street, kinds of foreign sounds and warning signals of vehi
 .. math:: \lambda = \log \sum_{c \ne street} e^{\ell_c} - \ell_{street}
 
 Above a threshold on lambda, held on streets never heard, the sound is not the street's. It is a warning
-signal where the softmax says so and x lies within reach of a kind of signal, :math:`|A (x - \mu_k)| \le 1`.
+signal where the log-odds of signals over all that is foreign exceed a second threshold.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import exp
 from typing import ClassVar, TypeAlias
 
@@ -23,7 +23,7 @@ import numpy as np
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import all_of, freeze_arrays, in_range, named
-from worldstate.ground.serialisation import Layout
+from worldstate.ground.serialisation import ADDED, Layout
 
 UNKNOWN, SIREN = "unknown", "siren"
 # As detectors of COCO's classes call them; a van is a car to some and a truck to others.
@@ -74,6 +74,8 @@ class RoadUserModel:
         Of the softmax.
     biases : ndarray, shape (classes,)
         Of the softmax; they hold the shares of the classes in use.
+    shares : ndarray, shape (classes,), optional
+        Those shares.
 
     Raises
     ------
@@ -91,11 +93,29 @@ class RoadUserModel:
     classes: tuple[str, ...]
     weights: FloatArray
     biases: FloatArray
+    shares: FloatArray | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         if UNKNOWN not in self.classes:
             raise InvalidArgumentError(f"classes: expected {UNKNOWN!r} among them, got {self.classes}")
         freeze_arrays(self, weights=(len(self.classes), len(self.measures)), biases=(len(self.classes),))
+        if self.shares is not None:
+            freeze_arrays(self, shares=(len(self.classes),))
+
+    def with_shares(self, shares: FloatArray) -> "RoadUserModel":
+        r"""Return the model where classes are as frequent as given; as it is if its own shares are unknown.
+
+        .. math:: p_c' \propto p_c\, \pi_c' / \pi_c
+
+        Parameters
+        ----------
+        shares : ndarray, shape (classes,)
+            Of sum 1; a class of share 0 is never heard.
+        """
+        if self.shares is None:
+            return self
+        moved = np.log(np.maximum(shares, np.finfo(float).tiny)) - np.log(self.shares)
+        return replace(self, biases=self.biases + moved, shares=shares)
 
     def probabilities(self, measures: FloatArray) -> FloatArray:
         r"""Return the probability of every class, shape (n, classes).
@@ -264,12 +284,8 @@ class DomainGuard:
         Of the softmax.
     threshold : float
         Log-odds that .025 of the hops of streets never heard exceed.
-    kinds_of_signals : tuple of str
-        The signal that each centre is of: two sirens are one.
-    centres : ndarray, shape (kinds, measures)
-        Mean of every kind of signal.
-    whitening : ndarray, shape (measures, measures)
-        Makes the reach of a kind the unit ball.
+    signal_nats : float
+        Log-odds of the signals over the foreign sounds from which a sound is a signal.
     margin : float
         Nats that evidence of a foreign sound has to exceed to say anything.
 
@@ -280,9 +296,8 @@ class DomainGuard:
 
     Examples
     --------
-    >>> reach = {"kinds_of_signals": ("siren",), "centres": [[9.0]], "whitening": [[1.0]]}
     >>> weights = [[0.0], [1.0], [2.0]]
-    >>> guard = DomainGuard(("x",), ("speech",), ("siren",), weights, [3.0, 0.0, -5.0], 1.0, **reach)
+    >>> guard = DomainGuard(("x",), ("speech",), ("siren",), weights, [3.0, 0.0, -5.0], 1.0)
     >>> guard.judge(np.array([0.0])).log_odds < 0.0, guard.judge(np.array([4.5])).reason
     (True, 'sounds like speech')
     """
@@ -293,10 +308,7 @@ class DomainGuard:
     weights: FloatArray
     biases: FloatArray
     threshold: float
-    # The softmax alone takes every whistle that it has never heard for a siren.
-    kinds_of_signals: tuple[str, ...]
-    centres: FloatArray
-    whitening: FloatArray
+    signal_nats: float = field(default=0.0, metadata=ADDED)
     # Foreign sounds alone alarm in .14 of their hops; less 2 nats in .06, less all in .04. Of vehicles that
     # come while one is as loud as they are, .84, .63 and .42 are detected (43 sounds at five sites, kind and
     # site never heard): docs/foreign_sounds.md.
@@ -306,8 +318,7 @@ class DomainGuard:
         classes, inputs = 1 + len(self.foreign) + len(self.signals), len(self.measures)
         if not self.foreign or not self.signals:
             raise InvalidArgumentError("foreign, signals: expected at least one kind of each, got none")
-        freeze_arrays(self, weights=(classes, inputs), biases=(classes,), whitening=(inputs, inputs))
-        freeze_arrays(self, centres=(len(self.kinds_of_signals), inputs))
+        freeze_arrays(self, weights=(classes, inputs), biases=(classes,))
 
     def log_odds(self, measures: FloatArray) -> FloatArray:
         r"""Return the log-odds of anything but the street, over the threshold, shape (n,).
@@ -335,10 +346,8 @@ class DomainGuard:
             return Familiar(log_odds)
         logits = (self.weights @ measures + self.biases)[1:]
         foreign, signal = logits[: len(self.foreign)], logits[len(self.foreign) :]
-        if np.logaddexp.reduce(signal) > np.logaddexp.reduce(foreign):
-            apart = np.square((measures - self.centres) @ self.whitening.T).sum(axis=1)
-            if apart.min() <= 1.0:
-                return WarningSignal(self.kinds_of_signals[int(apart.argmin())], log_odds)
+        if np.logaddexp.reduce(signal) - np.logaddexp.reduce(foreign) > self.signal_nats:
+            return WarningSignal(self.signals[int(signal.argmax())], log_odds)
         return Foreign(f"sounds like {self.foreign[int(foreign.argmax())]}", log_odds)
 
 

@@ -9,39 +9,17 @@ from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.settings import SoundKind
 
+from . import syntheses
 from .signals import gate
-from .syntheses import (
-    beeper,
-    bell,
-    bicycle_bell,
-    birds,
-    drill,
-    horn,
-    music,
-    saw,
-    siren,
-    steps,
-    tone,
-    voice,
-    wail,
-)
 
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]
 
 SYNTHESES: dict[str, Synthesis] = {
-    "voice": voice,
-    "steps": steps,
-    "bell": bell,
-    "saw": saw,
-    "drill": drill,
-    "music": music,
-    "birds": birds,
-    "tone": tone,
-    "siren": siren,
-    "wail": wail,
-    "horn": horn,
-    "beeper": beeper,
-    "bicycle-bell": bicycle_bell,
+    name: getattr(syntheses, name.replace("-", "_"))
+    for name in (
+        *("voice", "children", "steps", "bell", "saw", "drill", "music", "tune", "drums", "dog", "birds"),
+        *("shots", "tone", "siren", "wail", "sweeps", "turns", "horn", "horns", "beeper", "bicycle-bell"),
+    )
 }
 # Everything is drawn at a whole multiple of the rate asked, of at least this, and then band-limited: partials
 # above a low Nyquist frequency are left out, not folded, and the level is that of the whole sound.

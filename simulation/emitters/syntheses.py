@@ -1,5 +1,6 @@
-"""Sounds as they are drawn: speech, footsteps, bells, music, birds, sirens and horns, tools and tones."""
+"""Sounds as they are drawn: speech, steps, bells, music, dogs, birds, shots, sirens, horns, tools, tones."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from worldstate.ground.typing import Complex128Array, FloatArray
 from worldstate.simulation.scene.octave_bands import octave_masks
 
-from .signals import Spans, add_ringing, bursts, drift, gate, harmonics, octave_noise
+from .signals import INAUDIBLE_DECAYS, Spans, add_ringing, bursts, drift, gate, harmonics, octave_noise
 
 # First three formants of adult men's vowels: Peterson and Barney, "Control methods used in a study of the
 # vowels", J. Acoust. Soc. Am. 24 (1952), table II.
@@ -26,6 +27,7 @@ VOWELS_HZ = (
 HIGHER_HZ = (3500.0, 4500.0)
 BANDWIDTHS_HZ = (80.0, 100.0, 140.0, 200.0, 250.0)
 SPEECH_HZ = (105.0, 215.0)  # men's and women's mean pitch
+CHILDREN_HZ, MOST_CHILDREN = (230.0, 480.0), 7  # Pitch of calling children (assumed)
 HIGH_VOICE_HZ, SHORT_TRACT = 160.0, 1.15  # a shorter vocal tract has higher formants
 # A syllable takes a quarter of a second: speech is modulated at 3 to 6 Hz most of all.
 SYLLABLE_S, CLOSURE_S, PHRASE, SPEECH_PAUSE_S = (0.14, 0.24), (0.03, 0.07), (5, 12), (0.25, 0.6)
@@ -41,7 +43,21 @@ RAISED_DB = np.array([0.0, 53.0, 60.5, 64.9, 62.7, 57.2, 51.2, 42.5])
 
 def voice(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     """Draw a talker and what is said, shape (samples,)."""
-    pitch_hz = rng.uniform(*SPEECH_HZ)
+    return _talker(samples, rate_hz, rng.uniform(*SPEECH_HZ), rng)
+
+
+def children(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw one to seven children who call, and the breath in their voices, shape (samples,)."""
+    calls = [
+        rng.uniform(0.3, 1.0) * _talker(samples, rate_hz, rng.uniform(*CHILDREN_HZ), rng)
+        for _ in range(int(rng.integers(1, MOST_CHILDREN + 1)))
+    ]
+    together = np.sum(calls, axis=0)
+    breath = octave_noise(FRICATIVE_DB, samples, rate_hz, rng) * np.abs(drift(samples, rate_hz, 0.1, rng))
+    return np.asarray(together + rng.uniform(0.0, 0.6) * together.std() / breath.std() * breath)
+
+
+def _talker(samples: int, rate_hz: float, pitch_hz: float, rng: np.random.Generator) -> FloatArray:
     syllables, declination = _syllables(samples / rate_hz, rng)
     starts = np.array([start for start, _ in syllables])
     intonation = np.interp(np.arange(samples) / rate_hz, starts, declination)
@@ -232,6 +248,121 @@ def _semitones(chord: np.ndarray[tuple[int], np.dtype[np.int64]], note: int) -> 
     return np.asarray(2.0 ** (np.array(CHORDS)[chord, note] / 12.0))
 
 
+# Notes of a major scale over a tonic, how long they are and how they decay (assumed): any instrument.
+SCALE, TUNE_TONIC_HZ, NOTE_S, NOTE_DECAY_S = (
+    (0, 2, 4, 5, 7, 9, 11, 12),
+    (150.0, 700.0),
+    (0.12, 0.8),
+    (0.3, 3.0),
+)
+VIBRATO, VIBRATO_HZ, MOST_PARTS = 0.006, 5.5, 4
+
+
+def tune(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw up to four instruments that each play notes of a scale of its own, shape (samples,)."""
+    out = np.zeros(samples)
+    for _ in range(int(rng.integers(1, MOST_PARTS + 1))):
+        tonic, note_s, decay_s = rng.uniform(*TUNE_TONIC_HZ), rng.uniform(*NOTE_S), rng.uniform(*NOTE_DECAY_S)
+        overtones, at = _falling(rng.uniform(0.6, 2.0), 11), rng.uniform(0.0, 0.3)
+        while at < samples / rate_hz:
+            length_s = note_s * rng.choice((0.5, 1.0, 1.0, 2.0))
+            time = _times(out, at, length_s, rate_hz)
+            pitch = tonic * 2.0 ** (rng.choice(SCALE) / 12.0)
+            wave = harmonics(
+                pitch * (1.0 + VIBRATO * np.sin(2.0 * np.pi * VIBRATO_HZ * time)), overtones, rate_hz
+            )
+            _add(
+                out, at, rate_hz, rng.uniform(0.5, 1.0) * wave * np.exp(-time / decay_s) * _edges(time, 0.01)
+            )
+            at += length_s
+    return out
+
+
+# A deep and a high drum, and the hiss of sticks and cymbals (assumed).
+DRUMS = (((85.0, 1.0, 0.15), (220.0, 0.5, 0.08)), ((290.0, 1.0, 0.1), (700.0, 0.6, 0.05)))
+BEAT_S, HISS_SHARE, HISS_S = (0.2, 0.75), 0.6, (0.01, 0.08)
+
+
+def drums(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw a beat and what is struck on it, shape (samples,)."""
+    out, beat_s = np.zeros(samples), rng.uniform(*BEAT_S)
+    for at in np.arange(rng.uniform(0.0, beat_s), samples / rate_hz, beat_s).tolist():
+        add_ringing(out, at, rate_hz, DRUMS[rng.integers(len(DRUMS))], rng.uniform(0.3, 1.0))
+        if rng.random() < HISS_SHARE:
+            _add_blast(out, at, rate_hz, ((rng.uniform(0.05, 0.5), rng.uniform(*HISS_S)),), rng)
+    return out
+
+
+# A bark: harmonics that rise and fall by a third, rough by a share of noise, in series (assumed, from a
+# lapdog to a large dog).
+BARK_HZ, BARK_S, BARK_RISE, ROUGH = (250.0, 900.0), (0.08, 0.35), 0.35, 0.8
+BARKS_GAP_S, QUIET_SHARE, QUIET_S = (0.25, 1.5), 0.2, (1.0, 3.0)
+
+
+def dog(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw a dog and its barks, shape (samples,)."""
+    out, at = np.zeros(samples), rng.uniform(0.0, 0.8)
+    pitch, gap_s = rng.uniform(*BARK_HZ), rng.uniform(*BARKS_GAP_S)
+    while at < samples / rate_hz:
+        length_s = rng.uniform(*BARK_S)
+        time = _times(out, at, length_s, rate_hz)
+        arch = np.sin(np.pi * time / length_s)
+        glide = pitch * rng.uniform(0.9, 1.1) * (1.0 + BARK_RISE * arch)
+        wave = harmonics(glide, _falling(rng.uniform(0.5, 1.5), 14), rate_hz) if len(time) else time
+        wave = wave + 2.0 * rng.uniform(0.0, ROUGH) * np.std(wave) * rng.standard_normal(len(time))
+        _add(out, at, rate_hz, wave * np.sqrt(arch) * 10.0 ** (rng.standard_normal() / 10.0))
+        at += rng.uniform(*QUIET_S) if rng.random() < QUIET_SHARE else gap_s * rng.uniform(0.7, 1.5)
+    return out
+
+
+# A shot is a blast and what the place sends back of it; bursts come at an even pace (assumed).
+BLAST_DECAY_S, ECHO, ECHO_S = (0.005, 0.06), (0.02, 0.25), (0.1, 0.7)
+BURST_S, SINGLE_S = (0.08, 0.6), (0.8, 4.0)
+
+
+def shots(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw shots one by one or in bursts, shape (samples,)."""
+    out, at, pace_s = np.zeros(samples), rng.uniform(0.1, 2.0), rng.uniform(*BURST_S)
+    in_bursts = rng.random() < 0.5
+    while at < samples / rate_hz:
+        parts = (1.0, rng.uniform(*BLAST_DECAY_S)), (rng.uniform(*ECHO), rng.uniform(*ECHO_S))
+        _add_blast(out, at, rate_hz, parts, rng)
+        at += pace_s * rng.uniform(0.9, 1.1) if in_bursts else rng.uniform(*SINGLE_S)
+    return out
+
+
+def _falling(slope: float, count: int) -> list[float]:
+    """Amplitudes of partials that fall by a power of their order."""
+    return [order**-slope for order in range(1, count + 1)]
+
+
+def _times(out: FloatArray, at_s: float, length_s: float, rate_hz: float) -> FloatArray:
+    """Return times since `at_s` of so long a note, of which the end of the sound may cut some."""
+    return np.arange(max(min(int(length_s * rate_hz), len(out) - int(at_s * rate_hz)), 0)) / rate_hz
+
+
+def _edges(time: FloatArray, ramp_s: float) -> FloatArray:
+    return np.minimum(np.minimum(time, time[::-1]) / ramp_s, 1.0)
+
+
+def _add(out: FloatArray, at_s: float, rate_hz: float, wave: FloatArray) -> None:
+    first = int(at_s * rate_hz)
+    out[first : first + len(wave)] += wave
+
+
+def _add_blast(
+    out: FloatArray,
+    at_s: float,
+    rate_hz: float,
+    parts: Sequence[tuple[float, float]],
+    rng: np.random.Generator,
+) -> None:
+    """Add white noise that decays: parts are an amplitude and a time constant in s."""
+    time = _times(out, at_s, INAUDIBLE_DECAYS * max(decay_s for _, decay_s in parts), rate_hz)
+    envelope = np.sum([amplitude * np.exp(-time / decay_s) for amplitude, decay_s in parts], axis=0)
+    _add(out, at_s, rate_hz, envelope * rng.standard_normal(len(time)))
+
+
 @dataclass(frozen=True, slots=True)
 class _Song:
     """Notes of a phrase (start and end in Hz, length in s), how often they come, and the rest after it."""
@@ -317,6 +448,52 @@ def horn(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     blasts = gate(samples, rate_hz, bursts(samples / rate_hz, BLAST_S, PAUSE_S, rng), 0.02)
     both = [harmonics(np.full(samples, tune * disc), DISC_PARTIALS, rate_hz) for disc in DISCS_HZ]
     return blasts * (both[0] + both[1])
+
+
+# What sirens and horns have in common wherever they are made: harmonics of one pitch that sweeps, of two that
+# take turns, or of one or two that are held (spans assumed, wider than any regulation).
+SWEEP_LOW_HZ, SWEEP_RATIO, SWEEPS_HZ = (350.0, 900.0), (1.3, 2.6), (0.1, 8.0)
+TURN_LOW_HZ, TURN_RATIO, TURN_S, TURN_GLIDE_S = (350.0, 800.0), (1.15, 1.6), (0.25, 1.0), 0.02
+HELD_HZ, SECOND_RATIO, SECOND_SHARE, HELD_S, HELD_PAUSE_S = (
+    (250.0, 650.0),
+    (1.15, 1.35),
+    0.7,
+    (0.4, 8.0),
+    (0.1, 2.0),
+)
+
+
+def sweeps(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw a siren that rises and falls at any pace, round or straight, shape (samples,)."""
+    low, ratio, pace_hz = (
+        rng.uniform(*SWEEP_LOW_HZ),
+        rng.uniform(*SWEEP_RATIO),
+        np.exp(rng.uniform(*np.log(SWEEPS_HZ))),
+    )
+    cycles = rng.random() + pace_hz * np.arange(samples) / rate_hz
+    is_round = rng.random() < 0.5
+    height = 0.5 - 0.5 * np.cos(2.0 * np.pi * cycles) if is_round else 2.0 * np.abs(np.mod(cycles, 1.0) - 0.5)
+    return harmonics(low * ratio**height, _falling(rng.uniform(0.5, 2.5), 9), rate_hz)
+
+
+def turns(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw a siren of any two tones in turn, shape (samples,)."""
+    low, ratio, tone_s = rng.uniform(*TURN_LOW_HZ), rng.uniform(*TURN_RATIO), rng.uniform(*TURN_S)
+    cycles = np.mod((np.arange(samples) / rate_hz + rng.uniform(0.0, 2.0 * tone_s)) / tone_s, 2.0)
+    height = np.clip(0.5 + (np.abs(cycles - 1.0) - 0.5) * tone_s / TURN_GLIDE_S, 0.0, 1.0)
+    return harmonics(low * ratio**height, _falling(rng.uniform(0.3, 1.5), 11), rate_hz)
+
+
+def horns(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw blasts of one horn or two of any pitch, shape (samples,)."""
+    pitches = [rng.uniform(*HELD_HZ)]
+    if rng.random() < SECOND_SHARE:
+        pitches.append(pitches[0] * rng.uniform(*SECOND_RATIO))
+    longest_s = rng.uniform(*HELD_S)
+    blasts = gate(samples, rate_hz, bursts(samples / rate_hz, (0.1, longest_s), HELD_PAUSE_S, rng), 0.01)
+    amplitudes = rng.uniform(0.2, 1.0, 15) * np.where(np.arange(15) < 7, 1.0, 0.3)
+    held = [harmonics(np.full(samples, pitch), amplitudes.tolist(), rate_hz) for pitch in pitches]
+    return np.asarray(blasts * np.sum(held, axis=0))
 
 
 def beeper(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:

@@ -45,6 +45,9 @@ MOUTH_DB: Octaves = (-2.0, -3.0, -6.0, -9.0, -12.0, -15.0, -17.0, -18.0)
 _TABLE = (
     # ISO 9921:2003: raised effort is 66 dB(A) at 1 m with its pauses, normal 60, loud 72.
     SoundKind("voice", "one talker, raised effort", 68.3, 1.5, HEAD_DB),
+    # Assumed: a few children who call at play, and a dog in a yard, some 90 dB(A) at 1 m.
+    SoundKind("children", "children at play", 78.0, 1.0, HEAD_DB),
+    SoundKind("dog", "barking dog", 90.0, 0.5, HEAD_DB),
     # Hard heels on paving; assumed.
     SoundKind("steps", "one person walking", 58.0, 0.05),
     # Assumed: some 65 dB(A) at 100 m.
@@ -54,6 +57,10 @@ _TABLE = (
     SoundKind("drill", "hammer drill in masonry", 93.0, 1.2),
     # Assumed: a loudspeaker in an open window.
     SoundKind("music", "music with beat and bass", 80.0, 2.5, BOX_DB),
+    SoundKind("tune", "instruments that play a tune", 80.0, 1.5),
+    SoundKind("drums", "drums", 90.0, 1.0),
+    # Assumed: fireworks, a nail gun.
+    SoundKind("shots", "shots", 115.0, 1.5),
     # Assumed: small songbirds at full song.
     SoundKind("birds", "songbirds", 82.0, 5.0),
     # Assumed: an air conditioner's fan, a transformer.
@@ -62,8 +69,11 @@ _TABLE = (
     SoundKind("siren", "two-tone siren", 121.0, 1.8, MOUTH_DB, VEHICLE),
     # Assumed as loud as the two-tone one.
     SoundKind("wail", "wailing siren", 121.0, 1.8, MOUTH_DB, VEHICLE),
+    SoundKind("sweeps", "siren that rises and falls at any pace", 121.0, 1.8, MOUTH_DB, VEHICLE),
+    SoundKind("turns", "siren of any two tones", 121.0, 1.8, MOUTH_DB, VEHICLE),
     # 93 dB(A) at 7 m in front of the vehicle, the least that UN Regulation No. 28 asks, is 110 at 1 m.
     SoundKind("horn", "horn of a car", 110.0, 0.5, MOUTH_DB, VEHICLE),
+    SoundKind("horns", "one horn or two of any pitch", 110.0, 0.5, MOUTH_DB, VEHICLE),
     # 97 dB(A) at 1.2 m, class C of SAE J994, is 98.6 at 1 m.
     SoundKind("beeper", "reversing beeper", 98.6, 0.8, MOUTH_DB, VEHICLE, faces=-1.0),
     # Assumed.

@@ -25,9 +25,7 @@ GUARD = DomainGuard(
     weights=np.array([[0.0, 0.0], [2.0, 0.0], [2.0, -1.0], [0.0, 2.0]]),
     biases=np.array([4.0, 0.0, 0.0, 0.0]),
     threshold=1.0,
-    kinds_of_signals=("siren",),
-    centres=np.array([[0.0, 5.0]]),
-    whitening=np.eye(2),
+    signal_nats=1.0,
 )
 measures = st.lists(st.floats(-9.0, 9.0), min_size=2, max_size=2).map(np.array)
 
@@ -49,9 +47,11 @@ def test_what_is_told_and_why() -> None:
     assert isinstance(siren, WarningSignal) and siren.signal == "siren"
 
 
-@given(st.floats(-9.0, 9.0), st.floats(6.5, 20.0))
-def test_no_signal_out_of_reach_of_all_that_were_heard(x: float, y: float) -> None:
-    assert not isinstance(GUARD.judge(np.array([x, y])), WarningSignal)
+@given(measures)
+def test_a_signal_is_told_where_it_is_so_much_likelier_than_all_that_is_foreign(x: np.ndarray) -> None:
+    share = softmax(GUARD.weights @ x + GUARD.biases)
+    verdict, nats = GUARD.judge(x), np.log(share[3]) - np.log(share[1] + share[2])
+    assert isinstance(verdict, WarningSignal) == (verdict.log_odds > 0.0 and nats > 1.0)
 
 
 @given(measures)

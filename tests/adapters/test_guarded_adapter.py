@@ -36,9 +36,6 @@ def guard() -> DomainGuard:
         weights=weights,
         biases=np.array([12.0, 0.0, 0.0]),
         threshold=0.0,
-        kinds_of_signals=("siren",),
-        centres=np.zeros((1, len(MEASURES))),
-        whitening=np.zeros((len(MEASURES), len(MEASURES))),
     )
 
 
@@ -76,7 +73,6 @@ def test_a_guard_of_other_measures_is_refused() -> None:
     renamed = DomainGuard(
         ("loudness", *MEASURES[1:]),
         *(one.foreign, one.signals, one.weights, one.biases, one.threshold),
-        *(one.kinds_of_signals, one.centres, one.whitening),
     )
     with pytest.raises(OutOfDomainError, match="guard"):
         AcousticAdapter(ARRAY, RATE_HZ, Alarmed(), guard=renamed)

@@ -17,7 +17,7 @@ from worldstate.commissioning.road_user_training import (
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 
-N_INPUTS, EACH, SITES = len(MEASURES) + len(BANDS), 12, ("one", "two", "three")
+N_INPUTS, EACH, SITES = len(MEASURES) + len(BANDS), 100, ("one", "two", "three")
 
 
 def made_up_rows(seed: int, apart: float = 4.0) -> RoadUserRows:

@@ -28,7 +28,8 @@ from worldstate.operations.training.training import TrainingSettings, train_mode
 from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.stream.settings import StreamSettings
 
-from .guard_training import train_guard
+from . import guard_training, road_user_training
+from .guard_training import close_rows, train_guard
 from .heard_stream import (
     HAZARD_FREE,
     CommissionSettings,
@@ -40,7 +41,7 @@ from .heard_stream import (
     mounting_streams,
     mountings,
 )
-from .road_user_training import fit_road_users, road_user_rows
+from .road_user_training import fit_road_users, road_user_rows, with_close
 from .sequence_training import LabelledStream, calibrated_margin_s, stream_truth, train_sequence
 from .simulated_windows import (
     N_OPEN,
@@ -198,11 +199,15 @@ def commission(
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out.
     guard = road_users = None
+    about = model.provenance.classifier
     if not settings.quick:
-        guard = train_guard(array, streams, rng, jobs)
+        close = close_rows(rate_hz, rng, jobs=jobs)
+        guard = train_guard(array, streams, close, rng, jobs)
         sites = list(dict.fromkeys(one.site for one in streams))
-        road_users = fit_road_users(road_user_rows(array, sites, rate_hz, rng, jobs=jobs))
-    provenance = replace(model.provenance, fit_for_use=not settings.quick)
+        passes = road_user_rows(array, sites, rate_hz, rng, jobs=jobs)
+        road_users = fit_road_users(with_close(passes, close))
+        about = f"{about}; {guard_training.CHOSEN}; {road_user_training.CHOSEN}"
+    provenance = replace(model.provenance, classifier=about, fit_for_use=not settings.quick)
     made = replace(model, provenance=provenance, sequence=sequence, guard=guard, road_users=road_users)
     return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made
 

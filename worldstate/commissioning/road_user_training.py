@@ -44,6 +44,10 @@ _DRIVEN_S, _LEAD_S = 7.0, 3.0  # Before line of sight, and of ambience before th
 # Over the ambience from 250 to 2600 Hz over one second. At 0 dB a seventh of the hops of cars are unknown,
 # though their class is found as well.
 _AUDIBLE_DB = -6.0
+# Chosen on real clips of cars and trams, of which nothing else is learned: there the log-loss is least at
+# this temperature, and before it .2 higher at a strength of .03.
+TEMPERATURE, STRENGTH = 1.5, 0.003
+CHOSEN = f"temperature {TEMPERATURE} of road users chosen on the same passes"
 _FOLDS = 8
 _FIGURES = 5  # Of a coefficient in the file
 
@@ -129,15 +133,27 @@ def _over_a_second(power: FloatArray) -> FloatArray:
     return np.convolve(power, np.ones(HOPS_A_SECOND))[: len(power)]
 
 
+def with_close(rows: RoadUserRows, close: SoundRows) -> RoadUserRows:
+    """Return the rows with those of vehicles close by, which do not tell how frequent they are."""
+    vehicles = close.select(np.isin(close.kinds, list(CLASS_OF)))
+    number = len(vehicles.kinds)
+    heard = (vehicles.measures, vehicles.kinds, vehicles.sites, np.ones(number, np.bool_))
+    return RoadUserRows.joined([rows, RoadUserRows(*heard, np.zeros(number, np.bool_))])
+
+
 def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
-    """Fit a softmax to classes of equal weight, then let them be as frequent as in a town."""
+    r"""Fit a softmax to classes of equal weight, flatten it, and let classes be as frequent as in a town.
+
+    .. math:: p_c \propto \pi_c\, q_c^{1 / T}
+    """
     classes = rows.classes
     equal = 1.0 / np.bincount(classes, minlength=len(CLASSES))[classes]
-    slopes, biases = fit_softmax(rows.measures, classes, equal, equal * len(classes) / equal.sum())
-    biases += np.log(class_shares(rows))
-    return RoadUserModel(
-        (*MEASURES, *BANDS), CLASSES, significant(slopes, _FIGURES), significant(biases, _FIGURES)
-    )
+    weights = equal * len(classes) / equal.sum()
+    slopes, biases = fit_softmax(rows.measures, classes, equal, weights, STRENGTH)
+    shares = class_shares(rows)
+    slopes, biases = slopes / TEMPERATURE, biases / TEMPERATURE + np.log(shares)
+    rounded = (significant(one, _FIGURES) for one in (slopes, biases, shares))
+    return RoadUserModel((*MEASURES, *BANDS), CLASSES, *rounded)
 
 
 def class_shares(rows: RoadUserRows) -> FloatArray:

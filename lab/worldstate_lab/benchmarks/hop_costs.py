@@ -139,7 +139,7 @@ def published_chain_times(sound: Float32Array) -> Milliseconds:
     return [elapsed_ms(one_hop) + shared_ms for _ in range(REPEATS)]
 
 
-_FOREIGN, _SIGNALS, _CENTRES = 8, 4, 5
+_FOREIGN, _SIGNALS = 9, 4
 _ROWS, _WINDOWS = 150, 40  # Few: the peers' cost does not depend on them either
 
 
@@ -224,7 +224,4 @@ def _guard(rng: np.random.Generator) -> DomainGuard:
         biases=np.zeros(classes),
         # Everything is looked at more closely, which costs most.
         threshold=-1e3,
-        kinds_of_signals=("signal 0",) * _CENTRES,
-        centres=rng.normal(size=(_CENTRES, inputs)),
-        whitening=np.eye(inputs),
     )

@@ -27,6 +27,7 @@ STUDIES = {
         "ablations",
         "realism",
         "reach",
+        "clips",
         "foreign",
         "kinds",
         "place",

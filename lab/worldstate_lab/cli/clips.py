@@ -1,0 +1,268 @@
+"""`worldstate-lab clips`: what guard and kinds of a model make of single clips of real sound.
+
+TABLE.csv has the columns file, kind, recording and road_user: files of one channel or more (the first is
+heard), at any rate from 8 kHz; clips of one recording belong together; road_user is the true class (car,
+van, truck, tram, motorcycle, bicycle) or empty. A clip shorter than the memory of the numbers is led in by
+its mirror image. With --numbers they are read from an archive (`character`, `clip`: the line of the table).
+
+Printed by kind: in which share of the hops the sound is familiar, foreign or a warning signal, and the mean
+probability of each class of road users; over clips with a road_user the log-loss beside that of the shares
+of the table, to which the probabilities are corrected. Every recording counts alike.
+
+With --simulated N so many clips of each kind are simulated, and how far their numbers are from the real ones
+is printed beside real against real (halves of the recordings): the median over the numbers of |AUROC - .5|,
+and the area of a boosted classifier that tells them apart.
+
+Examples
+--------
+  worldstate-lab clips clips.csv --numbers numbers.npz --simulated 20
+"""
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sklearn.ensemble import HistGradientBoostingClassifier
+
+from worldstate.abduction.road_users import DomainGuard, Familiar, Foreign, RoadUserModel
+from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.files.file_io import load_npz, read_rows
+from worldstate.adapters.files.model_file import read_model
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.progress import progress_bar
+from worldstate.commissioning.guard_training import IDLING, characters, rows_of_clip
+from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray, TextArray
+from worldstate.operations.metrics.approach_table import auroc
+
+LOWEST_RATE_HZ, MEMORY_S, MOST_SECONDS, MOST_BYTES = 8000.0, 2.1, 600.0, 1 << 30
+NUMBERS = len(MEASURES) + len(BANDS)
+SAID = 0.9
+# Which of the simulator's kinds a kind of clip is held against.
+SIMULATED = {
+    **{"car": ("light",), "tram": ("tram",), "engine_idling": tuple(f"idling {kind}" for kind in IDLING)},
+    **{"siren": ("siren", "wail", "sweeps", "turns"), "car_horn": ("horn", "horns"), "dog_bark": ("dog",)},
+    **{"children_playing": ("children",), "street_music": ("music", "tune", "drums"), "gun_shot": ("shots",)},
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClipNumbers:
+    """Hops of all clips."""
+
+    measures: FloatArray  # shape (n, 49): As `SoundCharacter` reads them
+    clip: IndexArray  # shape (n,): Row of the table
+    kinds: TextArray  # shape (clips,), as the others
+    recordings: TextArray
+    road_users: TextArray  # Empty where it is none
+
+    def by_recording(self, values: FloatArray, hops: BoolArray) -> FloatArray:
+        """Mean over recordings of the mean over their hops, shape of `values` less the first axis."""
+        names = self.recordings[self.clip]
+        means = [values[hops & (names == name)].mean(axis=0) for name in np.unique(names[hops])]
+        return np.asarray(np.mean(means, axis=0))
+
+
+def read_clips(
+    table: Path, numbers: Path | None, advance: Callable[[], object] = lambda: None
+) -> ClipNumbers:
+    """Read a table of clips and hear them, or read what was heard of them."""
+    needed = ("kind", "recording") if numbers is not None else ("file", "kind", "recording")
+    rows = [row for _, row in read_rows(table, needed, optional=("road_user",))]
+    said = {
+        name: np.array([row.get(name, "") for row in rows]) for name in ("kind", "recording", "road_user")
+    }
+    if numbers is not None:
+        measures, clip = _archived(numbers, len(rows))
+    else:
+        heard = []
+        for row in rows:
+            heard.append(_heard(table.parent / row["file"]))
+            advance()
+        measures, clip = np.concatenate(heard), np.repeat(np.arange(len(rows)), list(map(len, heard)))
+    return ClipNumbers(measures, clip, said["kind"], said["recording"], said["road_user"])
+
+
+def _archived(path: Path, clips: int) -> tuple[FloatArray, IndexArray]:
+    def read(arrays: dict[str, AnyArray]) -> tuple[FloatArray, IndexArray]:
+        measures, clip = (np.asarray(arrays[name]) for name in ("character", "clip"))
+        if measures.shape != (len(clip), NUMBERS) or not 0 <= clip.min() <= clip.max() < clips:
+            raise InvalidArgumentError(
+                f"expected {NUMBERS} numbers of clips of the table, got {measures.shape}"
+            )
+        return measures.astype(np.float64), clip.astype(np.intp)
+
+    return load_npz(path, "numbers of clips", MOST_BYTES, read)
+
+
+def _heard(path: Path) -> FloatArray:
+    with open_audio(path) as source:
+        rate = float(source.sample_rate_hz)
+        in_range(f"{path}: sample rate", rate, LOWEST_RATE_HZ, 400_000.0)
+        in_range(f"{path}: seconds", source.frames / rate, 0.1, MOST_SECONDS)
+        sound = np.concatenate([block[:, 0] for block in source.blocks()])
+    lead = round(MEMORY_S * rate) if len(sound) < MEMORY_S * rate else 0
+    return characters(np.pad(sound, (lead, 0), mode="symmetric"), rate)[0]
+
+
+def judged(clips: ClipNumbers, guard: DomainGuard, model: RoadUserModel) -> dict[str, Any]:
+    """Return what guard and kinds make of the clips, as the report has it."""
+    verdicts = [guard.judge(one) for one in clips.measures[:, : len(MEASURES)]]
+    familiar, foreign = (
+        np.array([isinstance(one, kind) for one in verdicts], float) for kind in (Familiar, Foreign)
+    )
+    shares = np.column_stack([familiar, foreign, 1.0 - familiar - foreign])
+    said, kinds = model.probabilities(clips.measures), {}
+    for kind in dict.fromkeys(clips.kinds.tolist()):
+        hops = (clips.kinds == kind)[clips.clip]
+        told, users = (clips.by_recording(values, hops).tolist() for values in (shares, said))
+        kinds[kind] = {
+            "recordings": len(np.unique(clips.recordings[clips.kinds == kind])),
+            **dict(zip(("familiar", "foreign", "signal"), told, strict=True)),
+            "road_users": dict(zip(model.classes, users, strict=True)),
+        }
+    return {"kinds": kinds, **_calibration(clips, model)}
+
+
+def _calibration(clips: ClipNumbers, model: RoadUserModel) -> dict[str, Any]:
+    known = clips.road_users != ""
+    if not known.any():
+        return {"kinds_log_loss": None, "kinds_log_loss_prior": None, "said_90": None}
+    strange = set(clips.road_users[known].tolist()) - set(model.classes)
+    if strange:
+        raise InvalidArgumentError(
+            f"road_user: expected one of {', '.join(model.classes)}, got {min(strange)!r}"
+        )
+    named = zip(clips.recordings[known].tolist(), clips.road_users[known].tolist(), strict=True)
+    recordings = dict(named)
+    counts = np.array([sum(user == name for user in recordings.values()) for name in model.classes])
+    prior = counts / counts.sum()
+    hops = known[clips.clip]
+    truth = np.array([model.classes.index(user) if user else 0 for user in clips.road_users.tolist()])[
+        clips.clip
+    ]
+    said = model.with_shares(prior).probabilities(clips.measures)
+    rows, tiny = np.arange(len(truth)), np.finfo(float).tiny
+    losses = -np.log(np.maximum(said[rows, truth], tiny))
+    sure, right = said.max(axis=1) >= SAID, said.argmax(axis=1) == truth
+    return {
+        "kinds_log_loss": float(clips.by_recording(losses, hops)),
+        "kinds_log_loss_prior": float(-(prior * np.log(np.where(prior > 0.0, prior, 1.0))).sum()),
+        "said_90": {
+            "share": float(clips.by_recording(sure.astype(float), hops)),
+            "right": float(clips.by_recording(right.astype(float), hops & sure))
+            if (hops & sure).any()
+            else None,
+        },
+    }
+
+
+def realism_rows(
+    clips: ClipNumbers, each: int, rng: np.random.Generator, advance: Callable[[], object] = lambda: None
+) -> dict[str, dict[str, float]]:
+    """Return by kind how far simulated numbers are from real ones, and real from real."""
+    found = {}
+    for kind, names in SIMULATED.items():
+        hops = (clips.kinds == kind)[clips.clip]
+        recordings = np.unique(clips.recordings[clips.kinds == kind])
+        if len(recordings) < 4:
+            continue
+        drawn = zip(range(each * len(names)), rng.spawn(each * len(names)), strict=True)
+        ours = [(rows_of_clip(6000.0, (names[i % len(names)], i, own)).measures, i) for i, own in drawn]
+        simulated = np.concatenate([rows for rows, _ in ours])
+        groups = np.concatenate([np.full(len(rows), i) for rows, i in ours])
+        real, origin = clips.measures[hops], np.searchsorted(recordings, clips.recordings[clips.clip[hops]])
+        half = rng.permutation(len(recordings))[origin] % 2 == 0
+        found[kind] = {
+            "simulated": _apart(simulated, real),
+            "simulated_c2st": _told_apart((simulated, groups), (real, origin), rng),
+            "real": _apart(real[half], real[~half]),
+            "real_c2st": _told_apart((real[half], origin[half]), (real[~half], origin[~half]), rng),
+        }
+        advance()
+    return found
+
+
+def _apart(one: FloatArray, other: FloatArray) -> float:
+    origin = np.repeat([False, True], [len(one), len(other)])
+    areas = [auroc(column, origin) or 0.5 for column in np.concatenate([one, other]).T]
+    return float(np.median(np.abs(np.array(areas) - 0.5)))
+
+
+def _told_apart(
+    one: tuple[FloatArray, IndexArray], other: tuple[FloatArray, IndexArray], rng: np.random.Generator
+) -> float:
+    """Area of a boosted classifier over folds by clip or recording."""
+    inputs, origin = np.concatenate([one[0], other[0]]), np.repeat([0, 1], [len(one[0]), len(other[0])])
+    fold, score = np.concatenate([one[1], other[1]]) % 4, np.zeros(len(origin))
+    for number in range(4):
+        test = fold == number
+        model = HistGradientBoostingClassifier(max_iter=100, random_state=int(rng.integers(2**31)))
+        score[test] = model.fit(inputs[~test], origin[~test]).predict_proba(inputs[test])[:, 1]
+    return auroc(score, origin) or 0.5
+
+
+def clip_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return what is printed for people."""
+    kinds = report["kinds"]
+    users = list(next(iter(kinds.values()))["road_users"])
+    lines = [f"{'kind':18}{'recordings':>11}{'familiar':>10}{'foreign':>9}{'signal':>8}  mean probability"]
+    lines.append(" " * 56 + "".join(f"  {name:10}" for name in users))
+    for kind, one in kinds.items():
+        told = f"{one['familiar']:10.2f}{one['foreign']:9.2f}{one['signal']:8.2f}"
+        shares = "".join(f"  {share:<10.2f}" for share in one["road_users"].values())
+        lines.append(f"{kind:18}{one['recordings']:11}{told}{shares}")
+    for kind, one in report.get("realism", {}).items():
+        apart = f"{one['simulated']:.3f} simulated to real, {one['real']:.3f} real to real"
+        told = f"classifier {one['simulated_c2st']:.2f}, {one['real_c2st']:.2f}"
+        lines.append(f"{kind:18} numbers apart: {apart}; {told}")
+    if report["kinds_log_loss"] is None:
+        return [*lines, "road users: the table names none"]
+    said = report["said_90"]
+    right = "-" if said["right"] is None else f"{said['right']:.2f}"
+    losses = (
+        f"log-loss {report['kinds_log_loss']:.3f}, of the table's shares {report['kinds_log_loss_prior']:.3f}"
+    )
+    return [
+        *lines,
+        f"road users: {losses}; said {SAID} or more in {said['share']:.2f} of the hops, right {right}",
+    ]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("table", type=Path, metavar="TABLE.csv", help="file, kind, recording, road_user")
+    add("--numbers", type=Path, metavar="NPZ", help="what was heard of the clips, in place of their files")
+    add("--model", type=Path, metavar="FILE", help="(default: the model that ships)")
+    add(
+        "--simulated",
+        type=int,
+        default=0,
+        metavar="N",
+        help="clips of each kind to hold against the real ones",
+    )
+    add("--seed", type=int, default=0, help="of simulated clips (default: %(default)s)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    in_range("--simulated", arguments.simulated, 0, 1000)
+    model = read_model(arguments.model)
+    if model.guard is None or model.road_users is None:
+        raise InvalidArgumentError("--model: expected a model with guard and road users, got one without")
+    with progress_bar(
+        "hearing", 0 if arguments.numbers else len(list(read_rows(arguments.table, ("kind",))))
+    ) as bar:
+        clips = read_clips(arguments.table, arguments.numbers, bar.advance)
+    report = judged(clips, model.guard, model.road_users)
+    if arguments.simulated:
+        with progress_bar("simulating", len(SIMULATED)) as bar:
+            rng = np.random.default_rng(arguments.seed)
+            report["realism"] = realism_rows(clips, arguments.simulated, rng, bar.advance)
+    return CommandResult(report, table={}, lines=clip_lines(report))
