@@ -135,7 +135,7 @@ def _heard_advisories(memory: Memory, rule_ends_ns: Sequence[int]) -> tuple[Side
     if sequence is not None and sequence.alarm is not None:
         ends_ns = sequence.alarm_ends_ns(memory.stamp_ns)
         decided_nats = sequence.decided_at(memory.stamp_ns)
-        threshold, pairs = sequence.alarm.threshold_nats, zip(ends_ns, decided_nats, strict=True)
+        threshold, pairs = sequence.threshold_nats, zip(ends_ns, decided_nats, strict=True)
         return tuple(
             None if end_ns is None else SideAdvisory(end_ns, decided < threshold) for end_ns, decided in pairs
         )
@@ -162,7 +162,7 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
     if not sequence.has_news(memory.stamp_ns):
         return "nothing was measured for a second"
     log_odds = list(sequence.log_odds(model.context).values())
-    learned, threshold = sequence.read_nats(model.context)[side], sequence.alarm.threshold_nats
+    learned, threshold = sequence.read_nats(model.context)[side], sequence.threshold_nats
     if log_odds[-1][side] < threshold <= log_odds[-1][side] + learned:
         return "only by the traffic learned here, which is left out of the alarm"
     if log_odds[-1][side] < log_odds[-1].max():
@@ -298,7 +298,7 @@ def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
     kept, instant = memory.sequence, memory.last.instant
     assert instant is not None
     if kept is not None and kept.alarm is not None:
-        after, threshold = kept.log_odds(model.context), kept.alarm.threshold_nats
+        after, threshold = kept.log_odds(model.context), kept.threshold_nats
         terms = np.diff(list(after.values()), axis=0, prepend=0.0).T.tolist()
         return [
             EvidenceTerms("coming", dict(zip(after, own, strict=True)), decides, threshold)

@@ -135,6 +135,7 @@ class WorldFilter:
             events=last.events,
             heard=heard,
             ego=None if memory.ego is None else ego_of(memory.ego),
+            budget=None if memory.sequence is None else memory.sequence.budget(memory.stamp_ns),
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":

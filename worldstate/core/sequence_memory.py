@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,10 +27,12 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.side_belief import TIE, SideBelief
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, nanoseconds, seconds
+from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, nanoseconds, seconds
 from worldstate.ground.serialisation import Probability
 from worldstate.measurement.measurement import Look, Measurement
-from worldstate.state import Context
+from worldstate.state import Budget, Context
+
+from .budget_watch import BET_S, BudgetWatch, WatchedHop, budget_of
 
 # As sure of the usual rate as two arrivals would make it: streets differ by a factor of three either way.
 _SHAPE = 2.0
@@ -103,6 +105,8 @@ _LOOK_NS = 500_000_000
 # A window and the smoothing of the alarm: so long the sound of either side is that of the vehicle that has
 # just come into view, and says nothing of the next one.
 _MASKED_NS = 1_300_000_000
+_BET_GROUPS = COMING_S.index(BET_S) + 1
+_MOSTLY_MISSED = 0.5  # A look that misses more watches nothing: one in view would be counted as none
 _IN_VIEW_S = 6.0  # Two passages: before, it is the sound that tells whether it is still there
 _OTHERS = 0.1  # Vehicles in view from no side that is listened to
 _TWO = 0.5  # P(both) from which on the vehicles of two sides are two
@@ -143,6 +147,7 @@ class SequenceMemory:
     # How often a vehicle has come into view past the edge of each side, while a camera looked.
     arrivals: tuple[ArrivalRate, ...] = (ArrivalRate(),) * len(SIDES)
     stamp_ns: int = 0
+    watch: BudgetWatch = field(default_factory=BudgetWatch)  # Over the alarm's budget, and over the chances
 
     def check(self, directions: int) -> None:
         """Refuse what a file cannot have been written with, for so many approach sides."""
@@ -158,6 +163,17 @@ class SequenceMemory:
         for name in ("decided", "over_ns", "emerged_ns", "masked_ns", "unseen", "arrivals"):
             if (got := len(getattr(self, name))) != len(SIDES):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected {len(SIDES)}, got {got}")
+        self.watch.check(len(SIDES))
+
+    @property
+    def threshold_nats(self) -> float:
+        """What the alarm is raised from: its own threshold, higher where its budget is broken."""
+        return math.inf if self.alarm is None else self.alarm.threshold_nats + self.watch.shift_nats
+
+    def budget(self, stamp_ns: int) -> Budget | None:
+        """Return how the watch over the alarm stands; None without one."""
+        alarm = self.alarm
+        return None if alarm is None else budget_of(self.watch, stamp_ns, alarm.onsets_per_hour)
 
     @cached_property
     def weighed(self) -> FloatArray:
@@ -315,8 +331,7 @@ class SequenceMemory:
 
     def not_held(self, sides: Collection[int]) -> "SequenceMemory":
         """Return the memory without the alarms of some sides that are only held."""
-        least = math.inf if self.alarm is None else self.alarm.threshold_nats
-        pairs = enumerate(zip(self.over_ns, self.decided, strict=True))
+        least, pairs = self.threshold_nats, enumerate(zip(self.over_ns, self.decided, strict=True))
         return replace(
             self, over_ns=tuple(None if k in sides and one < least else ns for k, (ns, one) in pairs)
         )
@@ -444,6 +459,14 @@ def _as_heard(alone: FloatArray, said: FloatArray, share: float) -> FloatArray:
     return np.asarray(heard / heard.sum(axis=1, keepdims=True))
 
 
+def _watched(kept: SequenceMemory, over: BoolArray) -> WatchedHop:
+    """Return what a hop says to the watch over the alarm; `over` its own threshold, by side."""
+    answers = [look.answer for look in kept.looks if not isinstance(look.answer, Unqueried)]
+    looked = any(one.miss_rate <= _MOSTLY_MISSED for one in answers)
+    within = kept.coming[:, :_BET_GROUPS].sum(axis=1).tolist()
+    return WatchedHop(kept.stamp_ns, looked, tuple(over.tolist()), kept.emerged_ns, tuple(within))
+
+
 def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     """Return the memory with what decides held against the alarm's threshold.
 
@@ -459,14 +482,22 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
         [one[1 + k] for one in of_hop if ns is None or one[0] >= ns] for k, ns in enumerate(kept.emerged_ns)
     ]
     decided, over_ns, alarm = np.array([float(np.mean(row)) for row in rows]), kept.over_ns, kept.alarm
+    watch = kept.watch
     if alarm is not None:
-        decided = alarm.deciding(decided, kept.posterior.groups[0], np.array(kept.read_nats(context)))
-        over, denied = decided >= alarm.threshold_nats, np.array(kept.sides.risks) < LEAST_RISK
+        given = decided, kept.posterior.groups[0], np.array(kept.read_nats(context))
+        decided, denied = alarm.deciding(*given), np.array(kept.sides.risks) < LEAST_RISK
+        hop = _watched(kept, (decided >= alarm.threshold_nats) & ~denied)
+        watch = watch.after(hop, alarm.onsets_per_hour)
+        threshold = alarm.threshold_nats + watch.shift_nats
+        if watch.onsets.broken:
+            decided = replace(alarm, threshold_nats=threshold).deciding(*given)
+        over = decided >= threshold
+        watch = watch.raised(over & ~denied)
         # A risk that denies an alarm ends it: it is not held, and time alone does not bring it back.
         sides = zip(over, denied, over_ns, strict=True)
         over_ns = tuple(None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides)
         decided = np.where(over & denied, _UNDECIDED, decided)
-    after = replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns)
+    after = replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns, watch=watch)
     # The belief is the same: what was derived of it, half of the time of a step, is not derived again.
     vars(after).update(vars(kept) | vars(after))
     return after

@@ -4,6 +4,7 @@ from .context import Priors as Priors
 from .context import Rates as Rates
 from .context import blind_corner as blind_corner
 from .cue import Advisory as Advisory
+from .cue import Budget as Budget
 from .cue import EvidenceTerms as EvidenceTerms
 from .cue import Held as Held
 from .cue import RiskCue as RiskCue

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeAlias
 
-from worldstate.ground.serialisation import Layout, Probability
+from worldstate.ground.serialisation import Count, Layout, Probability
 
 from .context import Priors
 from .entity import AzimuthSource
@@ -88,6 +88,55 @@ class EvidenceTerms:
     terms_nats: Mapping[str, float]
     compared_nats: float
     threshold_nats: float
+
+
+Verdict: TypeAlias = Literal["kept", "in doubt", "broken", "unwatched"]
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    r"""Whether a sequence's alarm keeps to its budget, and its chances are true, by what a camera sees later.
+
+    Where the budget is broken the threshold is raised by as many halvings of the onsets as restore it, two at
+    most; it comes back with the evidence. What is counted is always of the model's own threshold.
+
+    Parameters
+    ----------
+    verdict : {"kept", "in doubt", "broken", "unwatched"}
+        In doubt from a tenth of what breaks it on; unwatched where no camera looks now.
+    why : str or None
+        What is broken, or that nothing watches; None otherwise.
+    evidence_nats : mapping of str to float
+        Log e-values against "no more onsets an hour than the budget" (``"onsets"``), and against "what comes
+        within two seconds is as frequent as stated" (``"within"``). Above zero they speak against it.
+    onsets_per_hour : float
+        The budget, of time in which no vehicle comes into view.
+    threshold_shift_nats : float
+        How much the threshold is raised.
+    quiet_s : float
+        Time watched in which none came within eight seconds before or after, s.
+    false_onsets : int
+        Alarms that began in that time.
+    arrivals, warned, lost : int
+        Vehicles that came into view; those of them warned of in the eight seconds before; those of these that
+        were not, because the threshold was raised.
+
+    Examples
+    --------
+    >>> Budget("kept", None, {"onsets": -2.0, "within": -0.5}, 25.0).threshold_shift_nats
+    0.0
+    """
+
+    verdict: Verdict
+    why: str | None
+    evidence_nats: Mapping[str, float]
+    onsets_per_hour: float
+    threshold_shift_nats: float = 0.0
+    quiet_s: float = 0.0
+    false_onsets: Count = 0
+    arrivals: Count = 0
+    warned: Count = 0
+    lost: Count = 0
 
 
 @dataclass(frozen=True, slots=True)

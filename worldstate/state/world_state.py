@@ -12,7 +12,7 @@ from worldstate.ground.serialisation import Layout, decode, decode_json, encode
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
-from .cue import RiskCue
+from .cue import Budget, RiskCue
 from .entity import EGO, Entity, Event, Relation
 from .sensor import Delivery, Ego, Hearing, SearchedView, SensorHealth
 
@@ -66,8 +66,9 @@ class WorldState:
         as they are seen from there.
     heard : tuple of Hearing, or None
         How well each sensor that listens could hear; None where none does.
-    budget : str or None
-        Whether the budget of alarms still holds; None, since nothing watches it yet.
+    budget : Budget or None
+        Whether the budget of alarms still holds, by what a camera sees later; None without the alarm of a
+        sequence model, which has one.
     events : tuple of Event
         What became of entities with the last measurement, at most 64.
 
@@ -99,7 +100,7 @@ class WorldState:
     events: tuple[Event, ...] = ()
     ego: Ego | None = None
     heard: tuple[Hearing, ...] | None = None
-    budget: str | None = None
+    budget: Budget | None = None
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.
