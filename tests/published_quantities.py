@@ -8,7 +8,7 @@ from typing import Any, get_args, get_type_hints
 from worldstate import WorldState
 
 # Names of what a reader may assume; no filter sets another value.
-CONSTANT = {"WorldState.frame_id", "WorldState.clock", "WorldState.budget"}
+CONSTANT = {"WorldState.frame_id", "WorldState.clock"}
 
 
 def published(kind: Any = WorldState) -> dict[type, list[str]]:

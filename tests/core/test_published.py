@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from published_quantities import quantities
+from watched_street import START_NS as WATCHED_NS
+from watched_street import arrival, false_alarms
 
 from worldstate import (
     Bearing,
@@ -121,7 +123,7 @@ def odd_deliveries(last: Measurement) -> Iterator[Measurement | PositionScan]:
 
 
 def states() -> Iterator[WorldState]:
-    """Yield the snapshots of two streets, the second with a sequence, a budget and other corners."""
+    """Yield the snapshots of streets, with a sequence, a budget, other corners, and one that is watched."""
     rng = np.random.default_rng(0)
     there = Context(
         rates=Rates(*rng.uniform(0.01, 0.1, 6).tolist()),
@@ -150,6 +152,11 @@ def states() -> Iterator[WorldState]:
             world = world.update(one)
             yield world.state
         yield world.predict(2.0).state
+    # A camera watches the budget, finds it broken, and one that comes is no longer warned of.
+    world = WorldFilter(start_ns=WATCHED_NS)
+    for one in (*false_alarms(), *arrival(500, level=2.0)):
+        world = world.update(one)
+        yield world.state
 
 
 def told(value: Any, values: dict[str, set[str]]) -> None:

@@ -15,11 +15,10 @@ Sources: Shafer, "Testing by betting", J. R. Statist. Soc. A 184, 2021; Shin, Ra
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from worldstate.ground import InvalidArgumentError, nanoseconds, seconds
-from worldstate.ground.serialisation import Count
-from worldstate.state.cue import Budget, Verdict
+from worldstate.state.cue import Budget, Tally, Verdict
 
 # Whatever is advised of comes into view within the risk's own horizon, or was not there. So long after one
 # came, sound is that of a vehicle that has been seen: no onset of a street without hazards.
@@ -37,7 +36,7 @@ IN_DOUBT = 0.1 * BROKEN
 CLUSTER = 2.0
 RATES = (1.5, 3.0, 9.0)  # Alternatives, in budgets
 # A chance is held where the share that comes has log-odds within so much of its own; bets are at twice it.
-# Streets differ by a factor of three either way, 1.1 nats, of which what is learned of their traffic takes .5.
+# Streets differ by a factor of three either way, 1.1 nats; what is learned of their traffic takes .5.
 TOLERANCE_NATS = 0.7
 _LEAST_CHANCE = 1e-9
 # Of the threshold, for half of the onsets: of ten streams (seed 1) 82 an hour from -2.5 nats on, 2 from .5.
@@ -119,17 +118,6 @@ class WatchedHop:
     within: tuple[float, ...]  # Chance that one does within two seconds
 
 
-@dataclass(frozen=True, slots=True)
-class Tally:
-    """What was counted while a camera watched."""
-
-    quiet_ns: Count = 0  # Time in which none came or had come
-    false_onsets: Count = 0  # In that time, at the model's own threshold
-    arrivals: Count = 0
-    warned: Count = 0  # Of these, at the model's own threshold
-    lost: Count = 0  # Of those warned of, not at the threshold in force
-
-
 _NEVER: tuple[int | None, ...] = (None, None)
 _NO_ONSETS, _NO_CHANCES = Evidence((1.0,) * len(RATES)), Evidence((1.0, 1.0))
 _MOST = len(RATES) * BROKEN * (1.0 + 1e-9)  # All of the mean in one of them
@@ -139,7 +127,7 @@ _MOST = len(RATES) * BROKEN * (1.0 + 1e-9)  # All of the mean in one of them
 class BudgetWatch:
     """The watch over an alarm: always of the model's own threshold, wherever the one in force stands."""
 
-    tally: Tally = Tally()
+    tally: Tally = field(default_factory=Tally)
     onsets: Evidence = _NO_ONSETS
     within: Evidence = _NO_CHANCES
     stamp_ns: int = 0
@@ -257,18 +245,9 @@ def _latest(before_ns: Sequence[int | None], over: Iterable[bool], now_ns: int) 
 
 def budget_of(watch: BudgetWatch, stamp_ns: int, onsets_per_hour: float) -> Budget:
     """Return how the watch over a budget stands at a time."""
-    tally, tests = watch.tally, {"onsets": watch.onsets, "within": watch.within}
-    return Budget(
-        *_verdict(watch, stamp_ns),
-        evidence_nats={name: one.nats for name, one in tests.items()},
-        onsets_per_hour=onsets_per_hour,
-        threshold_shift_nats=watch.shift_nats,
-        quiet_s=seconds(tally.quiet_ns),
-        false_onsets=tally.false_onsets,
-        arrivals=tally.arrivals,
-        warned=tally.warned,
-        lost=tally.lost,
-    )
+    evidence_nats = {"onsets": watch.onsets.nats, "within": watch.within.nats}
+    verdict, why = _verdict(watch, stamp_ns)
+    return Budget(verdict, why, evidence_nats, onsets_per_hour, watch.shift_nats, watch.tally)
 
 
 def _verdict(watch: BudgetWatch, stamp_ns: int) -> tuple[Verdict, str | None]:

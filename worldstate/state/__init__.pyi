@@ -8,6 +8,7 @@ from .cue import Budget as Budget
 from .cue import EvidenceTerms as EvidenceTerms
 from .cue import Held as Held
 from .cue import RiskCue as RiskCue
+from .cue import Tally as Tally
 from .entity import Classification as Classification
 from .entity import Entity as Entity
 from .entity import Event as Event

@@ -90,6 +90,36 @@ class EvidenceTerms:
     threshold_nats: float
 
 
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What was counted of an alarm while a camera watched, at the model's own threshold.
+
+    Parameters
+    ----------
+    quiet_ns : int
+        Time in which no vehicle came into view within eight seconds before or after, ns.
+    false_onsets : int
+        Alarms that began in that time.
+    arrivals : int
+        Vehicles that came into view.
+    warned : int
+        Those of them for whose side the alarm stood in the eight seconds before.
+    lost : int
+        Those of these that the raised threshold did not warn of.
+
+    Examples
+    --------
+    >>> Tally().lost
+    0
+    """
+
+    quiet_ns: Count = 0
+    false_onsets: Count = 0
+    arrivals: Count = 0
+    warned: Count = 0
+    lost: Count = 0
+
+
 Verdict: TypeAlias = Literal["kept", "in doubt", "broken", "unwatched"]
 
 
@@ -98,7 +128,7 @@ class Budget:
     r"""Whether a sequence's alarm keeps to its budget, and its chances are true, by what a camera sees later.
 
     Where the budget is broken the threshold is raised by as many halvings of the onsets as restore it, two at
-    most; it comes back with the evidence. What is counted is always of the model's own threshold.
+    most; it comes back with the evidence, which is always of the model's own threshold.
 
     Parameters
     ----------
@@ -113,30 +143,21 @@ class Budget:
         The budget, of time in which no vehicle comes into view.
     threshold_shift_nats : float
         How much the threshold is raised.
-    quiet_s : float
-        Time watched in which none came within eight seconds before or after, s.
-    false_onsets : int
-        Alarms that began in that time.
-    arrivals, warned, lost : int
-        Vehicles that came into view; those of them warned of in the eight seconds before; those of these that
-        were not, because the threshold was raised.
+    tally : Tally
+        What was counted since the filter began.
 
     Examples
     --------
-    >>> Budget("kept", None, {"onsets": -2.0, "within": -0.5}, 25.0).threshold_shift_nats
-    0.0
+    >>> Budget("kept", None, {"onsets": -2.0, "within": -0.5}, 25.0, 0.0, Tally()).verdict
+    'kept'
     """
 
     verdict: Verdict
     why: str | None
     evidence_nats: Mapping[str, float]
     onsets_per_hour: float
-    threshold_shift_nats: float = 0.0
-    quiet_s: float = 0.0
-    false_onsets: Count = 0
-    arrivals: Count = 0
-    warned: Count = 0
-    lost: Count = 0
+    threshold_shift_nats: float
+    tally: Tally
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,207 @@
+"""The watch over the budget: false alarms of its tests by simulation, and its laws in the filter."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from watched_street import START_NS, arrival, false_alarms
+
+from worldstate import Measurement, WorldFilter
+from worldstate.core.budget_watch import (
+    BROKEN,
+    CLUSTER,
+    HALVING_NATS,
+    RATES,
+    TOLERANCE_NATS,
+    BudgetWatch,
+    Evidence,
+    WatchedHop,
+    chance_factors,
+    onset_factors,
+)
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.state import Budget
+
+CHANCES = st.floats(1e-6, 1.0 - 1e-6)
+HOP_NS = 10**8
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.1, 200.0), st.floats(0.0, 60.0), st.integers(1, int(CLUSTER)))
+def test_false_onsets_bring_no_evidence_in_the_mean_up_to_the_budget(
+    share: float, budget: float, step_s: float, cluster: int
+) -> None:
+    """Clusters that come at random, of a rate of onsets up to the budget: log E e in closed form."""
+    clusters = share * budget * step_s / 3600.0 / cluster
+    nothing, one = onset_factors(0, step_s, budget), onset_factors(cluster, step_s, budget)
+    for none, some in zip(nothing, one, strict=True):
+        assert math.log(none) + clusters * (some / none - 1.0) <= 1e-12
+
+
+@given(st.tuples(CHANCES, CHANCES), st.tuples(*[st.floats(-TOLERANCE_NATS, TOLERANCE_NATS)] * 2))
+def test_chances_bring_no_evidence_in_the_mean_within_the_tolerance(
+    stated: tuple[float, float], off_nats: tuple[float, float]
+) -> None:
+    odds = [p / (1.0 - p) * math.exp(nats) for p, nats in zip(stated, off_nats, strict=True)]
+    true = [one / (1.0 + one) for one in odds]
+    mean = np.zeros(2)
+    for left in (False, True):
+        for right in (False, True):  # Each side by itself: their mean needs no more
+            weight = np.prod([t if y else 1.0 - t for t, y in zip(true, (left, right), strict=True)])
+            mean += weight * np.array(chance_factors(stated, (left, right)))
+    assert (mean <= 1.0 + 1e-9).all()
+
+
+@pytest.mark.parametrize("cluster", [1, 2])
+def test_at_the_budget_it_is_broken_falsely_in_at_most_one_of_forty_days(cluster: int) -> None:
+    rng, step_s, budget, broken, days = np.random.default_rng(3), 60.0, 25.0, 0, 200
+    for _ in range(days):
+        found = Evidence((1.0,) * len(RATES))
+        counts = cluster * rng.poisson(budget / 60.0 / cluster, 24 * 60)
+        for n in counts.tolist():
+            found = found.after(onset_factors(n, step_s, budget), step_s)
+            if found.broken:
+                broken += 1
+                break
+    assert broken <= 0.025 * days
+
+
+@pytest.mark.parametrize(("times", "within_h"), [(2.0, 2.0), (10.0, 0.25)])
+def test_what_exceeds_the_budget_is_found_and_what_has_ended_is_forgotten(
+    times: float, within_h: float
+) -> None:
+    """After six hours at three fifths of the budget, which must not count against what comes then."""
+    rng, step_s, budget, found_h, back_h = np.random.default_rng(5), 6.0, 25.0, list[float](), list[float]()
+
+    def hours_until(evidence: Evidence, rate: float, broken: bool) -> tuple[Evidence, float]:
+        for step in range(1, 20_000):
+            n = int(rng.poisson(rate * step_s / 3600.0))
+            evidence = evidence.after(onset_factors(n, step_s, budget), step_s)
+            if evidence.broken == broken:
+                return evidence, step * step_s / 3600.0
+        raise AssertionError("never")
+
+    for _ in range(20):
+        evidence = Evidence((1.0,) * len(RATES))
+        for n in rng.poisson(0.6 * budget * 0.1, 60).tolist():
+            evidence = evidence.after(onset_factors(n, 360.0, budget), 360.0)
+        evidence, late_h = hours_until(evidence, times * budget, True)
+        found_h.append(late_h)
+        back_h.append(hours_until(evidence, 0.6 * budget, False)[1])
+    assert np.median(found_h) < (within_h if times > 2.0 else 1.5 * within_h)
+    assert np.median(back_h) < 2.0
+
+
+def hop(number: int, over: bool = False, came: int | None = None, looked: bool = True) -> WatchedHop:
+    emerged_ns = (None if came is None else came * HOP_NS, None)
+    return WatchedHop(number * HOP_NS, looked, (over, False), emerged_ns, (0.01, 0.01))
+
+
+def test_an_onset_is_false_where_nothing_comes_within_eight_seconds_before_or_after() -> None:
+    def told(onsets: set[int], came: int | None, blind: set[int]) -> tuple[int, float]:
+        watch = BudgetWatch()
+        for number in range(401):
+            seen = came if came is not None and number >= came else None
+            watch = watch.after(hop(number, number in onsets, seen, number not in blind), 25.0)
+        return watch.tally.false_onsets, watch.tally.quiet_ns / 1e9
+
+    assert told({100, 105, 300}, None, set()) == (2, pytest.approx(24.0))  # One alarm is held for a second
+    assert told({50}, None, set())[0] == 0  # Eight seconds before it are not known
+    assert told({100, 240, 300}, 175, set()) == (1, pytest.approx(7.9))  # 8 to 9.4 s and 25.5 to 32 s
+    assert told({100}, 175, set())[0] == 0
+    assert told({100}, None, {150}) == (0, pytest.approx(8.9))
+    assert told({100}, None, set(range(401))) == (0, 0.0)
+
+
+def test_a_raised_threshold_tells_of_whom_it_no_longer_warned() -> None:
+    """The alarm of its own threshold stands before each of ten, the one in force before every other one."""
+    watch = replace(BudgetWatch(), onsets=Evidence((BROKEN,) * len(RATES), broken=True))
+    for number in range(1000):
+        watch = watch.after(hop(number, number % 100 == 40, number // 100 * 100 or None), 1e4)
+        watch = watch.raised((number % 200 == 40, False))
+    assert (watch.tally.arrivals, watch.tally.warned, watch.tally.lost) == (9, 9, 4)
+    assert 0.0 < watch.shift_nats <= 2.0 * HALVING_NATS
+    assert BudgetWatch().shift_nats == 0.0
+
+
+def budgets(measured: Iterator[Measurement] | list[Measurement]) -> list[Budget]:
+    world, told = WorldFilter(start_ns=START_NS), []
+    for one in measured:
+        world = world.update(one)
+        told.append(world.state.budget)
+    return told
+
+
+def test_false_alarms_break_the_budget_and_raise_the_threshold_that_decides() -> None:
+    world, told = WorldFilter(start_ns=START_NS), []
+    for one in false_alarms():
+        world = world.update(one)
+        told.append(world.state)
+    last = told[-1]
+    verdicts = [state.budget.verdict for state in told]
+    assert sorted(set(verdicts), key=verdicts.index) == ["kept", "in doubt", "broken"]
+    assert last.budget.why == "more false onsets than the budget"
+    assert last.budget.tally.false_onsets > 4 and 0.0 < last.budget.threshold_shift_nats <= 2 * HALVING_NATS
+    for state in told:
+        assert state.budget.onsets_per_hour == 4.0
+        for cue in state.cues:
+            assert cue.evidence.threshold_nats == state.budget.threshold_shift_nats
+    after = world.predict(3.0).state.budget
+    assert after.verdict == "unwatched" and after.threshold_shift_nats == last.budget.threshold_shift_nats
+
+
+def test_without_a_camera_nothing_watches_and_nothing_moves() -> None:
+    told = budgets(false_alarms(camera=None, hops=200))
+    assert {one.verdict for one in told} == {"unwatched"}
+    assert {one.why for one in told} == {"no camera looks where vehicles come into view"}
+    assert told[-1] == told[0]
+    assert WorldFilter().state.budget is None
+
+
+def test_the_mirrored_street_and_renamed_sensors_have_the_same_budget() -> None:
+    here = budgets(false_alarms(hops=300))
+    assert here[-1].tally.false_onsets > 2
+    assert budgets(false_alarms(mirrored=True, hops=300)) == here
+    assert budgets([replace(one, source="ear") for one in false_alarms("another", hops=300)]) == here
+
+
+def test_a_checkpoint_and_what_comes_late_leave_the_budget_as_it_is() -> None:
+    measured = list(false_alarms(hops=400))
+    here = budgets(measured)
+    world = WorldFilter(start_ns=START_NS)
+    for number, one in enumerate(measured):
+        if number % 233 == 100:
+            world = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict())))
+        world = world.update(one)
+    assert world.state.budget == here[-1]
+    late = measured.copy()
+    for at in range(20, len(late) - 1, 31):
+        late[at : at + 7] = late[at + 1 : at + 7] + late[at : at + 1]
+    assert budgets(late)[-1] == here[-1]
+
+
+def test_one_that_comes_into_view_is_counted_with_its_warning() -> None:
+    """It is heard for two seconds on the left and drives into the view there; weakly, after false alarms."""
+    tally = budgets(list(arrival(1)))[-1].tally
+    assert (tally.arrivals, tally.warned, tally.lost, tally.false_onsets) == (1, 1, 0, 0)
+    *_, last = budgets([*false_alarms(), *arrival(500, level=2.0)])
+    assert (last.tally.arrivals, last.tally.warned, last.tally.lost) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    "watch",
+    [
+        replace(BudgetWatch(), over_ns=(None,)),
+        replace(BudgetWatch(), bet=(0, (0.1,))),
+        replace(BudgetWatch(), within=Evidence((1.0,))),
+        replace(BudgetWatch(), onsets=Evidence((0.0,) * len(RATES))),
+        replace(BudgetWatch(), onsets=Evidence((1e9,) * len(RATES))),
+    ],
+)
+def test_a_file_that_no_watch_was_written_to_is_refused(watch: BudgetWatch) -> None:
+    with pytest.raises(InvalidArgumentError, match=r"memory\.sequence\.watch"):
+        watch.check(2)

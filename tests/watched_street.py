@@ -1,0 +1,54 @@
+"""A street that a camera watches: false alarms, and a vehicle that is heard and comes into view."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from worldstate import Measurement, Sighting
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.ground.values import NotUsable
+from worldstate.measurement import Look
+
+SIDES, SILENT, HOP_NS, START_NS = ("left", "right"), NotUsable("not scripted"), 10**8, 3600 * 10**9
+NOTHING = SignatureEvidence(SIDES, (-1.0, -1.0), -1.0, 1.0)
+SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
+ALARM = SequenceAlarm(0.0, 4.0)  # Four onsets an hour
+
+
+def heard(number: int, loud: str | None, answer: CoEvidence, level: float = 20.0) -> Measurement:
+    """Return a hop in which a vehicle comes from a side, so much likelier than none."""
+    groups = np.full((2, len(GROUPS)), 1e-3)
+    groups[:, -1] = 1.0
+    if loud is not None:
+        side = SIDES.index(loud)
+        groups[side, GROUPS.index("coming_2s")] += level
+        groups[1 - side, GROUPS.index("other")] += level
+    said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, ALARM)
+    stamp_ns = START_NS + number * HOP_NS
+    look = Look("camera", stamp_ns, answer)
+    return Measurement(stamp_ns, NOTHING, answer, SILENT, SILENT, look=look, sequence=said)
+
+
+def false_alarms(
+    camera: str | None = "camera", mirrored: bool = False, hops: int = 500
+) -> Iterator[Measurement]:
+    """Yield a false alarm of .4 s every four seconds, on either side in turn."""
+    answer = Unqueried("no camera") if camera is None else Absent(0.04, 0.01)
+    for number in range(1, hops):
+        side = SIDES[(number // 40 + mirrored) % 2] if number % 40 < 4 else None
+        one = heard(number, side, answer)
+        yield one if camera is None else replace(one, look=Look(camera, one.stamp_ns, answer))
+
+
+def arrival(first: int, level: float = 20.0) -> Iterator[Measurement]:
+    """Yield a vehicle that is heard on the left for two seconds and drives into the view there."""
+    for number in range(100):
+        seen = 80 <= number < 92
+        answer = (Present if seen else Absent)(0.04, 0.01)
+        one = heard(first + number, "left" if 60 <= number < 80 else None, answer, level)
+        boxes = (Sighting(0.53 - 0.04 * (number - 80), 0.02, "car", 0.9),) if seen else ()
+        yield replace(one, sightings=boxes)
