@@ -91,6 +91,9 @@ def test_what_exceeds_the_budget_is_found_and_what_has_ended_is_forgotten(
             evidence = evidence.after(onset_factors(n, 360.0, budget), 360.0)
         evidence, late_h = hours_until(evidence, times * budget, True)
         found_h.append(late_h)
+        for n in rng.poisson(times * budget * 0.1, 60).tolist():  # Six hours more make the way back no longer
+            evidence = evidence.after(onset_factors(n, 360.0, budget), 360.0)
+        evidence = replace(evidence, broken=True)
         back_h.append(hours_until(evidence, 0.6 * budget, False)[1])
     assert np.median(found_h) < (within_h if times > 2.0 else 1.5 * within_h)
     assert np.median(back_h) < 2.0

@@ -34,7 +34,7 @@ IN_DOUBT = 0.1 * BROKEN
 # Onsets come in clusters of up to so many; the root of a Poisson ratio of that order still has a mean of at
 # most one for clusters that come at random.
 CLUSTER = 2.0
-RATES = (1.5, 3.0, 9.0)  # Alternatives, in budgets
+RATES = (2.0, 10.0)  # Alternatives, in budgets: what is to be found within two hours, and within minutes
 # A chance is held where the share that comes has log-odds within so much of its own; bets are at twice it.
 # Streets differ by a factor of three either way, 1.1 nats; what is learned of their traffic takes .5.
 TOLERANCE_NATS = 0.7
