@@ -189,7 +189,7 @@ def snapshot_schema() -> dict[str, Any]:
     --------
     >>> schema = snapshot_schema()
     >>> sorted(schema["$defs"])[:3], schema["properties"]["stamp_ns"]["type"]
-    (['Advisory', 'Bearing', 'Classification'], 'integer')
+    (['Advisory', 'Bearing', 'Budget'], 'integer')
     """
     shipped = files("worldstate") / "data" / "snapshot.schema.json"
     schema: dict[str, Any] = json.loads(shipped.read_text(encoding="utf-8"))
