@@ -24,15 +24,7 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import HIDDEN_BIAS_STD, SiteGeometry
 from worldstate.belief.track import Track, Tracks, acceleration_psd, hidden_shares
 from worldstate.ground import seconds
-from worldstate.state import (
-    Classification,
-    Context,
-    Entity,
-    Hearing,
-    SearchedView,
-    SensorHealth,
-    Visibility,
-)
+from worldstate.state import Classification, Context, Entity, Hearing, SearchedView, SensorHealth, Visibility
 from worldstate.state.entity import AzimuthSource, SideShare
 from worldstate.state.sensor import Ego
 
