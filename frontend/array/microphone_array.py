@@ -136,6 +136,11 @@ class MicrophoneArray:
         return np.asarray(np.ptp(self.positions_m, axis=0))
 
     @property
+    def widest_m(self) -> float:
+        """Largest distance between two microphones, metres."""
+        return float(np.linalg.norm(self.positions_m[:, None] - self.positions_m, axis=-1).max())
+
+    @property
     def horizontal_moment_m2(self) -> float:
         """S_xx of eq. (4): sum of (p_m - mean p)^2 over the coordinates p = y, square metres."""
         return float(np.sum(self.centred_m[:, 1] ** 2))

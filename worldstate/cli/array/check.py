@@ -2,7 +2,11 @@
 
 Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
 or clipped ones, offsets, levels, gusts, cards that are late or have a clock of their own, missing or repeated
-samples, the sample rate. Channels are counted from 1.
+samples, the sample rate. Channels are counted from 1. It also compares the sound with the positions: channels
+exchanged or in another order, an array of another size.
+
+No sound tells whether an array is mirrored or turned: --heard-from DEG says where one sound came from, in
+degrees, left positive.
 
 Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
 and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
@@ -11,19 +15,29 @@ ten for small ones; levels and gusts take six seconds, drifts twenty.
 Examples
 --------
   worldstate array check some.wav --array mics.xml
+  worldstate array check clapping.wav --array mics.xml --heard-from 40
   worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json
 """
 
 import argparse
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate import frontend
 from worldstate.cli.common import inputs, output, progress
+from worldstate.ground import InvalidArgumentError, in_range
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
     from worldstate.operations.recordings.channel_report import RecordingHealth
+
+# Least extent in shortest waves; what metres are divided by where they are taken for another unit; extents of
+# arrays that are built, metres.
+_LEAST_WAVE = 0.1
+_UNITS = {"inches": 39.37, "millimetres": 1000.0}
+_USUAL_M = (0.03, 1.5)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -34,18 +48,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--duration", type=float, metavar="S", help="its length by another clock, seconds")
     add("--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)")
+    add("--heard-from", type=float, metavar="DEG", help="azimuth of the only source, left positive")
     add("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from dataclasses import replace
-
     from worldstate.operations.recordings import channel_report
 
     output.check_outputs(arguments, figures=("figure",))
+    if arguments.heard_from is not None:
+        in_range("--heard-from", arguments.heard_from, -360.0, 360.0)
     with inputs.opened_front_end(arguments) as (audio, front_end):
-        array, health = front_end.array, examine(audio, front_end)
+        array = front_end.array
+        check_extent(array, front_end.settings.srp_band_hz[1])
+        health = examine(audio, front_end, arguments.heard_from)
         if arguments.duration is not None:
             rate = channel_report.rate_from_duration(
                 audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
@@ -58,14 +75,33 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     return output.CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
 
 
-def examine(audio: "Audio", front_end: "frontend.FrontEnd") -> "RecordingHealth":
+def check_extent(array: "frontend.MicrophoneArray", highest_hz: float) -> None:
+    """Refuse an array that the shortest waves hardly notice, and name the unit that its numbers had."""
+    from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
+
+    extent_m, least_m = array.widest_m, _LEAST_WAVE * SPEED_OF_SOUND_M_S / highest_hz
+    if extent_m < least_m:
+        units = [unit for unit, factor in _UNITS.items() if _USUAL_M[0] < factor * extent_m < _USUAL_M[1]]
+        expected = f"at least {least_m:.2g} m across, a tenth of the shortest wave ({highest_hz:g} Hz)"
+        cause = f"metres divided once more, as if they were {' or '.join(units or _UNITS)}?"
+        raise InvalidArgumentError(f"--array: expected {expected}, got {extent_m:.2g} m: {cause}")
+
+
+def examine(
+    audio: "Audio", front_end: "frontend.FrontEnd", heard_from_deg: float | None = None
+) -> "RecordingHealth":
     """Listen to an open recording to its end."""
+    from worldstate.frontend.health.position_check import PositionCheck
     from worldstate.operations.recordings.channel_report import HealthLog
 
-    log = HealthLog()
+    log, check = HealthLog(), PositionCheck(front_end.array, audio.sample_rate_hz)
     with progress.sound_bar(audio) as bar:
         for block in audio.blocks(audio.sample_rate_hz):
+            check.push(block)
             for frame in front_end.process(block):
                 log.add(frame)
             bar.advance()
-    return log.summary()
+    health = log.summary()
+    heard_from_rad = None if heard_from_deg is None else math.radians(heard_from_deg)
+    usable = health.hears_waves(front_end.array.n_microphones)
+    return replace(health, positions=check.verdict(usable, heard_from_rad))

@@ -12,9 +12,11 @@ import numpy as np
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Dropout, Fault
+from worldstate.frontend.health.position_check import NOTHING_AGAINST, PositionVerdict
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import Via, encode
+from worldstate.ground.typing import BoolArray
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.operations import figure_style as style
 
@@ -32,6 +34,7 @@ _EXPLAINS = {
 # Each of them misplaces the others' waves, too: what was seen in most hops is the cause, and what is left
 # shows when that is mended.
 _MISPLACED = frozenset({Fault.SWAPPED, Fault.DELAY, Fault.DRIFT})
+_DEAF = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED})
 # Dropouts beyond these are counted, not listed.
 _LISTED_DROPOUTS = 100
 _COLOURS = {
@@ -133,12 +136,18 @@ class RecordingHealth:
     n_hops: int  # Hops processed
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
     sample_rate: RateEstimate | None = None  # By another clock
+    positions: PositionVerdict = NOTHING_AGAINST
 
     @property
     def is_healthy(self) -> bool:
         """Whether nothing was wrong."""
         rate_is_wrong = self.sample_rate is not None and self.sample_rate.is_wrong
-        return not (self.verdicts or self.n_dropouts or rate_is_wrong)
+        return self.positions.fits and not (self.verdicts or self.n_dropouts or rate_is_wrong)
+
+    def hears_waves(self, n_channels: int) -> BoolArray:
+        """Channels whose sound is that of the others, wherever they stand, (M,)."""
+        deaf = {one.channel for one in self.verdicts if one.fault in _DEAF}
+        return np.array([channel not in deaf for channel in range(n_channels)])
 
     @property
     def masked_channels(self) -> tuple[int, ...]:
@@ -267,6 +276,8 @@ def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stanc
         "ambiguity": array.ambiguity,
         "coherence": None if isinstance(health.coherence, NotUsable) else health.coherence,
         "masked_microphones": [channel + 1 for channel in health.masked_channels],
+        "condition": "working" if health.is_healthy else "impaired",
+        "positions": _positions_json(health.positions),
         "faults": [_fault_json(verdict) for verdict in health.verdicts],
         "n_dropouts": health.n_dropouts,
         "dropouts": [encode(one) for one in health.dropouts],
@@ -281,6 +292,11 @@ def _fault_json(verdict: ChannelVerdict) -> dict[str, object]:
     return encode(verdict) | counted
 
 
+def _positions_json(positions: PositionVerdict) -> dict[str, object]:
+    order = positions.order if positions.order is None else [place + 1 for place in positions.order]
+    return encode(positions) | {"fit": positions.fits, "order": order}
+
+
 def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stance: str) -> Iterator[str]:
     """Yield the lines of the report."""
     alias = array.alias_hz()
@@ -289,6 +305,7 @@ def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stanc
     if health.verdicts:
         yield ""
         yield from _table(health.verdicts)
+    yield from _position_lines(health.positions)
     yield from _other_lines(health)
     yield ""
     yield "healthy" if health.is_healthy else _conclusion(health)
@@ -327,7 +344,7 @@ def _advice(verdict: ChannelVerdict) -> str:
         Fault.NOISY: f"{100 * max(value, 0):.0f} % of the usual coherence: own noise, or another place",
         Fault.INVERTED: "polarity is reversed: cross its two leads",
         Fault.SWAPPED: f"fits the place of channel {other}: exchange plugs, or the lines of the array file",
-        Fault.CLIPPED: f"{100 * value:.2g} % of samples at its limit: lower the gain",
+        Fault.CLIPPED: f"{100 * value:.2g} % of samples at its limit, impaired: lower the gain",
         Fault.OFFSET: f"mean is {100 * value:.0f} % of the peak-to-peak sound: check bias and coupling",
         Fault.LEVEL: f"{value:+.0f} dB against the median channel: check gain and sensitivity",
         Fault.GUSTS: f"loud by itself in {100 * value:.0f} % of ten seconds, wind: fit a windscreen",
@@ -338,6 +355,27 @@ def _advice(verdict: ChannelVerdict) -> str:
 
 def _when(value: float) -> str:
     return "later" if value > 0.0 else "earlier"
+
+
+def _position_lines(positions: PositionVerdict) -> Iterator[str]:
+    if positions.order is not None:
+        yield f"positions: {_order_text(positions.order)}"
+    if positions.size is not None:
+        better = f"{positions.size:.3g} times the size given fits better"
+        yield f"positions: {better}: check the radius, and the unit"
+    if positions.mounting:
+        yield f"mounting: {' or '.join(positions.mounting)}: the sound comes from another side than was said"
+    yield from (f"not judged: {unjudged}" for unjudged in positions.unjudged)
+
+
+def _order_text(order: tuple[int, ...]) -> str:
+    moved = [str(channel + 1) for channel, place in enumerate(order) if channel != place]
+    mend = "exchange plugs, or the lines of the array file"
+    if len(moved) == 2:
+        return f"channels {' and '.join(moved)} are exchanged: {mend}"
+    if moved:
+        return f"channels stand in places {', '.join(str(place + 1) for place in order)}: {mend}"
+    return "the sound fits no better in this order than in any: check the order of the array file"
 
 
 def _other_lines(health: RecordingHealth) -> Iterator[str]:
@@ -359,6 +397,7 @@ def _conclusion(health: RecordingHealth) -> str:
     for verdict in health.verdicts:
         kinds.setdefault(verdict.fault.value, set()).add(verdict.channel + 1)
     parts = [f"{kind} {', '.join(map(str, sorted(found)))}" for kind, found in kinds.items()]
+    parts += [] if health.positions.fits else ["sound and positions do not belong together"]
     masked = len(health.masked_channels)
     left_out = f"; {masked} left out by the front-end" if masked else ""
     return f"not healthy: {'; '.join(parts) or 'see above'}{left_out}"

@@ -1,0 +1,353 @@
+r"""Compare the positions that an array is said to have with its sound: order, size and mounting.
+
+Sound that comes mostly from one direction u within a quarter of a second has, in a narrow band k, the
+coherence
+
+.. math:: R_{kij} = w_k\, a_{ki}(u)\, \overline{a_{kj}(u)}
+          + v_k\, \frac{\sin(2 \pi f_k d_{ij} / c)}{2 \pi f_k d_{ij} / c}, \qquad w_k, v_k \ge 0,
+
+that of a plane wave over a diffuse field. Positions are judged by what this explains of :math:`|R|^2` by
+least squares with the best u near the horizon: no other order of the channels and no other size of the array
+may explain more. As every hypothesis hears the same sound, neither the room nor the sources need be known.
+
+References
+----------
+R. K. Cook et al., J. Acoust. Soc. Am. 27, 1955 (the diffuse field); O. Thiergart, G. Del Galdo and E. A. P.
+Habets, "On the spatial coherence in mixed sound fields", J. Acoust. Soc. Am. 132, 2012 (the mixture).
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S, MicrophoneArray
+from worldstate.frontend.array.steering import cross_spectra
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, whiten
+from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray, IndexArray
+from worldstate.ground.values import wrap_angle
+
+# A frame, and a part of the sound in which one source dominates: a syllable of speech.
+_FRAME_S, _PART_S = 0.032, 0.25
+# Up to here every exchange of two channels is tried. One hypothesis of 56 channels takes half a second.
+_FEW = 16
+# Parts kept, those with the most coherent sound; bands times channels, the fewest and the most bands.
+_PARTS, _BANDS, _FEWEST, _MOST = 60, 192, 10, 24
+# Two seconds: below, one word decides.
+_LEAST_PARTS = 8
+# From waves of eight spacings, whose phases begin to differ, to those that alias a little; an array whose
+# numbers are inches is judged by waves that a smaller one hears, too.
+_BAND, _LEAST_TOP_HZ, _BOTTOM_HZ = (0.25, 1.5), 2000.0, (200.0, 1000.0)
+# Within a band whose width is the speed of sound over so many extents of the array phases hardly turn.
+_EXTENTS = 16.0
+# Near the horizon: steep waves look to a flat array as level ones do to a smaller one.
+_ELEVATIONS_RAD = np.radians([0.0, 13.0, -13.0, 26.0, -26.0])
+# From ahead on, so that of two directions that an array hears alike the one ahead is kept.
+_AZIMUTHS_RAD = np.radians(sorted(range(-180, 180, 5), key=abs))
+_SAME_S = 2e-6
+# Within an eighth of its size an array is called right: sources above its plane make it seem smaller.
+_RIGHT = (1.0, 0.92, 1.09)
+_OFF = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0, 10.0, 25.4, 39.37, 1 / 10, 1 / 25.4, 1 / 39.37)
+# Least gain of another order and of another size in the logarithm of what is left unexplained, and in
+# standard deviations. Simulated rooms: right orders lose by 0.5 and more, right sizes by 0.09 (rings of 4)
+# and 0.01 (56 microphones, of which one direction explains a tenth); wrong sizes gain by 0.02 and more.
+_ORDER_GAIN, _SIZE_GAIN, _SIGMAS = 0.05, 0.015, 4.0
+# Mean square of the coherence below which there is no sound that all microphones hear.
+_COHERENT = 0.02
+# Of four microphones every order is few exchanges away.
+_RANDOM_ORDERS, _LEAST_BY_CHANCE, _MOSTLY = 3, 4, 0.6
+# Sizes that a sound must exclude before the one claimed is called right.
+_OFF_BY_30 = (0.77, 1.3)
+# Least share of the coherent energy that is counted as unexplained, and distance over the extent of the array
+# within which two microphones count as in one place.
+_LEAST_LEFT, _SAME_PLACE = 0.02, 0.05
+# Of one sound from a known side: error of its bearing, and difference at which two mountings fit alike.
+_SIDE_RAD = math.radians(15.0)
+_ALIKE_RAD = math.radians(7.0)
+
+_NO_SIDE = ("whether the array is mirrored or turned: only sound from a known side (--heard-from) shows it",)
+
+
+class _Hypothesis:
+    """What plane waves and a diffuse field explain, for positions (M, 3) and frequencies (K,)."""
+
+    def __init__(self, positions_m: FloatArray, frequencies_hz: FloatArray) -> None:
+        azimuth, elevation = (one.ravel() for one in np.meshgrid(_AZIMUTHS_RAD, _ELEVATIONS_RAD))
+        delays = MicrophoneArray(positions_m).delays_s(azimuth, elevation)
+        kept = np.unique(np.round(delays / _SAME_S), axis=0, return_index=True)[1]
+        self.azimuths_rad, self.delays_s = azimuth[kept], delays[kept]
+        phase = -2j * np.pi * frequencies_hz[:, None, None] * self.delays_s.T
+        self._beams = np.exp(phase).astype(np.complex64)
+        apart = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1)
+        self._pairs = len(apart) * (len(apart) - 1)
+        self._diffuse = np.sinc(2.0 * frequencies_hz[:, None, None] * apart / SPEED_OF_SOUND_M_S)
+        np.einsum("kmm->km", self._diffuse)[...] = 0.0
+        self._power = np.square(self._diffuse).sum(axis=(1, 2))[:, None] / self._pairs
+        self._shared = self._on_beams(self._diffuse.astype(np.complex64))
+
+    def _on_beams(self, coherence: Complex64Array) -> FloatArray:
+        return np.asarray((self._beams.conj() * (coherence @ self._beams)).real.sum(axis=-2) / self._pairs)
+
+    def explained(self, coherence: Complex64Array) -> FloatArray:
+        """Energy explained by a wave from each direction, (S, D), in parts of coherence (S, K, M, M)."""
+        wave = self._on_beams(coherence)
+        field = ((coherence.real * self._diffuse).sum(axis=(2, 3)) / self._pairs)[:, :, None]
+        w, v = wave * self._power - field * self._shared, field - wave * self._shared
+        determinant = self._power - self._shared**2
+        mixed = (w > 0.0) & (v > 0.0) & (determinant > 1e-3 * self._power)
+        one = np.maximum(np.maximum(wave, 0.0) ** 2, np.maximum(field, 0.0) ** 2 / self._power)
+        both = (wave * w + field * v) / np.where(mixed, determinant, 1.0)
+        return np.asarray(np.where(mixed, both, one).sum(axis=1))
+
+    def best(self, coherence: Complex64Array) -> FloatArray:
+        """Energy that the best direction of every part explains, (S,)."""
+        return np.asarray(self.explained(coherence).max(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class PositionVerdict:
+    """What the sound of a recording says about the positions of the microphones.
+
+    Parameters
+    ----------
+    order : tuple of int or None
+        Place of every channel, from 0, in the order that fits better; empty where no single one was found.
+        None where the order fits, or is not judged.
+    size : float or None
+        Factor to the positions that fits better; None where the size fits, or is not judged.
+    mounting : tuple of str
+        How an array is mounted that hears a sound of a known side elsewhere; more than one where it cannot
+        be told which.
+    unjudged : tuple of str
+        What this sound does not show, and why.
+
+    Examples
+    --------
+    >>> PositionVerdict(order=(1, 0, 2)).fits, PositionVerdict().fits
+    (False, True)
+    """
+
+    order: tuple[int, ...] | None = None
+    size: float | None = None
+    mounting: tuple[str, ...] = ()
+    unjudged: tuple[str, ...] = ()
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing speaks against the positions."""
+        return self.order is None and self.size is None and not self.mounting
+
+
+NOTHING_AGAINST = PositionVerdict()
+
+
+class PositionCheck:
+    """Collect the coherence of a recording by quarters of a second, and judge the positions by it."""
+
+    def __init__(self, array: MicrophoneArray, sample_rate_hz: float) -> None:
+        n = array.n_microphones
+        self._positions = array.positions_m
+        nfft = 2 ** round(math.log2(_FRAME_S * sample_rate_hz))
+        low, high = (share * array.alias_hz() for share in _BAND)
+        top = min(max(high, _LEAST_TOP_HZ), 0.45 * sample_rate_hz)
+        bins = band_bins((float(np.clip(low, *_BOTTOM_HZ)), top), sample_rate_hz, nfft)
+        width_hz = SPEED_OF_SOUND_M_S / (_EXTENTS * array.widest_m)
+        wide = min(max(int(width_hz * nfft / sample_rate_hz), 1), len(bins))
+        bands = min(max(_BANDS // n, _FEWEST), _MOST, len(bins) // wide)
+        first = np.linspace(0, len(bins) - wide, bands).astype(int)
+        self._bands = first[:, None] + np.arange(wide)
+        self._frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
+        self._frames_a_part = round(2.0 * _PART_S * sample_rate_hz / nfft)
+        # What independent noise reaches by chance.
+        self._noise = 1.0 / (self._frames_a_part * wide)
+        self._stft = StreamingStft(n, nfft, bins)
+        self._parts: list[tuple[float, Complex64Array]] = []
+
+    def push(self, samples: Float32Array) -> None:
+        r"""Take the next samples (n, M), best a second of them, and keep the coherence of their parts.
+
+        .. math:: R_{kij} = \frac1{TB} \sum_{t, b \in k} \frac{X_{tbi} \overline{X_{tbj}}}{|X_{tbi} X_{tbj}|}
+        """
+        frames = whiten(self._stft.push(samples))[:, self._bands]
+        for part in np.array_split(frames, max(len(frames) // self._frames_a_part, 1)):
+            if len(part) >= self._frames_a_part // 2:
+                by_band = part.transpose(1, 0, 2, 3).reshape(len(self._bands), -1, part.shape[-1])
+                coherence = cross_spectra(by_band) / np.float32(by_band.shape[1])
+                np.einsum("kmm->km", coherence)[...] = 0.0
+                self._parts.append((_power(coherence) - self._noise, coherence))
+        if len(self._parts) > 2 * _PARTS:
+            self._parts = self._strongest()
+
+    def _strongest(self) -> list[tuple[float, Complex64Array]]:
+        return sorted(self._parts, key=lambda one: -one[0])[:_PARTS]
+
+    def verdict(self, usable: BoolArray, heard_from_rad: float | None = None) -> PositionVerdict:
+        """Judge order and size of the usable channels (M,), by a sound of known azimuth their mounting."""
+        kept = [one for one in self._strongest() if one[0] > _COHERENT]
+        if np.count_nonzero(usable) < 3:
+            return PositionVerdict(unjudged=("order and size: three usable microphones are needed",))
+        if len(kept) < _LEAST_PARTS:
+            few = f"{_PART_S * len(kept):.2g} s of sound that all microphones hear, 2 s are needed"
+            return PositionVerdict(unjudged=(f"order and size: {few}",))
+        heard = np.array([coherence for _, coherence in kept])
+        claimed = self._positions, self._frequencies, np.flatnonzero(usable)
+        return _Comparison(*claimed, heard, self._noise).verdict(heard_from_rad)
+
+
+def _power(coherence: Complex64Array) -> float:
+    """Mean square over the pairs of coherence (..., M, M), its diagonal zero."""
+    n = coherence.shape[-1]
+    return float(np.square(np.abs(coherence)).mean() * n / (n - 1))
+
+
+class _Comparison:
+    """Hypotheses about some of the channels, (m,), that hear the same parts, coherence (S, K, M, M)."""
+
+    def __init__(
+        self,
+        positions_m: FloatArray,
+        frequencies_hz: FloatArray,
+        channels: IndexArray,
+        coherence: Complex64Array,
+        noise: float,
+    ) -> None:
+        self._positions = positions_m[channels] - positions_m[channels].mean(axis=0)
+        self._frequencies, self._channels = frequencies_hz, channels
+        self._coherence = coherence[:, :, channels][..., channels]
+        self._power = (_power(self._coherence) - noise) * self._coherence[..., 0, 0].size
+        self._claimed = _Hypothesis(self._positions, frequencies_hz)
+
+    def verdict(self, heard_from_rad: float | None) -> PositionVerdict:
+        """Compare orders first, then sizes in the best order, then the mounting of what fits."""
+        order, unsure = self._best_order()
+        size, by_chance, untold = self._best_size(order)
+        if by_chance:
+            return PositionVerdict(order=())
+        if not np.array_equal(order, np.arange(len(order))):
+            return PositionVerdict(order=tuple(self._channels[np.argsort(order)].tolist()))
+        if size is not None:
+            return PositionVerdict(size=size)
+        mounting, unheard = ((), _NO_SIDE) if heard_from_rad is None else self._mounting(heard_from_rad)
+        return PositionVerdict(mounting=mounting, unjudged=(*unsure, *untold, *unheard))
+
+    def _in_order(self, order: IndexArray) -> Complex64Array:
+        return np.asarray(self._coherence[:, :, order][..., order])
+
+    def _gain(self, new: FloatArray, old: FloatArray) -> float:
+        r"""Gain of one hypothesis over another, 0 where it is not significant.
+
+        .. math:: \ln \frac{P - \sum_s E_s^{old}}{P - \sum_s E_s^{new}}
+        """
+        more = new - old
+        if more.mean() < _SIGMAS * more.std() / math.sqrt(len(more)):
+            return 0.0
+        left = np.maximum(self._power - np.array([old.sum(), new.sum()]), _LEAST_LEFT * self._power)
+        return math.log(left[0] / left[1])
+
+    def _best_order(self) -> tuple[IndexArray, tuple[str, ...]]:
+        """Exchange two channels as long as that explains more; return the order, and what cannot be told."""
+        order = np.arange(len(self._positions))
+        explained = self._claimed.best(self._coherence)
+        while len(order) <= _FEW:
+            tried = [_exchanged(order, *pair) for pair in combinations(range(len(order)), 2)]
+            found = [self._claimed.best(self._in_order(one)) for one in tried]
+            best = int(np.argmax([one.sum() for one in found]))
+            if self._gain(found[best], explained) < _ORDER_GAIN:
+                return order, self._alike(order, explained, tried, found)
+            order, explained = tried[best], found[best]
+        return order, ()
+
+    def _alike(
+        self, order: IndexArray, explained: FloatArray, tried: list[IndexArray], found: list[FloatArray]
+    ) -> tuple[str, ...]:
+        """Name the exchanges that would show in some sound, and not in this."""
+        apart = np.linalg.norm(self._positions[:, None] - self._positions, axis=-1)
+        pairs = [
+            "{} and {}".format(*(self._channels[one != order] + 1))
+            for one, energy in zip(tried, found, strict=True)
+            if self._gain(explained, energy) < _ORDER_GAIN
+            and np.abs(apart[one][:, one] - apart).max() > _SAME_PLACE * np.max(apart)
+        ]
+        named = ", ".join(pairs[:3]) + (f" and {len(pairs) - 3} more pairs" if len(pairs) > 3 else "")
+        return (f"exchange of {named}: this sound fits both",) if pairs else ()
+
+    def _best_size(self, order: IndexArray) -> tuple[float | None, bool, tuple[str, ...]]:
+        """Return the size that fits better, whether any order would fit as well, and what cannot be told."""
+        heard = self._in_order(order)
+        found = {size: _Hypothesis(self._positions * size, self._frequencies) for size in (*_RIGHT, *_OFF)}
+        energy = {size: one.best(heard) for size, one in found.items()}
+        right, off = (max(some, key=lambda size: energy[size].sum()) for some in (_RIGHT, _OFF))
+        is_off = self._gain(energy[off], energy[right]) > _SIZE_GAIN
+        size = off if is_off else right
+        # Numbers in another unit fit in no order either, and what explains most of the sound is no chance.
+        explains = energy[size].sum() > _MOSTLY * self._power
+        if len(order) > _LEAST_BY_CHANCE and not explains and self._by_chance(found[size], energy[size]):
+            return None, True, ()
+        if is_off:
+            return off, False, ()
+        unsure = [
+            f"{one:g} times" for one in _OFF_BY_30 if self._gain(energy[right], energy[one]) < _SIZE_GAIN
+        ]
+        return None, False, (f"{' or '.join(unsure)} the size: this sound fits both",) if unsure else ()
+
+    def _by_chance(self, hypothesis: _Hypothesis, explained: FloatArray) -> bool:
+        rng = np.random.default_rng(0)
+        orders = (rng.permutation(len(self._positions)) for _ in range(_RANDOM_ORDERS))
+        return any(
+            self._gain(explained, hypothesis.best(self._in_order(one))) < _ORDER_GAIN for one in orders
+        )
+
+    def _mounting(self, heard_from_rad: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the mountings in which a sound from there is heard where it is, or why none is named."""
+        explained, azimuths = self._claimed.explained(self._coherence), self._claimed.azimuths_rad
+        at = float(azimuths[explained.sum(axis=0).argmax()])
+        votes = wrap_angle(azimuths[explained.argmax(axis=1)] - at)
+        if np.median(np.abs(votes)) > 2.0 * _SIDE_RAD:
+            return (), ("mounting: sound comes from several sides",)
+        misses = {name: self._miss(places, at) for name, places in self._places(heard_from_rad).items()}
+        least = min(misses.values())
+        fits = misses.pop("as claimed") < max(_SIDE_RAD - _ALIKE_RAD, least + _ALIKE_RAD)
+        alike = tuple(name for name, miss in misses.items() if miss < least + _ALIKE_RAD)
+        if fits:
+            return (), (f"whether it is {' or '.join(alike)}: sound from there fits both",) if alike else ()
+        return (alike if least < _SIDE_RAD else (_turned(heard_from_rad - at),)), ()
+
+    def _places(self, heard_from_rad: float) -> dict[str, FloatArray]:
+        """Azimuths at which a sound from there would be heard in every mounting."""
+        turns, first_rad = _symmetry(self._positions)
+        steps = 2.0 * np.pi / turns * np.arange(turns)
+        mirrors = np.concatenate([[0.0, np.pi], 2.0 * first_rad + steps if turns > 1 else []])
+        places = {"as claimed": np.array([heard_from_rad]), "mirrored": mirrors - heard_from_rad}
+        angles = [
+            (f"turned by {math.degrees(wrap_angle(one)):.0f} degrees", one) for one in steps[1:].tolist()
+        ]
+        return places | {name: np.array([heard_from_rad - one]) for name, one in angles}
+
+    def _miss(self, azimuths_rad: FloatArray, at_rad: float) -> float:
+        """Least angle between a direction and others, each as the array hears it: ahead for behind."""
+        delays = MicrophoneArray(self._positions).delays_s(azimuths_rad)
+        nearest = np.square(delays[:, None] - self._claimed.delays_s).sum(axis=-1).argmin(axis=1)
+        return float(np.abs(wrap_angle(self._claimed.azimuths_rad[nearest] - at_rad)).min())
+
+
+def _turned(angle_rad: float) -> str:
+    return f"turned by {math.degrees(wrap_angle(angle_rad)):.0f} degrees"
+
+
+def _exchanged(order: IndexArray, a: int, b: int) -> IndexArray:
+    other = order.copy()
+    other[[a, b]] = order[[b, a]]
+    return other
+
+
+def _symmetry(positions_m: FloatArray) -> tuple[int, float]:
+    """Return by how many parts of a full turn about the vertical an array is regular, and where it begins."""
+    plane = positions_m[:, 0] + 1j * positions_m[:, 1]
+    outer = plane[np.abs(plane).argmax()]
+    for turns in range(len(plane), 1, -1):
+        turned = np.abs(plane[:, None] * np.exp(2j * np.pi / turns) - plane)
+        apart = np.hypot(turned, positions_m[:, 2, None] - positions_m[:, 2]).min(axis=1)
+        if apart.max() < _SAME_PLACE * abs(outer):
+            return turns, float(np.angle(outer))
+    return 1, 0.0
