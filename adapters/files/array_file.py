@@ -140,7 +140,7 @@ def _check_size(path: Path, positions_m: FloatArray) -> None:
     for wrong, problem in (
         (wide_m > MAX_APERTURE_M, f"{metres} an array {wide_m:g} wide: millimetres?"),
         (mean_m > MAX_SPACING_M, f"{metres} microphones {mean_m:g} apart: centimetres?"),
-        (0.0 < least_m < MIN_SPACING_M, f"{metres} microphones {least_m:g} apart"),
+        (0.0 < least_m < MIN_SPACING_M, f"{metres} microphones {least_m:g} apart: divided by 1000?"),
         (upright, "expected a horizontal extent, got a vertical line, which hears every azimuth alike"),
     ):
         if wrong:

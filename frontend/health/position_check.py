@@ -222,6 +222,8 @@ class _Comparison:
         """Compare orders first, then sizes in the best order, then the mounting of what fits."""
         order, unsure = self._best_order()
         size, by_chance, untold = self._best_size(order)
+        if self._is_upright and self._spread(self._in_order(order))[1] < _SIDE_RAD:
+            size, untold = None, ("the size: sound from one side shows none to an upright array",)
         if by_chance:
             return PositionVerdict(order=())
         if not np.array_equal(order, np.arange(len(order))):
@@ -230,6 +232,22 @@ class _Comparison:
             return PositionVerdict(size=size)
         mounting, unheard = ((), _NO_SIDE) if heard_from_rad is None else self._mounting(heard_from_rad)
         return PositionVerdict(mounting=mounting, unjudged=(*unsure, *untold, *unheard))
+
+    @property
+    def _is_upright(self) -> bool:
+        """Whether level waves reach the array at any length from none on: another angle, or another size."""
+        return bool(
+            np.linalg.matrix_rank(
+                self._positions[:, :2], tol=_SAME_PLACE * float(np.abs(self._positions).max())
+            )
+            < 2
+        )
+
+    def _spread(self, coherence: Complex64Array) -> tuple[float, float]:
+        """Azimuth that explains most of all parts, and the median distance from there of those of each."""
+        explained, azimuths = self._claimed.explained(coherence), self._claimed.azimuths_rad
+        at = float(azimuths[explained.sum(axis=0).argmax()])
+        return at, float(np.median(np.abs(wrap_angle(azimuths[explained.argmax(axis=1)] - at))))
 
     def _in_order(self, order: IndexArray) -> Complex64Array:
         return np.asarray(self._coherence[:, :, order][..., order])
@@ -300,14 +318,12 @@ class _Comparison:
 
     def _mounting(self, heard_from_rad: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the mountings in which a sound from there is heard where it is, or why none is named."""
-        explained, azimuths = self._claimed.explained(self._coherence), self._claimed.azimuths_rad
-        at = float(azimuths[explained.sum(axis=0).argmax()])
-        votes = wrap_angle(azimuths[explained.argmax(axis=1)] - at)
-        if np.median(np.abs(votes)) > 2.0 * _SIDE_RAD:
+        at, spread = self._spread(self._coherence)
+        if spread > 2.0 * _SIDE_RAD:
             return (), ("mounting: sound comes from several sides",)
         misses = {name: self._miss(places, at) for name, places in self._places(heard_from_rad).items()}
         least = min(misses.values())
-        fits = misses.pop("as claimed") < max(_SIDE_RAD - _ALIKE_RAD, least + _ALIKE_RAD)
+        fits = misses.pop("as claimed") < max(_SIDE_RAD, least + _ALIKE_RAD)
         alike = tuple(name for name, miss in misses.items() if miss < least + _ALIKE_RAD)
         if fits:
             return (), (f"whether it is {' or '.join(alike)}: sound from there fits both",) if alike else ()
