@@ -9,6 +9,7 @@ from .array.microphone_array import MicrophoneArray as MicrophoneArray
 from .array.microphone_array import ovad_array as ovad_array
 from .array.microphone_array import roof_array_56 as roof_array_56
 from .bounds.cramer_rao import bearing_crb_rad2 as bearing_crb_rad2
+from .bounds.cramer_rao import delay_crb_s2 as delay_crb_s2
 from .bounds.cramer_rao import radial_speed_crb_m2_s2 as radial_speed_crb_m2_s2
 from .bounds.cramer_rao import tone_crb_hz2 as tone_crb_hz2
 from .direction.bearing import Peak as Peak
@@ -16,6 +17,8 @@ from .direction.bearing import find_peaks as find_peaks
 from .direction.bearing import srp_phat as srp_phat
 from .direction.bearing import steered_power as steered_power
 from .direction.feature import published_feature as published_feature
+from .direction.gcc_phat import PairDelays as PairDelays
+from .direction.gcc_phat import gcc_delays as gcc_delays
 from .direction.music import count_sources as count_sources
 from .direction.music import music_spectrum as music_spectrum
 from .ego_noise.ego_noise import EgoNoiseSettings as EgoNoiseSettings

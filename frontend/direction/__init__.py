@@ -1,1 +1,1 @@
-"""Direction of arrival: SRP-PHAT, MUSIC, peaks, bearing, the published feature."""
+"""Direction of arrival: SRP-PHAT, MUSIC, delays, peaks, bearing, the published feature."""
