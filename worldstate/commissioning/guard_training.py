@@ -67,7 +67,7 @@ CALM = (
 IDLING = ("light", "medium", "heavy", "motorcycle")
 CLIP_S = (3.0, 6.0)
 _IN_TRAFFIC, _OVER_TRAFFIC_DB = 0.8, (-15.0, 20.0)  # A warning signal sounds where vehicles are
-PLACES = 8  # Folds of what is heard close
+PLACES = 4  # Folds of what is heard close
 CLIPS_EACH = 40  # With thirty, shares of real clips move by .05 from draw to draw
 SOUND_S = 20.0
 # Over the ambience, in the band that the guard hears, over the louder half of the sound: a pause is none.

@@ -22,7 +22,7 @@ import numpy as np
 
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
-from worldstate.commissioning.guard_training import heard_characters
+from worldstate.commissioning.guard_training import close_rows, heard_characters
 from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams
 from worldstate.commissioning.road_user_training import (
     CLASSES,
@@ -33,6 +33,7 @@ from worldstate.commissioning.road_user_training import (
     cross_validated,
     fit_road_users,
     road_user_rows,
+    with_close,
 )
 from worldstate.commissioning.sequence_training import AUDIBLE_DB
 from worldstate.frontend.array.microphone_array import ovad_array
@@ -40,6 +41,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
 _ALONE_DB, _SILENT_DB = 6.0, -100.0
+CLIPS_EACH = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,6 +144,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         rows = road_user_rows(
             ovad_array(), sites, rate_hz, rng, passes=passes, jobs=jobs, on_pass=bar.advance
         )
+    # Close passes by other recorders, as in a model that is made: learned, and of no junction that is judged.
+    rows = with_close(rows, close_rows(rate_hz, rng, CLIPS_EACH, jobs))
     streams = [HeardStream.load(path) for path in arguments.streams]
     found = stream_exam(rows, streams) if streams else road_user_exam(rows)
     report = {name: np.asarray(one).tolist() for name, one in asdict(found).items()}

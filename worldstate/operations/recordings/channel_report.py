@@ -34,7 +34,8 @@ _EXPLAINS = {
 # Each of them misplaces the others' waves, too: what was seen in most hops is the cause, and what is left
 # shows when that is mended.
 _MISPLACED = frozenset({Fault.SWAPPED, Fault.DELAY, Fault.DRIFT})
-_DEAF = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED})
+# What no wave arrives at in its order: the position of a channel with a clock of its own cannot be judged.
+_DEAF = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.DELAY, Fault.DRIFT})
 # Dropouts beyond these are counted, not listed.
 _LISTED_DROPOUTS = 100
 _COLOURS = {
