@@ -44,10 +44,11 @@ _DRIVEN_S, _LEAD_S = 7.0, 3.0  # Before line of sight, and of ambience before th
 # Over the ambience from 250 to 2600 Hz over one second. At 0 dB a seventh of the hops of cars are unknown,
 # though their class is found as well.
 _AUDIBLE_DB = -6.0
-# Chosen on real clips of cars and trams, of which nothing else is learned: there the log-loss is least at
-# this temperature, and before it .2 higher at a strength of .03.
-TEMPERATURE, STRENGTH = 1.5, 0.003
-CHOSEN = f"temperature {TEMPERATURE} of road users chosen on the same passes"
+# Chosen on real clips of cars and trams, of which nothing else is learned: their log-loss is .27 at this
+# strength and .61 at .03, that of passes at junctions .52 and .48. Beside it a temperature is not needed
+# (1.5: .25 and .58).
+STRENGTH = 0.003
+CHOSEN = f"strength {STRENGTH} of road users chosen on the same passes"
 _FOLDS = 8
 _FIGURES = 5  # Of a coefficient in the file
 
@@ -142,17 +143,13 @@ def with_close(rows: RoadUserRows, close: SoundRows) -> RoadUserRows:
 
 
 def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
-    r"""Fit a softmax to classes of equal weight, flatten it, and let classes be as frequent as in a town.
-
-    .. math:: p_c \propto \pi_c\, q_c^{1 / T}
-    """
+    """Fit a softmax to classes of equal weight, then let them be as frequent as in a town."""
     classes = rows.classes
     equal = 1.0 / np.bincount(classes, minlength=len(CLASSES))[classes]
     weights = equal * len(classes) / equal.sum()
     slopes, biases = fit_softmax(rows.measures, classes, equal, weights, STRENGTH)
     shares = class_shares(rows)
-    slopes, biases = slopes / TEMPERATURE, biases / TEMPERATURE + np.log(shares)
-    rounded = (significant(one, _FIGURES) for one in (slopes, biases, shares))
+    rounded = (significant(one, _FIGURES) for one in (slopes, biases + np.log(shares), shares))
     return RoadUserModel((*MEASURES, *BANDS), CLASSES, *rounded)
 
 
