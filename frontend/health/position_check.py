@@ -337,10 +337,7 @@ class _Comparison:
         steps = 2.0 * np.pi / turns * np.arange(turns)
         mirrors = np.concatenate([[0.0, np.pi], 2.0 * first_rad + steps if turns > 1 else []])
         places = {"as claimed": np.array([heard_from_rad]), "mirrored": mirrors - heard_from_rad}
-        angles = [
-            (f"turned by {math.degrees(wrap_angle(one)):.0f} degrees", one) for one in steps[1:].tolist()
-        ]
-        return places | {name: np.array([heard_from_rad - one]) for name, one in angles}
+        return places | {_turned(one): np.array([heard_from_rad - one]) for one in steps[1:].tolist()}
 
     def _miss(self, azimuths_rad: FloatArray, at_rad: float) -> float:
         """Least angle between a direction and others, each as the array hears it: ahead for behind."""

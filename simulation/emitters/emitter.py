@@ -15,11 +15,27 @@ from .signals import gate
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]
 
 SYNTHESES: dict[str, Synthesis] = {
-    name: getattr(syntheses, name.replace("-", "_"))
-    for name in (
-        *("voice", "children", "steps", "bell", "saw", "drill", "music", "tune", "drums", "dog", "birds"),
-        *("shots", "tone", "siren", "wail", "sweeps", "turns", "horn", "horns", "beeper", "bicycle-bell"),
-    )
+    "voice": syntheses.voice,
+    "children": syntheses.children,
+    "steps": syntheses.steps,
+    "bell": syntheses.bell,
+    "saw": syntheses.saw,
+    "drill": syntheses.drill,
+    "music": syntheses.music,
+    "tune": syntheses.tune,
+    "drums": syntheses.drums,
+    "dog": syntheses.dog,
+    "birds": syntheses.birds,
+    "shots": syntheses.shots,
+    "tone": syntheses.tone,
+    "siren": syntheses.siren,
+    "wail": syntheses.wail,
+    "sweeps": syntheses.sweeps,
+    "turns": syntheses.turns,
+    "horn": syntheses.horn,
+    "horns": syntheses.horns,
+    "beeper": syntheses.beeper,
+    "bicycle-bell": syntheses.bicycle_bell,
 }
 # Everything is drawn at a whole multiple of the rate asked, of at least this, and then band-limited: partials
 # above a low Nyquist frequency are left out, not folded, and the level is that of the whole sound.

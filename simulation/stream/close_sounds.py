@@ -57,7 +57,8 @@ _TONES = {
 }
 _TONE_GAIN = (0.02, 0.5)
 _REVERBERATION_S, _DIRECT_DB, _OUTDOORS = (0.1, 2.0), (-6.0, 15.0), 0.2
-SNR_DB, BAND_HZ = (0.0, 30.0), (250.0, 2600.0)
+# Over the noise in the band that the guard hears.
+_SNR_DB, BAND_HZ = (0.0, 30.0), (250.0, 2600.0)
 # Shots, barks and steps are recorded where it is calm: their pauses are silent.
 _CALM_DB = (0.0, 55.0)
 
@@ -115,7 +116,7 @@ def recorded(
     loud, beside = (np.square(scipy.signal.sosfilt(band, one)) for one in (sound, noise))
     # Over its louder third: a pause is none.
     parts = np.sort([part.mean() for part in np.array_split(loud, max(len(loud) // round(0.1 * rate_hz), 1))])
-    ratio_db = rng.uniform(*(_CALM_DB if calm else SNR_DB))
+    ratio_db = rng.uniform(*(_CALM_DB if calm else _SNR_DB))
     gain = np.sqrt((parts[-len(parts) // 3 :].mean() + np.finfo(float).tiny) / beside.mean()) * 10.0 ** (
         -ratio_db / 20
     )

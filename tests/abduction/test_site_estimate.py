@@ -121,7 +121,7 @@ def rates(table, prepared, train, here, rng):
     """Decisions on a stream, site learned and not, at a threshold from windows out of fold; and labels."""
     known = prepared.select(train)
     model, folds = fit_ensemble(known), folds_by_recording(known, rng)
-    inner = out_of_fold(known, folds, fit_ensemble, lambda one, rows: one.explain(known.features[rows]))
+    (inner,) = out_of_fold(known, folds, fit_ensemble, [lambda one, rows: one.explain(known.features[rows])])
     gamma = neyman_pearson_threshold(list(hazard_statistic(inner, 0.0)[known.hazard_free][:, None]), 0.02)
     estimate, decisions = SiteEstimate.start(60), []
     rows = stream_of(table, here, rng)

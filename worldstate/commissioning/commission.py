@@ -22,14 +22,13 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
+from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
 from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.stream.settings import StreamSettings
 
-from . import guard_training, road_user_training
-from .guard_training import close_rows, train_guard
+from .guard_training import CHOSEN_FOR_GUARD, close_rows, train_guard
 from .heard_stream import (
     HAZARD_FREE,
     CommissionSettings,
@@ -41,7 +40,7 @@ from .heard_stream import (
     mounting_streams,
     mountings,
 )
-from .road_user_training import fit_road_users, road_user_rows, with_close
+from .road_user_training import CHOSEN_FOR_ROAD_USERS, fit_road_users, road_user_rows, with_close
 from .sequence_training import LabelledStream, calibrated_margin_s, stream_truth, train_sequence
 from .simulated_windows import (
     N_OPEN,
@@ -206,7 +205,7 @@ def commission(
         sites = list(dict.fromkeys(one.site for one in streams))
         passes = road_user_rows(array, sites, rate_hz, rng, jobs=jobs)
         road_users = fit_road_users(with_close(passes, close))
-        about = f"{about}; {guard_training.CHOSEN}; {road_user_training.CHOSEN}"
+        about = f"{about}; {CHOSEN_FOR_GUARD}; {CHOSEN_FOR_ROAD_USERS}"
     provenance = replace(model.provenance, classifier=about, fit_for_use=not settings.quick)
     made = replace(model, provenance=provenance, sequence=sequence, guard=guard, road_users=road_users)
     return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made

@@ -27,7 +27,13 @@ from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SimulationSetti
 from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.simulation.sound.receiver import standing_m
 from worldstate.simulation.stream.arrivals import SOUND_MARGIN_S, Event, SoundEvent
-from worldstate.simulation.stream.close_sounds import close_sound, close_vehicle, idling_vehicle, recorded
+from worldstate.simulation.stream.close_sounds import (
+    BAND_HZ,
+    close_sound,
+    close_vehicle,
+    idling_vehicle,
+    recorded,
+)
 from worldstate.simulation.stream.rendering import Microphones, ambience_piece, event_sound, stream_ambience
 from worldstate.simulation.stream.settings import StreamSettings
 
@@ -42,28 +48,14 @@ FOREIGN = {
     **{"dog": "dogs", "birds": "birds", "shots": "shots", "rain": "rain"},
 }
 SIGNALS = {
-    **{
-        "siren": "siren",
-        "wail": "siren",
-        "sweeps": "siren",
-        "turns": "siren",
-        "horn": "horn",
-        "horns": "horn",
-    },
+    **{"siren": "siren", "wail": "siren", "sweeps": "siren", "turns": "siren"},
+    **{"horn": "horn", "horns": "horn"},
     **{"beeper": "reversing beeper", "bicycle-bell": "bicycle bell"},
 }
 CLOSE = "close"  # What passes or idles some metres away, at no junction
 STREET = ("none", "front", "hidden", CLOSE)
-CALM = (
-    "horn",
-    "horns",
-    "dog",
-    "shots",
-    "steps",
-    "bell",
-    "bicycle-bell",
-    "drums",
-)  # Recorded where little else is heard
+# Recorded where little else is heard.
+CALM = ("horn", "horns", "dog", "shots", "steps", "bell", "bicycle-bell", "drums")
 IDLING = ("light", "medium", "heavy", "motorcycle")
 CLIP_S = (3.0, 6.0)
 _IN_TRAFFIC, _OVER_TRAFFIC_DB = 0.8, (-15.0, 20.0)  # A warning signal sounds where vehicles are
@@ -71,7 +63,7 @@ PLACES = 4  # Folds of what is heard close
 CLIPS_EACH = 40  # With thirty, shares of real clips move by .05 from draw to draw
 SOUND_S = 20.0
 # Over the ambience, in the band that the guard hears, over the louder half of the sound: a pause is none.
-SNR_DB, BAND_HZ, AUDIBLE_DB = (0.0, 25.0), (250.0, 2600.0), 0.0
+SNR_DB, AUDIBLE_DB = (0.0, 25.0), 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,6 +134,7 @@ def close_rows(
 
     As in a clip, what is heard begins with its first hop.
     """
+    # Rain falls on the microphones and stands nowhere: it is heard at the sites.
     names = [*KINDS, *KINDS, *(f"idling {name}" for name in (*IDLING, *IDLING)), *FOREIGN, *SIGNALS]
     plan = [(name, number) for name in names if name != "rain" for number in range(each)]
     draws = [(*one, own) for one, own in zip(plan, rng.spawn(len(plan)), strict=True)]
@@ -257,7 +250,7 @@ _FIGURES = 5  # Of a coefficient in the file, which is a fifth as long
 # of the hops of idling engines are called foreign, and log-odds of a signal over all that is foreign at which
 # .7 of those of sirens are told.
 REAL_THRESHOLD, SIGNAL_NATS = 2.2, -3.0
-CHOSEN = (
+CHOSEN_FOR_GUARD = (
     f"guard's least threshold {REAL_THRESHOLD} and its signals at {SIGNAL_NATS} nats chosen on real clips: 82"
     " passes of cars and trams, 394 clips of UrbanSound8K"
 )

@@ -48,7 +48,7 @@ _AUDIBLE_DB = -6.0
 # strength and .61 at .03, that of passes at junctions .52 and .48. Beside it a temperature is not needed
 # (1.5: .25 and .58).
 STRENGTH = 0.003
-CHOSEN = f"strength {STRENGTH} of road users chosen on the same passes"
+CHOSEN_FOR_ROAD_USERS = f"strength {STRENGTH} of road users chosen on the same passes"
 _FOLDS = 8
 _FIGURES = 5  # Of a coefficient in the file
 

@@ -22,10 +22,10 @@ from worldstate.abduction.sequence.sequence_model import (
     smoothed_log_odds,
 )
 from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, wrap_angle
+from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate.operations.metrics.approach_table import (
     AFTER_S,
-    SECONDS_PER_HOUR,
     SLACK_S,
     ApproachOutcome,
     ApproachTable,

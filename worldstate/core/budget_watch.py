@@ -18,6 +18,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from worldstate.ground import InvalidArgumentError, nanoseconds, seconds
+from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.state.cue import Budget, Tally, Verdict
 
 # Whatever is advised of comes into view within the risk's own horizon, or was not there. So long after one
@@ -26,7 +27,6 @@ HORIZON_NS = nanoseconds(8.0)
 BET_NS, BET_S = nanoseconds(2.0), 2.0  # A chance of two seconds is known after two
 LOOK_NS = nanoseconds(0.5)  # A look tells of its own time, so longer steps were not watched
 ENDS_NS = nanoseconds(1.005)  # An alarm is held for a second: later it is another onset
-SECONDS_PER_HOUR = 3600.0
 _BEGUN_ANEW_HZ = 1.0 / (6.0 * SECONDS_PER_HOUR)
 # .05 in 24 hours, half for each test.
 BROKEN = (1.0 + 24.0 * SECONDS_PER_HOUR * _BEGUN_ANEW_HZ) / 0.025

@@ -21,6 +21,7 @@ Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 LEAST_HEARD = 0.2
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
+SECONDS_PER_HOUR = 3600.0
 # Of signed 64 bits, less an hour: what is derived from a stamp, as the end of an advisory, is written too.
 _MOST_NS = (1 << 63) - 3600 * NANOSECONDS_PER_SECOND
 

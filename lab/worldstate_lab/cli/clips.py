@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sklearn.ensemble import HistGradientBoostingClassifier
 
 from worldstate.abduction.road_users import DomainGuard, Familiar, Foreign, RoadUserModel
 from worldstate.adapters.audio.sound_file import open_audio
@@ -39,10 +38,11 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray, TextArray
 from worldstate.operations.metrics.approach_table import auroc
+from worldstate_lab.streets.set_classifiers import boosted_area
 
 LOWEST_RATE_HZ, MEMORY_S, MOST_SECONDS, MOST_BYTES = 8000.0, 2.1, 600.0, 1 << 30
 NUMBERS = len(MEASURES) + len(BANDS)
-SAID = 0.9
+SAID, FOLDS = 0.9, 4
 # Which of the simulator's kinds a kind of clip is held against.
 SIMULATED = {
     **{"car": ("light",), "tram": ("tram",), "engine_idling": tuple(f"idling {kind}" for kind in IDLING)},
@@ -170,7 +170,7 @@ def realism_rows(
     for kind, names in SIMULATED.items():
         hops = (clips.kinds == kind)[clips.clip]
         recordings = np.unique(clips.recordings[clips.kinds == kind])
-        if len(recordings) < 4:
+        if len(recordings) < FOLDS:
             continue
         drawn = zip(range(each * len(names)), rng.spawn(each * len(names)), strict=True)
         ours = [(rows_of_clip(6000.0, (names[i % len(names)], i, own)).measures, i) for i, own in drawn]
@@ -198,13 +198,9 @@ def _told_apart(
     one: tuple[FloatArray, IndexArray], other: tuple[FloatArray, IndexArray], rng: np.random.Generator
 ) -> float:
     """Area of a boosted classifier over folds by clip or recording."""
-    inputs, origin = np.concatenate([one[0], other[0]]), np.repeat([0, 1], [len(one[0]), len(other[0])])
-    fold, score = np.concatenate([one[1], other[1]]) % 4, np.zeros(len(origin))
-    for number in range(4):
-        test = fold == number
-        model = HistGradientBoostingClassifier(max_iter=100, random_state=int(rng.integers(2**31)))
-        score[test] = model.fit(inputs[~test], origin[~test]).predict_proba(inputs[test])[:, 1]
-    return auroc(score, origin) or 0.5
+    origin = np.repeat([0, 1], [len(one[0]), len(other[0])])
+    fold = np.concatenate([one[1], other[1]]) % FOLDS
+    return boosted_area(np.concatenate([one[0], other[0]]), origin, fold, rng)
 
 
 def clip_lines(report: Mapping[str, Any]) -> list[str]:

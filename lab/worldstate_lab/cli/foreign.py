@@ -131,7 +131,7 @@ def _code(guard: DomainGuard, measures: FloatArray) -> float:
 
 
 NAMES = ("foreign_sounds.json", "foreign_sounds.txt")
-CLIPS_EACH, GUARD_RATE_HZ = 8, 6000.0  # One a place
+CLIPS_EACH, GUARD_RATE_HZ = 8, 6000.0  # As many in every fold
 SITES = 3  # At least: one that is judged and two others that set its threshold
 
 

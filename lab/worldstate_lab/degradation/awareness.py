@@ -11,8 +11,8 @@ from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
+from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.metrics.approach_table import (
-    SECONDS_PER_HOUR,
     onset_outcome,
     poisson_interval,
     rising_edges,

@@ -31,10 +31,10 @@ from worldstate.adapters.source import Source, open_source, unoccluded_sector
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.ground.values import nanoseconds
+from worldstate.ground.values import SECONDS_PER_HOUR, nanoseconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.detectors.miss_rate_measurement import MIN_OVERLAP
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rising_edges
+from worldstate.operations.metrics.approach_table import poisson_interval, rising_edges
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream, joined
 from worldstate_lab.metrics.intervals import middle, poisson_upper, stratified_draws
 

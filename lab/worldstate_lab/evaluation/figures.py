@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
+from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_table import HOP_S
 
 _UNITS = {"": 1.0, "per hour": 1.0 / (HOP_S / SECONDS_PER_HOUR), "degrees": float(np.degrees(1.0))}

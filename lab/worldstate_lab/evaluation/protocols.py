@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, caution
+from worldstate.ground.values import SECONDS_PER_HOUR
+from worldstate.operations.metrics.approach_table import caution
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule, ShippedChain
 from worldstate_lab.methods.line_of_sight import OcSortRecovery, RadarFieldOfView, VisionOnly

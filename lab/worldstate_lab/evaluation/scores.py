@@ -14,7 +14,8 @@ from worldstate.abduction.sequence.sequence_model import held
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rank_wins
+from worldstate.ground.values import SECONDS_PER_HOUR
+from worldstate.operations.metrics.approach_table import poisson_interval, rank_wins
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
 from worldstate_lab.evaluation import reduction
 from worldstate_lab.evaluation.figures import FIGURES

@@ -32,7 +32,7 @@ from worldstate.operations.training.training import (
     calibrate_passes,
     folds_by_recording,
     junction_folds,
-    out_of_fold_each,
+    out_of_fold,
 )
 from worldstate_lab.features.published_classifier import Classifier
 
@@ -78,7 +78,7 @@ class WindowMethod:
     ) -> list[FloatArray]:
         """Return posteriors out of fold for each way to ask, each of shape (n, 4)."""
         folds = folds_of(inner, table, rng)
-        return out_of_fold_each(table, folds, lambda part: self.trained(part, rng), asks)
+        return out_of_fold(table, folds, lambda part: self.trained(part, rng), asks)
 
     def asks(self, table: FeatureTable, rng: np.random.Generator) -> list[Ask]:
         """Return how inner folds of a prepared table are asked: compared as the scored windows are."""

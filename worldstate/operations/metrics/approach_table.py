@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.signature.site_estimate import HOP_S
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.values import SECONDS_PER_HOUR
 
 
 def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
@@ -86,7 +87,6 @@ def rank_wins(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) 
 
 Figures = dict[str, float | int | None]
 LONGEST_LEAD_S, AFTER_S = 5.0, 6.0
-SECONDS_PER_HOUR = 3600.0
 NEAR_S = 1.5  # Two vehicles with a smaller gap are heard in one window and its fades
 # A hop ends with a whole sample, T0 is a camera frame: one that ends at T0 misses it by 10 us and more.
 SLACK_S = 1e-3

@@ -175,22 +175,12 @@ def out_of_fold(
     table: FeatureTable,
     folds: TextArray,
     fit: Callable[[FeatureTable], Trained],
-    ask: Callable[[Trained, BoolArray], FloatArray],
-) -> FloatArray:
-    """Return posteriors of each window from a classifier trained on the other folds, shape (n, 4).
-
-    `ask` returns those of the chosen rows of `table`, shape (rows, 4).
-    """
-    return out_of_fold_each(table, folds, fit, [ask])[0]
-
-
-def out_of_fold_each(
-    table: FeatureTable,
-    folds: TextArray,
-    fit: Callable[[FeatureTable], Trained],
     asks: Sequence[Callable[[Trained, BoolArray], FloatArray]],
 ) -> list[FloatArray]:
-    """Return what `out_of_fold` does for several ways to ask the same classifiers, each of shape (n, 4)."""
+    """Return posteriors of each window from a classifier trained on the other folds, for each way to ask.
+
+    Each of `asks` returns those of the chosen rows of `table`, shape (rows, 4); what comes back is (n, 4).
+    """
     passes = [np.empty((len(table), len(CLASSES))) for _ in asks]
     for fold in np.unique(folds):
         held_out = folds == fold
@@ -365,11 +355,11 @@ def _out_of_fold_levels(
     asks = asked_on_streams(inputs, rng)
     passes = []
     for _ in range(repeats):
-        passes += out_of_fold_each(inputs, folds_by_recording(inputs, rng), fit, asks)
+        passes += out_of_fold(inputs, folds_by_recording(inputs, rng), fit, asks)
         on_step()
     if len(np.unique(inputs.environments)) < 2:
         return [passes]
-    return [out_of_fold_each(inputs, junction_folds(inputs), fit, asks), passes]
+    return [out_of_fold(inputs, junction_folds(inputs), fit, asks), passes]
 
 
 def _policies(
