@@ -267,11 +267,17 @@ def test_a_full_disk_leaves_no_figure(tmp_path):
 
 
 def test_a_full_standard_output_is_one_line():
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [*COMMAND, "array", "bounds"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
-        )
-    assert "No space left" in one_line(done)
+    for unbuffered in ("", "1"):  # In a buffer it is written last by the interpreter itself
+        with Path("/dev/full").open("w") as full:
+            done = subprocess.run(
+                [*COMMAND, "array", "bounds"],
+                stdout=full,
+                stderr=subprocess.PIPE,
+                text=True,
+                check=False,
+                env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
+            )
+        assert "No space left" in one_line(done)
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():

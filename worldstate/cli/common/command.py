@@ -156,15 +156,23 @@ def run_program(
     except WorldstateError as error:
         return _refused(str(error))
     except BrokenPipeError:
-        # Else the interpreter writes what is left to the closed pipe once more, and complains.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_unwritable_output()
         return 0
     except OSError as error:
+        _discard_unwritable_output()
         return _refused(f"{error.filename or 'input or output'}: {error.strerror or error}")
     except MemoryError:
         return _refused("expected more memory than this machine has left")
     except KeyboardInterrupt:
         return 130
+
+
+def _discard_unwritable_output() -> None:
+    """Drop what standard output does not take: the interpreter would write it once more, and complain."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandParser], None]) -> int:
