@@ -13,6 +13,7 @@ from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emi
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.diffraction import screen_attenuation_db
 from worldstate.simulation.sound.propagation import ANY_ORDER, add_sources
+from worldstate.simulation.sound.rays import TracedSource, add_traced
 from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.scatter import add_scattered, scattering
 from worldstate.simulation.sound.static_field import StaticSources, add_late_sound
@@ -41,9 +42,18 @@ def add_vehicle(
     engine_db = preset.engine_spread_db * rng.standard_normal() - site.surface_db + engine_bass_db(preset)
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
     sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
-    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
+    if site.is_traced:
+        add_traced(
+            static,
+            TracedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M),
+            site,
+            receiver,
+            rng,
+        )
+        return
+    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
     far = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
     add_sources(static, sources, around, ANY_ORDER[:POINT_REFLECTIONS])
     add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
@@ -147,6 +157,10 @@ def _add_from(
     rate, ego_x = receiver.sample_rate_hz, receiver.ego.x_m(track.time_s)
     angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad
     towards = _gained(signal, directivity(kind, angle), rate) * GROUND_GAIN
+    if site.is_traced:
+        source = TracedSource(towards, track.time_s, track.x_m, track.y_m, kind.height_m)
+        add_traced(static, source, site, receiver, rng)
+        return
     around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
     if not in_the_streets(site, track).all():
         over = _gained(towards, over_roofs(track, kind.height_m, receiver, preset.screen_cap_db), rate)

@@ -123,6 +123,11 @@ class Site:
         return self.in_the_open or bool(self.occluders)
 
     @property
+    def is_traced(self) -> bool:
+        """Whether its sound is carried by rays through drawn houses: the name begins with T."""
+        return self.name.startswith("T")
+
+    @property
     def far_kerb_m(self) -> float:
         """Distance ahead of the crossing roadway's far edge."""
         return self.corner_ahead_m + self.verge_m + self.street_width_m
@@ -257,6 +262,8 @@ def drawn_site(name: str) -> Site:
     True
     """
     rng = site_generator(name)
+    if name.startswith("T"):
+        return _traced_site(name, rng)
     with_wall = name[:2] in ("SA", "DA")
     ahead, corners = rng.uniform(4.5, 5.2), rng.uniform(2.3, 3.1, 2)
     walls = corners - rng.uniform(0.1, 0.7, 2)
@@ -280,6 +287,15 @@ def drawn_site(name: str) -> Site:
         left_openings_m=openings[0],
         right_openings_m=openings[1],
     )
+
+
+def _traced_site(name: str, rng: np.random.Generator) -> Site:
+    """Draw a site for the second renderer: wider streets, and more of them, than the fitted family has."""
+    (left, right), ahead = rng.uniform(2.2, 8.0, 2), rng.uniform(3.0, 10.0)
+    verge, street = rng.uniform(0.3, 3.5), rng.uniform(4.0, 9.0)
+    opposite = ahead + verge + street + rng.uniform(0.3, 4.0) if name[1] == "A" else None
+    plan = Site(name, left, right, ahead, opposite, left, right, street, verge_m=verge)
+    return replace(plan, surface_db=rng.uniform(0.0, 9.0))
 
 
 def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:

@@ -211,6 +211,40 @@ def turns_away(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     return _beside(driver, along(points, 1.0), (-driver.reach_from(before), BESIDE_M), limits)
 
 
+def stands(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Stop behind the corner with the engine running, then turn into a side street."""
+    away = turns_away(driver, rng)
+    stop = SpeedLimit(-rng.uniform(1.0, 8.0), 0.0, rng.uniform(8.0, 40.0))
+    limits = [stop, SpeedLimit(0.0, TURN_MPS), SpeedLimit(0.5 * np.pi * TURN_RADIUS_M, TURN_MPS)]
+    span = float(away.motion.driven_m[0]), float(away.motion.driven_m[-1])
+    motion = _drive(driver, away.motion.route, span, limits)
+    return replace(away, motion=motion, arrives_s=motion.reaches_s(stop.at_m))
+
+
+def leaves(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Pull out from the kerb behind the corner and drive away from the junction."""
+    y = _hidden_y_m(driver, rng.uniform(6.0, 30.0))
+    lane = driver.lane_m(into=True)
+    limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 6.0))]
+    route = along([[lane, y], [lane, y + driver.side]])
+    motion = _drive(driver, route, (0.0, max(driver.reach_m - abs(y), SHORTEST_M)), limits, into=True)
+    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
+
+
+def joins(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Come out of a side street behind the corner, turn into the arm and drive away."""
+    turn = driver.lane_m(into=True) - TURN_RADIUS_M, _hidden_y_m(driver, rng.uniform(8.0, 35.0))
+    driven = _turn_into(replace(driver, reach_m=BESIDE_M), turn, (1.0, 0.0))
+    near, far = driver.site.lanes_m
+    return replace(driven, heard=confined(driven.motion.route, near, far))
+
+
+def _hidden_y_m(driver: Driver, before_m: float) -> float:
+    """Return y in the arm, so far before the line of sight of the lane that leads into it."""
+    entry = entry_y_m(driver.site, driver.lane_m(into=True), driver.arm)
+    return entry + driver.side * before_m
+
+
 def parks(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     """Stop at the kerb of the arm and switch the engine off."""
     lane, before = driver.lane_m(), rng.uniform(8.0, 30.0)
@@ -259,6 +293,9 @@ MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
     "from_behind": from_behind,
     "from_ahead": from_ahead,
     "queue": emerges,
+    "stands": stands,
+    "leaves": leaves,
+    "joins": joins,
 }
 
 

@@ -24,6 +24,7 @@ from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
+from worldstate.simulation.sound.rays import add_traced_background
 from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.static_field import StaticSources
 
@@ -80,7 +81,8 @@ def ambience_piece(
     overlap = overlap_samples(settings)
     sound = np.zeros((len(microphones.positions_m), samples + overlap), np.float32)
     receiver = microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz)
-    add_background(sound, receiver, settings.site, settings.preset, rng, here)
+    add = add_traced_background if settings.site.is_traced else add_background
+    add(sound, receiver, settings.site, settings.preset, rng, here)
     rise = np.sin(0.5 * np.pi * (np.arange(overlap) + 0.5) / overlap).astype(np.float32)
     if not begins:
         sound[:, :overlap] *= rise

@@ -15,7 +15,7 @@ from worldstate.simulation.scene.vehicle import EgoMotion
 
 # What a flow is, is drawn in `manoeuvres.py`; these bring vehicles out of a hidden arm.
 HAZARDS = ("left", "right", "both", "waits", "queue")
-FLOWS = (*HAZARDS, "turns_away", "parks", "far", "from_behind", "from_ahead")
+FLOWS = (*HAZARDS, "turns_away", "parks", "far", "from_behind", "from_ahead", "stands", "leaves", "joins")
 MOST_PER_HOUR = 3600.0
 # Cars, delivery vans and lorries, electric cars, bicycles and kick scooters of a side street; assumed, not
 # counted.
@@ -64,6 +64,11 @@ class Traffic:
 
 
 _OTHERS = {"turns_away": 20.0, "parks": 8.0, "far": 40.0, "from_behind": 12.0, "from_ahead": 12.0}
+_MISLEADING = {
+    "voice tone beeper horn dog": 20.0,
+    "children music drill birds steps horns": 10.0,
+    "saw siren wail sweeps turns tune drums shots bell": 5.0,
+}
 # A side street at midday and a district road in the rush hour; `no-hazard` is the latter without vehicles
 # out of a hidden arm: whatever warns there is wrong. `empty` is background alone.
 TRAFFICS = {
@@ -93,6 +98,23 @@ TRAFFICS = {
             apart_s=6.0,
         ),
         Traffic("no-hazard", _OTHERS),
+        # What misleads: everything that is near, loud or grows louder and never comes out of an arm.
+        Traffic(
+            "misleading",
+            {"turns_away": 20, "parks": 20, "far": 60, "from_behind": 20, "from_ahead": 20}
+            | {"stands": 30, "leaves": 50, "joins": 40},
+            sounds={kind: rate for kinds, rate in _MISLEADING.items() for kind in kinds.split()},
+        ),
+        # One kind of it at a time, as an exam asks; what stands sounds nearly all the time.
+        Traffic("receding", {"leaves": 30, "joins": 30}),
+        Traffic("standing", {"stands": 60}),
+        Traffic("far", {"far": 60}),
+        Traffic("machines", {}, sounds={"tone": 100, "saw": 100, "drill": 100}),
+        Traffic(
+            "signals", {}, sounds=dict.fromkeys(("siren", "wail", "sweeps", "turns", "horns", "beeper"), 40)
+        ),
+        Traffic("speech", {}, sounds={"voice": 150, "children": 150}),
+        Traffic("music", {}, sounds={"music": 100, "tune": 100, "drums": 100}),
         Traffic("empty", {}),
     )
 }

@@ -1,0 +1,456 @@
+"""The second renderer: energy carried by rays through houses, and sound made anew from it.
+
+It shares nothing of the first one's propagation: no images, no screens, no late field. Rays leave the array,
+meet houses that stand back, stand apart and end, and are mirrored or scattered; by reciprocity the way of a
+ray is the way of sound to the array. What they deposit in a cell of the plan is how loud a source there is
+from every direction, per octave. Direct sound and the two corners, of which rays know nothing, are added by
+the uniform theory of diffraction. Delays of single echoes are not kept: every direction is a plane wave that
+carries the source's sound through a decaying noise of its own.
+
+Sources: H. Kuttruff, "Room Acoustics", 6th ed., 2016, ch. 9 (rays); R. G. Kouyoumjian and P. H. Pathak, "A
+uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62,
+1448-1461, 1974.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.signal import oaconvolve
+from scipy.special import modfresnelm
+
+from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
+from worldstate.simulation.scene.junction import Site, site_generator
+from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, level_curve
+from worldstate.simulation.scene.presets import Ambience, Preset
+
+from .background import (
+    NOISE_BAND_HZ,
+    ROOF_FLOOR_HZ,
+    ROOF_SLOPE,
+    BlockGrid,
+    WaveField,
+    far_passages_s,
+    wind_density,
+)
+from .delay import Emission, SampledSignal
+from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS
+from .receiver import Receiver, add_along, add_to_all
+from .static_field import StaticSources, plane_wave_delays, unit_vectors
+
+RAYS, BOUNCES, STEP_M = 100_000, 40, 1.0
+CELL_M, PLAN_M = 2.0, ((-40.0, 40.0), (-90.0, 90.0))  # x and y of the plan that is kept
+BELOW_M = 2.0  # sources stand below it
+STEEPEST = 0.5  # sine of the elevation of rays; steeper ones leave over the roofs
+DIRECTIONS, ELEVATION_RAD = 24, 0.1
+ABSORBED, SCATTERED, HEIGHT_M = (0.03, 0.3), (0.05, 0.6), (5.0, 14.0)  # of a house
+FRONT_M, SETBACK_M, GAP_M, GAPS = (6.0, 18.0), 1.0, (2.5, 5.0), 0.2
+EARLY_BOUNCES = 2
+FAINTEST = 1e-3  # of the energy at its loudest: a direction below it is left out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Houses:
+    """Fronts of the houses along two streets, seen from above."""
+
+    ends_m: FloatArray  # shape (W, 2, 2): Both ends of every front, x and y
+    height_m: FloatArray  # shape (W,)
+    kept: FloatArray  # shape (W, 8): Share of the energy that comes back, per octave
+    scattered: FloatArray  # shape (W,): Share of that which is scattered
+
+
+def drawn_houses(site: Site) -> Houses:
+    """Draw the houses of a site; those at its corners stand where its plan says.
+
+    Examples
+    --------
+    >>> from worldstate.simulation.scene.junction import drawn_site
+    >>> drawn_houses(drawn_site("TA1")).ends_m.shape[1:]
+    (2, 2)
+    """
+    rng = site_generator(site.name, "houses")
+    ahead, (left, right) = site.corner_ahead_m, (site.corner_left_m, -site.corner_right_m)
+    (back, _), (_, far) = PLAN_M
+    # Rows as their beginning, their direction, how far they go, and the way back from the street.
+    rows = [
+        ((ahead, left), (0.0, 1.0), far, (-1.0, 0.0)),
+        ((ahead, right), (0.0, -1.0), far, (-1.0, 0.0)),
+        ((ahead, left), (-1.0, 0.0), ahead - back, (0.0, 1.0)),
+        ((ahead, right), (-1.0, 0.0), ahead - back, (0.0, -1.0)),
+    ]
+    if site.opposite_wall_m is not None:
+        rows += [((site.opposite_wall_m, 0.0), (0.0, side), far, (1.0, 0.0)) for side in (1.0, -1.0)]
+    elif rng.random() < 0.5:  # the own street goes on beyond a crossing
+        beyond = site.far_kerb_m + site.verge_m
+        rows += [((beyond, side * 4.0), (0.0, side), far, (1.0, 0.0)) for side in (1.0, -1.0)]
+    fronts = [front for row in rows for front in _row(*row, rng)]
+    count = len(fronts)
+    kept = np.clip(1.0 - rng.uniform(*ABSORBED, (count, 1)) * rng.uniform(0.7, 1.3, (1, 8)), 0.0, 1.0)
+    scattered = rng.uniform(*SCATTERED) * rng.uniform(0.5, 1.5, count)
+    return Houses(np.array(fronts), rng.uniform(*HEIGHT_M, count), kept, np.minimum(scattered, 1.0))
+
+
+Point = tuple[float, float]
+
+
+def _row(
+    begin_m: Point, along: Point, length_m: float, back: Point, rng: np.random.Generator
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Draw a row of houses; the first one is at the street, the others up to some metres behind it."""
+    at, fronts, behind = 0.0, [], 0.0
+    while at < length_m:
+        width = rng.uniform(*FRONT_M)
+        start = np.array(begin_m) + at * np.array(along) + behind * np.array(back)
+        end = start + width * np.array(along)
+        side = 12.0 * np.array(back)  # a house is so deep: gaps have walls
+        fronts += [(start, end), (end, end + side), (start, start + side)]
+        at += width + (rng.uniform(*GAP_M) if rng.random() < GAPS else 0.0)
+        behind = abs(SETBACK_M * rng.standard_normal())
+    return fronts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reached:
+    """How loud a source in every cell of the plan is at the array, without the direct sound."""
+
+    energy: FloatArray  # shape (X, Y, K, 8): Squared pressure from every direction, that at 1 m in the open 1
+    early: FloatArray  # shape (K,): Share of it after few reflections
+    open: FloatArray  # shape (K,): Share of all that comes in between the houses; they sum to one
+    decay_s: float  # Reverberation time
+
+
+def azimuths_rad() -> FloatArray:
+    """Middle of every direction, shape (K,)."""
+    return -np.pi + (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS
+
+
+@lru_cache(maxsize=8)
+def reached(site: Site, height_m: float) -> Reached:
+    """Trace the rays of a site once."""
+    return trace(drawn_houses(site), height_m, site_generator(site.name, "rays"))
+
+
+def trace(houses: Houses, height_m: float, rng: np.random.Generator, rays: int = RAYS) -> Reached:
+    r"""Send rays from the array at the origin, so high, and collect what they leave in the plan.
+
+    .. math:: p^2(\text{cell}, \text{direction}) = 4 \pi \frac{\sum E\, l}{V}
+
+    of rays that left in this direction, l metres of which lie in the cell of volume V; the road mirrors, and
+    source levels stand over hard ground already.
+    """
+    azimuth = rng.uniform(-np.pi, np.pi, rays)
+    launched = np.minimum(((azimuth + np.pi) * DIRECTIONS / (2.0 * np.pi)).astype(int), DIRECTIONS - 1)
+    slope = _tangent(rng.uniform(-STEEPEST, STEEPEST, rays))
+    at = np.zeros((rays, 2))
+    flat = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    height, gone = np.full(rays, height_m), np.zeros(rays)
+    energy = np.full((rays, len(OCTAVES_HZ)), STEEPEST / rays)
+    shape = (*(round((high - low) / CELL_M) for low, high in PLAN_M), DIRECTIONS, len(OCTAVES_HZ))
+    left, early, out = np.zeros(shape), np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
+    lengths, heard = [], []
+    for bounce in range(BOUNCES):
+        wall, way = _next_wall(houses, at, flat)
+        if bounce:
+            deposit = _deposit(left, launched, at, flat, height, slope, way, energy, rng)
+            early += deposit if bounce <= EARLY_BOUNCES else 0.0
+            lengths.append(gone)
+            heard.append(energy[:, 3] * np.minimum(way, 20.0))
+        escaped = ~np.isfinite(way)
+        np.add.at(out, launched[escaped], energy[escaped].mean(axis=1))
+        way[escaped] = 0.0
+        on = ~escaped & (np.abs(height + slope * way) < houses.height_m[wall])
+        wall, launched, slope, way = wall[on], launched[on], slope[on], way[on]
+        at, height = at[on] + way[:, None] * flat[on], height[on] + slope * way
+        far = way * np.hypot(1.0, slope)
+        gone = gone[on] + far
+        energy = energy[on] * houses.kept[wall] * 10.0 ** (-far[:, None] * OCTAVE_DB_PER_M / 10.0)
+        flat, slope = _reflected(houses, wall, flat[on], slope, rng)
+        at = at + 1e-6 * flat
+        if not len(at):
+            break
+    whole = left.sum(axis=(0, 1, 3))
+    decay_s = _decay_s(np.concatenate(lengths), np.concatenate(heard))
+    volume = CELL_M**2 * 2.0 * BELOW_M
+    shares = (out + 1e-9) / (out + 1e-9).sum()
+    return Reached(4.0 * np.pi * left / volume, np.minimum(early / (whole + 1e-30), 1.0), shares, decay_s)
+
+
+def _tangent(sine: FloatArray) -> FloatArray:
+    return np.asarray(sine / np.sqrt(1.0 - sine**2))
+
+
+def _next_wall(houses: Houses, at: FloatArray, flat: FloatArray) -> tuple[IndexArray, FloatArray]:
+    """Return the front that every ray meets next and how far it is seen from above; infinite for none."""
+    nearest, which = np.full(len(at), np.inf), np.zeros(len(at), np.intp)
+    for number, (start, end) in enumerate(houses.ends_m):
+        along = end - start
+        across = flat[:, 0] * along[1] - flat[:, 1] * along[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = ((start[0] - at[:, 0]) * along[1] - (start[1] - at[:, 1]) * along[0]) / across
+            part = ((start[0] - at[:, 0]) * flat[:, 1] - (start[1] - at[:, 1]) * flat[:, 0]) / across
+        hit = (way > 1e-5) & (part >= 0.0) & (part <= 1.0) & (way < nearest)
+        nearest[hit], which[hit] = way[hit], number
+    return which, nearest
+
+
+def _deposit(
+    left: FloatArray,
+    launched: IndexArray,
+    at: FloatArray,
+    flat: FloatArray,
+    height: FloatArray,
+    slope: FloatArray,
+    way: FloatArray,
+    energy: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Leave the energy of every ray in the cells on its way, and return what each direction left."""
+    longest = np.minimum(way, 120.0)
+    count = np.ceil(longest / STEP_M).astype(int)
+    ray = np.repeat(np.arange(len(at)), count)
+    number = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
+    metres = (number + rng.random(len(ray))) * longest[ray] / count[ray]
+    low = np.abs(height[ray] + slope[ray] * metres) < BELOW_M
+    ray, metres, share = ray[low], metres[low], (longest[ray] / count[ray])[low]
+    place = at[ray] + metres[:, None] * flat[ray]
+    cell = np.floor((place - np.array(PLAN_M)[:, 0]) / CELL_M).astype(int)
+    inside = ((cell >= 0) & (cell < left.shape[:2])).all(axis=1)
+    ray, cell, length = ray[inside], cell[inside], (share * np.hypot(1.0, slope[ray]))[inside]
+    flat_index = (cell[:, 0] * left.shape[1] + cell[:, 1]) * DIRECTIONS + launched[ray]
+    each, size = energy[ray] * length[:, None], left[..., 0].size
+    for band in range(left.shape[3]):
+        left[..., band] += np.bincount(flat_index, each[:, band], size).reshape(left.shape[:3])
+    return np.asarray(np.bincount(launched[ray], each.sum(axis=1), DIRECTIONS))
+
+
+def _reflected(
+    houses: Houses, wall: IndexArray, flat: FloatArray, slope: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Mirror a ray in its wall, or send it anywhere by Lambert's law."""
+    along = houses.ends_m[wall, 1] - houses.ends_m[wall, 0]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
+    towards = np.einsum("nd,nd->n", flat, normal)
+    mirrored = flat - 2.0 * towards[:, None] * normal
+    # Of a cosine lobe: distance from the normal in the plane of the front, drawn evenly over the unit disc.
+    radius, turn = np.sqrt(rng.random(len(flat))), rng.uniform(0.0, 2.0 * np.pi, len(flat))
+    outward = -np.sign(towards)[:, None] * normal
+    beside = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
+    sideways = np.sqrt(1.0 - radius**2)[:, None] * outward + (radius * np.cos(turn))[:, None] * beside
+    level = np.linalg.norm(sideways, axis=1)
+    diffuse = rng.random(len(flat)) < houses.scattered[wall]
+    new = np.where(diffuse[:, None], sideways / level[:, None], mirrored)
+    return new, np.where(diffuse, radius * np.sin(turn) / level, slope)
+
+
+def _decay_s(length_m: FloatArray, energy: FloatArray) -> float:
+    """Reverberation time of the energy that has gone 40 to 160 m."""
+    edges = np.linspace(40.0, 160.0, 7)
+    total, _ = np.histogram(length_m, edges, weights=energy)
+    if (total <= 0.0).any():
+        return 0.3
+    per_m = np.polyfit(0.5 * (edges[1:] + edges[:-1]), 10.0 * np.log10(total), 1)[0]
+    return float(np.clip(-60.0 / (min(per_m, -1e-3) * SPEED_OF_SOUND_MPS), 0.15, 1.5))
+
+
+def corner_gain(edge_m: Point, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+    r"""Amplitude round the corner of a house to the array at the origin, shape (T, 8), rms over the octave.
+
+    .. math:: \frac{|D|}{\sqrt{s' s (s' + s)}}
+
+    with the coefficient D of a hard wedge of 90 degrees (Kouyoumjian and Pathak, eqs. 25 to 29) whose faces
+    run back along the own street and sideways along the crossing one.
+    """
+    # A corner on the right is one on the left of the mirrored plan.
+    side = np.sign(edge_m[1])
+    ahead, beside = edge_m[0], abs(edge_m[1])
+    from_edge = x_m - ahead, side * y_m - beside
+    away, last = np.maximum(np.hypot(*from_edge), 0.1), float(np.hypot(ahead, beside))
+    seen = np.mod(np.arctan2(*from_edge[::-1]) - np.pi, 2.0 * np.pi)
+    own = float(np.mod(np.arctan2(-beside, -ahead) - np.pi, 2.0 * np.pi))
+    octave = 2.0 ** (np.array([-1.0, 0.0, 1.0]) / 3.0)
+    k = 2.0 * np.pi * np.outer(OCTAVES_HZ, octave) / SPEED_OF_SOUND_MPS
+    distance = (away * last / (away + last))[:, None, None]
+    total = np.zeros((len(away), *k.shape), np.complex128)
+    for angle in (seen - own, seen + own):
+        for sign in (1.0, -1.0):
+            total += _wedge_term(angle[:, None, None], sign, k * distance)
+    coefficient = np.abs(total) / (2.0 * WEDGE * np.sqrt(2.0 * np.pi * k))
+    rms = np.sqrt(np.square(coefficient).mean(axis=2))
+    return np.asarray(rms / np.sqrt(away * last * (away + last))[:, None])
+
+
+WEDGE = 1.5  # the open angle round the corner, in half turns
+
+
+def _wedge_term(angle_rad: FloatArray, sign: float, k_distance: FloatArray) -> FloatArray:
+    """One of the four cotangents with its transition function."""
+    # On the boundary itself the cotangent is infinite and the transition nought: a milliradian beside it.
+    tangent = np.tan((np.pi + sign * angle_rad) / (2.0 * WEDGE))
+    beside = angle_rad + np.where(np.abs(tangent) < 1e-3, 4e-3, 0.0)
+    turns = np.rint((beside + sign * np.pi) / (2.0 * np.pi * WEDGE))
+    a = 2.0 * np.cos(0.5 * (2.0 * np.pi * WEDGE * turns - beside)) ** 2
+    root = np.sqrt(k_distance * a)
+    transition = 2j * root * np.exp(1j * root**2) * modfresnelm(root)[0]
+    return np.asarray(transition / np.tan((np.pi + sign * beside) / (2.0 * WEDGE)))
+
+
+LIT_BLEND_M = 0.5  # of a source's way, over which it comes into the straight line
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TracedSource:
+    """A sound of a traced street and where it comes from at its emission knots."""
+
+    signal: Float32Array  # shape (n,)
+    time_s: FloatArray  # shape (T,): The knots
+    x_m: FloatArray  # shape (T,)
+    y_m: FloatArray
+    height_m: float
+
+
+def add_traced(
+    static: StaticSources, source: TracedSource, site: Site, receiver: Receiver, rng: np.random.Generator
+) -> None:
+    """Add a moving or standing source by all that rays found, round both corners, and straight."""
+    here = reached(site, round(float(receiver.centre_m[2]), 3))
+    emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
+    energy = _at(here.energy, source.x_m, source.y_m)
+    loud = energy.sum(axis=2).max(axis=0)
+    used = np.flatnonzero(loud > FAINTEST * loud.max())
+    lit, length = _lit(site, source), _way_m(site, source)
+    elevation = np.abs(ELEVATION_RAD * rng.standard_normal(DIRECTIONS))
+    places = [(site.corner_ahead_m, site.corner_left_m), (site.corner_ahead_m, -site.corner_right_m)]
+    bent = np.array([np.arctan2(y, x) for x, y in places])
+    middle = len(source.x_m) // 2
+    over = np.arctan2(source.y_m[middle], source.x_m[middle])
+    azimuth, tilt = np.r_[azimuths_rad()[used], bent, over], np.r_[elevation[used], 0.0, 0.0, ROOF_RAD]
+    waves = np.zeros((len(used) + 3, receiver.samples), np.float32)
+    knots = emission.knots_s
+    for wave, direction in zip(waves, used, strict=False):
+        made = emission.table(np.sqrt(energy[:, direction]) * length[:, None])
+        if made is not None:
+            table = _smeared(made[0], float(here.early[direction]), here.decay_s, rng)
+            later = length + rng.exponential(3.0)  # echoes do not come all at once
+            add_along(wave, table, knots[made[1]], later[made[1]], receiver.knots_s)
+    behind = [(1.0 - lit) * (np.sign(source.y_m) == np.sign(y)) for _, y in places]
+    gains = [corner_gain(one, source.x_m, source.y_m) for one in places]
+    gains, behind = [*gains, _roof_gain(source, receiver)], [*behind, 1.0 - lit]
+    for wave, gain, share in zip(waves[len(used) :], gains, behind, strict=True):
+        made = emission.table(gain * (share * length)[:, None])
+        if made is not None:
+            add_along(wave, made[0], knots[made[1]], length[made[1]], receiver.knots_s)
+    delays = plane_wave_delays(unit_vectors(azimuth, tilt), receiver.positions_m - receiver.centre_m)
+    static.add(waves, delays + receiver.skew_s)
+    made = emission.table(np.repeat(lit[:, None], len(OCTAVES_HZ), axis=1))
+    if made is not None:
+        table, span = made
+
+        def travel(position: FloatArray) -> FloatArray:
+            rise = position[2] - source.height_m
+            flat = np.hypot(source.x_m[span] - position[0], source.y_m[span] - position[1])
+            return np.asarray(np.hypot(flat, rise))
+
+        add_to_all(static.out, table, knots[span], travel, receiver)
+
+
+def _roof_gain(source: TracedSource, receiver: Receiver) -> FloatArray:
+    r"""Amplitude over the nearest roof, shape (T, 8): ISO 9613-2, eq. (14), a thin screen, at most 20 dB.
+
+    .. math:: D = 10 \log_{10}(3 + 20 z / \lambda)
+    """
+    away = np.maximum(np.hypot(source.x_m, source.y_m), 2.0 * ROOF_M[0])
+    low, high = (ROOF_M[1] - height for height in (float(receiver.centre_m[2]), source.height_m))
+    detour = np.hypot(ROOF_M[0], low) + np.hypot(away - ROOF_M[0], max(high, 0.0)) - away
+    loss = 10.0 * np.log10(3.0 + 20.0 * detour[:, None] * OCTAVES_HZ / SPEED_OF_SOUND_MPS)
+    return np.asarray(10.0 ** (-np.minimum(loss, 20.0) / 20.0) / away[:, None])
+
+
+ROOF_M, ROOF_RAD = (6.0, 8.0), 0.5  # how far away and how high it is, and how steep sound comes from there
+
+
+def _lit(site: Site, source: TracedSource) -> FloatArray:
+    """1 where the array sees a source, 0 where a corner is before it, shape (T,)."""
+    right, left = site.sights_m(np.maximum(source.x_m, site.corner_ahead_m), (0.0, 0.0))
+    inside = np.minimum(left - source.y_m, source.y_m - right)
+    return np.clip(0.5 + inside / LIT_BLEND_M, 0.0, 1.0) ** 2
+
+
+def _way_m(site: Site, source: TracedSource) -> FloatArray:
+    """Way from above by the middle of the mouth where a source is beside it, shape (T,)."""
+    wide = min(site.corner_left_m, site.corner_right_m)
+    over = np.sign(source.y_m) * np.minimum(np.abs(source.y_m), wide)
+    return np.asarray(
+        np.hypot(source.x_m - site.corner_ahead_m, source.y_m - over) + np.hypot(site.corner_ahead_m, over)
+    )
+
+
+def _at(energy: FloatArray, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+    """Energy at places of the plan, between the middles of its cells, shape (T, K, 8)."""
+    out = np.zeros((len(x_m), *energy.shape[2:]))
+    low = np.array(PLAN_M)[:, 0]
+    at = (np.stack([x_m, y_m], axis=1) - low) / CELL_M - 0.5
+    first = np.floor(at).astype(int)
+    part = at - first
+    for i in (0, 1):
+        for j in (0, 1):
+            weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
+            x, y = (np.clip(first[:, a] + b, 0, energy.shape[a] - 1) for a, b in ((0, i), (1, j)))
+            out += weight[:, None, None] * energy[x, y]
+    return out
+
+
+def _smeared(table: SampledSignal, early: float, decay_s: float, rng: np.random.Generator) -> SampledSignal:
+    """Pass a signal through an echo and a decaying noise, of unit energy together."""
+    tail = np.arange(max(int(0.7 * decay_s * table.rate_hz), 2))
+    noise = rng.standard_normal(len(tail)) * 10.0 ** (-3.0 * tail / (decay_s * table.rate_hz))
+    response = np.sqrt(max(1.0 - early, 0.0) / np.square(noise).sum()) * noise
+    response[0] += np.sqrt(early)
+    values = oaconvolve(table.values, response.astype(np.float32))[: len(table.values)]
+    return SampledSignal(np.asarray(values, np.float32), table.start_s, table.rate_hz)
+
+
+WAVES, SKY_SHARE, WANDER_DB, WANDER_S = 64, (0.3, 0.8), 2.5, 0.7
+TOWN_DB, TOWN_S = 1.5, 12.0  # all of it rises and falls together
+OCTAVE_DB = 2.5  # how far a street's spectrum is from the preset's
+PASSING_S, PASSING_DB = (2.0, 6.0), (-8.0, 4.0)
+
+
+def add_traced_background(
+    out: Float32Array,
+    receiver: Receiver,
+    site: Site,
+    preset: Preset,
+    rng: np.random.Generator,
+    here: Ambience,
+) -> None:
+    """Add what a traced street sounds like without a vehicle, shape (M, n).
+
+    Sound comes from the sky, and by the gaps and ends of the streets where rays got out; what passes far
+    away is heard by one of these.
+    """
+    grid, own = BlockGrid(out.shape[1], receiver.sample_rate_hz), site_generator(site.name, "town")
+    opened = reached(site, round(float(receiver.centre_m[2]), 3)).open
+    azimuth = rng.uniform(-np.pi, np.pi, WAVES)
+    elevation = np.abs(rng.normal(0.0, 0.3, WAVES))
+    number = ((azimuth + np.pi) * DIRECTIONS / (2.0 * np.pi)).astype(int) % DIRECTIONS
+    by_gaps = opened[number] / opened[number].sum()
+    sky, time = own.uniform(*SKY_SHARE), grid.middles_s
+    octaves = here.octaves_db + OCTAVE_DB * own.standard_normal(len(OCTAVES_HZ))
+    wander = np.stack([_wander(time, WANDER_S, WANDER_DB, rng) for _ in azimuth], axis=1)
+    power = np.broadcast_to(sky / WAVES + (1.0 - sky) * by_gaps, wander.shape).copy()
+    for loudest_s in far_passages_s(preset, float(time[-1]), rng):
+        side = np.exp(8.0 * (np.cos(azimuth - rng.choice(azimuth, p=by_gaps)) - 1.0))
+        level = 10.0 ** (rng.uniform(*PASSING_DB) / 10.0) * side / side.sum()
+        power += level * np.exp(-(((time - loudest_s) / rng.uniform(*PASSING_S)) ** 2))[:, None]
+    power *= 10.0 ** ((wander + _wander(time, TOWN_S, TOWN_DB, rng)[:, None]) / 10.0)
+    wind = wind_density(preset.wind_100hz_db + here.wind_db, grid.frequencies_hz, ROOF_SLOPE, ROOF_FLOOR_HZ)
+    electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / NOISE_BAND_HZ
+    delays = plane_wave_delays(unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m)
+    density = level_curve(octaves, grid.frequencies_hz)
+    WaveField(grid, delays + receiver.skew_s, density, power, wind + electronic).add_to(out, rng)
+
+
+def _wander(time_s: FloatArray, every_s: float, spread_db: float, rng: np.random.Generator) -> FloatArray:
+    """Level that wanders by so much in so long, shape (B,)."""
+    knots = spread_db * rng.standard_normal(int(time_s[-1] / every_s) + 2)
+    return np.interp(time_s / every_s, np.arange(len(knots)), knots)
