@@ -42,7 +42,7 @@ RAYS, BOUNCES, STEP_M = 100_000, 40, 1.0
 CELL_M, PLAN_M = 2.0, ((-40.0, 40.0), (-90.0, 90.0))  # x and y of the plan that is kept
 BELOW_M = 2.0  # sources stand below it
 STEEPEST = 0.5  # sine of the elevation of rays; steeper ones leave over the roofs
-DIRECTIONS, ELEVATION_RAD = 24, 0.1
+DIRECTIONS, ELEVATION_RAD, LATER_M = 24, 0.1, 3.0
 ABSORBED, SCATTERED, HEIGHT_M = (0.03, 0.3), (0.05, 0.6), (5.0, 14.0)  # of a house
 FRONT_M, SETBACK_M, GAP_M, GAPS = (6.0, 18.0), 1.0, (2.5, 5.0), 0.2
 EARLY_BOUNCES = 2
@@ -311,46 +311,83 @@ class TracedSource:
 def add_traced(
     static: StaticSources, source: TracedSource, site: Site, receiver: Receiver, rng: np.random.Generator
 ) -> None:
-    """Add a moving or standing source by all that rays found, round both corners, and straight."""
-    here = reached(site, round(float(receiver.centre_m[2]), 3))
+    """Add a moving or standing source by all that rays found, round both corners, over roofs, straight."""
     emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
+    lit, length = _lit(site, source), _way_m(site, source)
+    ways = [*_echoes(source, site, receiver, rng), *_edges(source, site, receiver, lit)]
+    waves = np.zeros((len(ways), receiver.samples), np.float32)
+    for wave, way in zip(waves, ways, strict=True):
+        made = emission.table(way.gain * length[:, None])
+        if made is not None:
+            table, span = made
+            if way.early < 1.0:
+                table = _smeared(table, way.early, way.decay_s, rng)
+            later = length[span] + way.later_m
+            add_along(wave, table, emission.knots_s[span], later, receiver.knots_s)
+    directions = unit_vectors(*np.array([(way.azimuth_rad, way.elevation_rad) for way in ways]).T)
+    delays = plane_wave_delays(directions, receiver.positions_m - receiver.centre_m)
+    static.add(waves, delays + receiver.skew_s)
+    _add_straight(static.out, emission, source, lit, receiver)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Way:
+    """A direction from which a source is heard."""
+
+    azimuth_rad: float
+    elevation_rad: float
+    gain: FloatArray  # shape (T, 8): Against the pressure at 1 m
+    early: float = 1.0  # Share of the energy that is an echo; the rest decays
+    decay_s: float = 0.0
+    later_m: float = 0.0  # Beyond the way by the mouth
+
+
+def _echoes(source: TracedSource, site: Site, receiver: Receiver, rng: np.random.Generator) -> list[_Way]:
+    """Return the directions from which rays came."""
+    here = reached(site, round(float(receiver.centre_m[2]), 3))
     energy = _at(here.energy, source.x_m, source.y_m)
     loud = energy.sum(axis=2).max(axis=0)
-    used = np.flatnonzero(loud > FAINTEST * loud.max())
-    lit, length = _lit(site, source), _way_m(site, source)
-    elevation = np.abs(ELEVATION_RAD * rng.standard_normal(DIRECTIONS))
-    places = [(site.corner_ahead_m, site.corner_left_m), (site.corner_ahead_m, -site.corner_right_m)]
-    bent = np.array([np.arctan2(y, x) for x, y in places])
-    middle = len(source.x_m) // 2
-    over = np.arctan2(source.y_m[middle], source.x_m[middle])
-    azimuth, tilt = np.r_[azimuths_rad()[used], bent, over], np.r_[elevation[used], 0.0, 0.0, ROOF_RAD]
-    waves = np.zeros((len(used) + 3, receiver.samples), np.float32)
-    knots = emission.knots_s
-    for wave, direction in zip(waves, used, strict=False):
-        made = emission.table(np.sqrt(energy[:, direction]) * length[:, None])
-        if made is not None:
-            table = _smeared(made[0], float(here.early[direction]), here.decay_s, rng)
-            later = length + rng.exponential(3.0)  # echoes do not come all at once
-            add_along(wave, table, knots[made[1]], later[made[1]], receiver.knots_s)
-    behind = [(1.0 - lit) * (np.sign(source.y_m) == np.sign(y)) for _, y in places]
-    gains = [corner_gain(one, source.x_m, source.y_m) for one in places]
-    gains, behind = [*gains, _roof_gain(source, receiver)], [*behind, 1.0 - lit]
-    for wave, gain, share in zip(waves[len(used) :], gains, behind, strict=True):
-        made = emission.table(gain * (share * length)[:, None])
-        if made is not None:
-            add_along(wave, made[0], knots[made[1]], length[made[1]], receiver.knots_s)
-    delays = plane_wave_delays(unit_vectors(azimuth, tilt), receiver.positions_m - receiver.centre_m)
-    static.add(waves, delays + receiver.skew_s)
+    # Echoes do not come all at once.
+    return [
+        _Way(
+            azimuths_rad()[k],
+            abs(ELEVATION_RAD * rng.standard_normal()),
+            np.sqrt(energy[:, k]),
+            float(here.early[k]),
+            here.decay_s,
+            rng.exponential(LATER_M),
+        )
+        for k in np.flatnonzero(loud > FAINTEST * loud.max())
+    ]
+
+
+def _edges(source: TracedSource, site: Site, receiver: Receiver, lit: FloatArray) -> list[_Way]:
+    """Return the ways round both corners and over the nearest roof, of a source that is not seen."""
+    x, y, ways = source.x_m, source.y_m, []
+    for across in (site.corner_left_m, -site.corner_right_m):
+        place = site.corner_ahead_m, across
+        gain = corner_gain(place, x, y) * ((1.0 - lit) * (np.sign(y) == np.sign(across)))[:, None]
+        ways.append(_Way(float(np.arctan2(*place[::-1])), 0.0, gain))
+    middle = len(x) // 2
+    over = _roof_gain(source, receiver) * (1.0 - lit)[:, None]
+    return [*ways, _Way(float(np.arctan2(y[middle], x[middle])), ROOF_RAD, over)]
+
+
+def _add_straight(
+    out: Float32Array, emission: Emission, source: TracedSource, lit: FloatArray, receiver: Receiver
+) -> None:
+    """Add what reaches every microphone along the straight line."""
     made = emission.table(np.repeat(lit[:, None], len(OCTAVES_HZ), axis=1))
-    if made is not None:
-        table, span = made
+    if made is None:
+        return
+    table, span = made
 
-        def travel(position: FloatArray) -> FloatArray:
-            rise = position[2] - source.height_m
-            flat = np.hypot(source.x_m[span] - position[0], source.y_m[span] - position[1])
-            return np.asarray(np.hypot(flat, rise))
+    def travel(position: FloatArray) -> FloatArray:
+        rise = position[2] - source.height_m
+        flat = np.hypot(source.x_m[span] - position[0], source.y_m[span] - position[1])
+        return np.asarray(np.hypot(flat, rise))
 
-        add_to_all(static.out, table, knots[span], travel, receiver)
+    add_to_all(out, table, emission.knots_s[span], travel, receiver)
 
 
 def _roof_gain(source: TracedSource, receiver: Receiver) -> FloatArray:

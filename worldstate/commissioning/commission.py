@@ -30,7 +30,6 @@ from worldstate.simulation.stream.settings import StreamSettings
 
 from .guard_training import CHOSEN_FOR_GUARD, close_rows, train_guard
 from .heard_stream import (
-    HAZARD_FREE,
     CommissionSettings,
     HeardStream,
     exam_streams,
@@ -130,7 +129,7 @@ def learn_sequence(
         model = train_sequence([labelled[i] for i in range(len(streams)) if i not in outside], rng)
         margins.append(calibrated_margin_s(model, [labelled[i] for i in outside]))
         for i in outside:
-            if streams[i].hops.about["traffic"] == HAZARD_FREE:
+            if streams[i].hazard_free:
                 quiet.setdefault(streams[i].site, []).append(model.posterior(labelled[i].evidence))
         on_step()
     alarm, margin_s = alarm_elsewhere(list(quiet.values()), onsets_per_hour), float(np.mean(margins))
@@ -149,7 +148,7 @@ def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:
 
 def _weights(streams: Sequence[HeardStream]) -> FloatArray:
     """Return what a hop of each stream counts, so that hazard-free time has its share of use."""
-    free = np.array([one.hops.about["traffic"] == HAZARD_FREE for one in streams])
+    free = np.array([one.hazard_free for one in streams])
     hops = np.array([len(one.hops) for one in streams])
     quiet = HAZARD_FREE_SHARE / max(hops[free].sum(), 1)
     approaching = (1.0 - HAZARD_FREE_SHARE) / max(hops[~free].sum(), 1)

@@ -33,6 +33,8 @@ from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
 # Hazards one after another; a moving ego has one a drive, with the arrivals that its model learned.
 PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
+# What is near or loud and never comes, learned at every other two junctions, in streets of both renderers.
+MISLEADING, TRACED_SEEDS = "misleading", 500
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
@@ -109,16 +111,33 @@ def quick_settings(settings: CommissionSettings) -> CommissionSettings:
 
 
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
-    """Return the streams that a model learns from: drawn junctions, none of the five with a name."""
-    motion = settings.sites[0][0]
-    names = {i: f"{motion}{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
-    return _streams(names, LEARNED_SEED, settings.approach_minutes, settings.hazard_free_minutes, settings)
+    """Return the streams that a model learns from: drawn junctions, none of the five with a name.
+
+    Beside them, for an ego that stands, half as many of the second renderer.
+    """
+    names = {i: f"{settings.sites[0][0]}{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
+    approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
+    found = _streams(names, LEARNED_SEED, _usual(approaching, quiet, settings), settings)
+    if settings.moving_ego:
+        return found
+    some = {i: name for i, name in names.items() if i % 4 < 2}
+    traced = {TRACED_SEEDS + i: f"T{name[1:]}" for i, name in some.items()}
+    found += _streams(traced, LEARNED_SEED, {PAIRS: approaching, MISLEADING: quiet}, settings)
+    return found + _streams(some, LEARNED_SEED, {MISLEADING: quiet}, settings)
+
+
+def _usual(
+    approach_minutes: float, hazard_free_minutes: float, settings: CommissionSettings
+) -> dict[str, float]:
+    hazards = APPROACHES if settings.moving_ego else PAIRS
+    return {hazards: approach_minutes, HAZARD_FREE: hazard_free_minutes}
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams of an exam: the five junctions with a name, twenty singles of each and more."""
     names = {i: name for i, name in enumerate(settings.sites) if i == MOUNTING or not settings.quick}
-    return _streams(names, EXAM_SEED, 0.6 * settings.exam_minutes, settings.exam_minutes, settings)
+    minutes = _usual(0.6 * settings.exam_minutes, settings.exam_minutes, settings)
+    return _streams(names, EXAM_SEED, minutes, settings)
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
@@ -132,17 +151,11 @@ def junction_named(name: str) -> Site:
 
 
 def _streams(
-    names: Mapping[int, str],
-    first_seed: int,
-    approach_minutes: float,
-    hazard_free_minutes: float,
-    settings: CommissionSettings,
+    names: Mapping[int, str], first_seed: int, minutes_of: Mapping[str, float], settings: CommissionSettings
 ) -> list[StreamSettings]:
-    """Return two streams of every numbered junction, or as many drives as last so long."""
+    """Return a stream of each traffic at every numbered junction, or as many drives as last so long."""
     found: list[StreamSettings] = []
-    hazards = APPROACHES if settings.moving_ego else PAIRS
-    kinds = ((hazards, approach_minutes), (HAZARD_FREE, hazard_free_minutes))
-    for (number, name), (traffic, minutes) in product(names.items(), kinds):
+    for (number, name), (traffic, minutes) in product(names.items(), minutes_of.items()):
         own = first_seed + number + SEEDS_EACH * settings.seed
         whole = StreamSettings(
             junction_named(name),

@@ -8,7 +8,8 @@ passed, how true times and bearings are, and what a meter reaches that measures 
 place was. Then, of the second vehicle from the other side and of the one behind, by the gap to the first: the
 chance to come within three seconds where it adds a decibel to the sound and where it adds less, and what
 becomes of its entity. How much it adds stands first, last the trade between naming both sides of two and the
-other side of one. "worst" is of the junctions with eight cases or more.
+other side of one, and onsets an hour by kind of hazard-free traffic. "worst" is of the junctions with eight
+cases or more.
 
 The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
 
@@ -29,7 +30,13 @@ from worldstate.cli.common.progress import track
 from worldstate.operations.metrics.approach_table import Figures
 from worldstate.simulation.parallel import in_processes
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
-from worldstate_lab.passes.pass_outcomes import hearing_allows, pass_figures, second_figures, sides_by_risk
+from worldstate_lab.passes.pass_outcomes import (
+    hearing_allows,
+    onsets_by_traffic,
+    pass_figures,
+    second_figures,
+    sides_by_risk,
+)
 from worldstate_lab.report.table import figure_lines
 
 
@@ -60,10 +67,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     every = [one for some in streams.values() for one in some]
     figures = {site: _figures(streams[site]) for site in sorted(streams)}
     columns = figures | {"worst": worst_of(figures), "all": _figures(every)}
-    added, sides = hearing_allows(every), sides_by_risk(every)
+    added, sides, quiet = hearing_allows(every), sides_by_risk(every), onsets_by_traffic(every)
     report = {**given, "junctions": columns, "second_adds_db": added, "sides_by_risk": sides}
+    report["hazard_free"] = quiet
     lines = ["dB that a second vehicle adds, so long before its own T0", *figure_lines(added, ".1f"), ""]
     lines += [*figure_lines(columns, ".3f"), "", "sides named by risk", *figure_lines(sides, ".3f")]
+    lines += ["", "without hazards", *figure_lines(quiet, ".3f")]
     return CommandResult(report, table={}, lines=lines)
 
 

@@ -203,6 +203,17 @@ def sides_by_risk(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
     return found
 
 
+def onsets_by_traffic(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
+    """Return how often streams of each traffic without hazards are warned of."""
+    found: dict[str, list[tuple[HeardStream, BoolArray]]] = {}
+    for one in streams:
+        if one.heard.hazard_free:
+            found.setdefault(str(one.heard.hops.about["traffic"]), []).append(
+                (one.heard, one.followed.advisory)
+            )
+    return {name: approach_table(some).false_alarms() for name, some in sorted(found.items())}
+
+
 def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Figures:
     """Return what "louder than the place was" reaches at as many onsets an hour."""
     quiet = [above_place_db(one.heard) for one in streams if one.heard.hazard_free]
