@@ -148,6 +148,8 @@ def test_false_alarms_break_the_budget_and_raise_the_threshold_that_decides() ->
     verdicts = [state.budget.verdict for state in told]
     assert sorted(set(verdicts), key=verdicts.index) == ["kept", "in doubt", "broken"]
     assert last.budget.why == "more false onsets than the budget"
+    policed = replace(world, policy=replace(world.policy, alpha=0.1)).state
+    assert not policed.calibrated and policed.budget == last.budget
     assert last.budget.tally.false_onsets > 4 and 0.0 < last.budget.threshold_shift_nats <= 2 * HALVING_NATS
     for state in told:
         assert state.budget.onsets_per_hour == 4.0

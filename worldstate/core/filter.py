@@ -117,6 +117,8 @@ class WorldFilter:
         deaf = heard is not None and all(one.share < LEAST_HEARD for one in heard)
         # Those of the last step hold until time passes, or odometry moves the place.
         is_fresh = memory is self._lag.latest and memory.ego is None
+        budget = None if memory.sequence is None else memory.sequence.budget(memory.stamp_ns)
+        broken = budget is not None and budget.verdict == "broken"
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.counts.measurements,
@@ -124,7 +126,7 @@ class WorldFilter:
             relations=memory.relations if is_fresh else relations_at(memory, tracks, context),
             context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
-            calibrated=self.policy.alpha > 0.0 and not deaf,
+            calibrated=self.policy.alpha > 0.0 and not deaf and not broken,
             bearing=last.bearing,
             domain=last.domain,
             no_sequence=last.no_sequence,
@@ -135,7 +137,7 @@ class WorldFilter:
             events=last.events,
             heard=heard,
             ego=None if memory.ego is None else ego_of(memory.ego),
-            budget=None if memory.sequence is None else memory.sequence.budget(memory.stamp_ns),
+            budget=budget,
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":

@@ -43,8 +43,8 @@ class WorldState:
     clock : {"media", "unix", "monotonic"}
         What `stamp_ns` counts from.
     calibrated : bool
-        Whether the cues hold to a false-alarm budget, of a model that is used for what it was made for. Where
-        not, no cue states an alpha.
+        Whether the cues hold to a false-alarm budget, of a model that is used for what it was made for; where
+        it is not, no cue states an alpha. False, too, while nothing can be heard or the budget is broken.
     bearing : Bearing or None
         Loudest source of the last measurement, with its standard deviation; None where it had no bearing.
     domain : Familiar, Foreign, WarningSignal or None
