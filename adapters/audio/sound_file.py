@@ -257,7 +257,7 @@ def _check(source: AudioSource) -> None:
     if source.frames == 0:
         raise InputFileError(source.path, "expected samples, the recording is empty")
     source.span(source.frames - 1, 1)  # which a FLAC file that was cut short cannot give
-    source.silent_channels = constant_channels(source.span(0, source.sample_rate_hz))
+    source.silent_channels = constant_channels(source.span(0, min(source.sample_rate_hz, source.frames)))
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:

@@ -375,8 +375,7 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
 def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
-    levels = replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder)
-    settings = replace(drawn, preset=levels)
+    settings = replace(drawn, preset=replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder))
     if wanted.bandwidth_hz is not None:
         settings = replace(settings, sample_rate_hz=rate_for(wanted.bandwidth_hz))
     if wanted.sounds:

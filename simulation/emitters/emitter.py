@@ -5,7 +5,6 @@ A folder of recordings holds a folder a kind, named as in `SOUNDS`, with WAV or 
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -80,23 +79,20 @@ def emitted(
 
 def sound_files(folder: str, kind: str) -> list[Path]:
     """Return the recordings of a kind in a folder of them, in the order of their names."""
-    if not folder or not (where := Path(folder) / kind).is_dir():
-        return []
-    return sorted(path for path in where.iterdir() if path.suffix.lower() in SUFFIXES)
+    found = Path(folder, kind).glob("*") if folder else ()
+    return sorted(path for path in found if path.suffix.lower() in SUFFIXES)
 
 
 def recorded_kinds(folder: str) -> tuple[str, ...]:
     """Return the kinds that a folder has recordings of; refuse other names, and what cannot be read."""
-    where = Path(folder)
-    there = where.iterdir() if where.is_dir() else ()
-    kinds = sorted(path.name for path in there if path.is_dir() and not path.name.startswith("."))
-    files = {kind: sound_files(folder, kind) for kind in kinds}
-    strange = [kind for kind in kinds if kind not in SYNTHESES or not 1 <= len(files[kind]) <= MOST_FILES]
-    if strange or not kinds:
-        told = f"expected folders of 1 to {MOST_FILES} WAV or FLAC files named {', '.join(SYNTHESES)}"
-        raise InputFileError(where, f"{told}, got {strange[0] if strange else 'none'}")
-    for path in chain.from_iterable(files.values()):
-        open_audio(path, strict=False, short=True).close()
+    kinds = sorted(path.name for path in Path(folder).glob("[!.]*") if path.is_dir())
+    for kind in kinds or ["none"]:
+        files = sound_files(folder, kind)
+        if kind not in SYNTHESES or not 1 <= len(files) <= MOST_FILES:
+            told = f"expected folders of 1 to {MOST_FILES} WAV or FLAC files named {', '.join(SYNTHESES)}"
+            raise InputFileError(folder, f"{told}, got {kind} with {len(files)}")
+        for path in files:
+            open_audio(path, strict=False, short=True).close()
     return tuple(kinds)
 
 

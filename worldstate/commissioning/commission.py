@@ -56,7 +56,6 @@ from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
 FOLDS = 4
 LEARNING_STEPS = 2 * FOLDS + 2
 LEAST_ONSETS = 3.0
-CLIPS_EACH_QUICK = 2
 SIMULATED = "simulated streets"
 # Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
 HAZARD_FREE_SHARE = 120.0 / 192.0
@@ -200,12 +199,12 @@ def commission(
         simulated=beside,
     )
     on_step()
-    # What streets sound like is learned from several of them: two are none that are left out. Recorded clips
-    # are tried all the same, beside a few simulated ones.
+    # What streets sound like is learned from several of them: two are none that are left out. With recorded
+    # clips it is tried all the same, beside two simulated ones a kind.
     guard = road_users = None
     about = model.provenance.classifier
     if recorded is not None or not settings.quick:
-        close = close_rows(rate_hz, rng, CLIPS_EACH_QUICK if settings.quick else CLIPS_EACH, jobs)
+        close = close_rows(rate_hz, rng, 2 if settings.quick else CLIPS_EACH, jobs)
         if recorded is not None:
             close = SoundRows.joined([close, recorded.rows])
             about = f"{about}; {recorded.told}"
