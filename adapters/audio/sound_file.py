@@ -179,7 +179,9 @@ class SilentChannelsError(InputFileError):
         self.channels = channels
 
 
-def open_audio(path: str | Path, expect_channels: int | None = None, *, strict: bool = True) -> AudioSource:
+def open_audio(
+    path: str | Path, expect_channels: int | None = None, *, strict: bool = True, short: bool = False
+) -> AudioSource:
     """Open a WAV, RF64, W64 or FLAC recording and check what can be checked before the first block.
 
     FLAC holds 8 channels at most and WAV 4 GiB, nine minutes of 56 channels: use RF64 or W64 beyond.
@@ -193,6 +195,8 @@ def open_audio(path: str | Path, expect_channels: int | None = None, *, strict: 
     strict : bool
         True: a silent channel is an error. False: so is only a recording with more silent channels than
         others; `AudioSource.silent_channels` lists them, and the front-end leaves them out.
+    short : bool
+        Whether it may be shorter than one second.
 
     Returns
     -------
@@ -221,7 +225,8 @@ def open_audio(path: str | Path, expect_channels: int | None = None, *, strict: 
     name = Path(path)
     source = AudioSource(name, _open_file(name))
     try:
-        _check(source, expect_channels)
+        _check(source)
+        (source.check_channels if short else source.check_size)(expect_channels)
         source.check_silence(strict)
     except BaseException:
         source.close()
@@ -244,16 +249,15 @@ def _open_file(path: Path) -> Any:
     return file
 
 
-def _check(source: AudioSource, expect_channels: int | None) -> None:
+def _check(source: AudioSource) -> None:
     size = data_size(source.path)
     if size is not None and size[0] > size[1]:
         problem = f"cut short: expected {size[0]} bytes of samples by its header, got {size[1]}"
         raise InputFileError(source.path, problem)
     if source.frames == 0:
         raise InputFileError(source.path, "expected samples, the recording is empty")
-    source.check_size(expect_channels)
     source.span(source.frames - 1, 1)  # which a FLAC file that was cut short cannot give
-    source.silent_channels = constant_channels(source.span(0, source.sample_rate_hz))
+    source.silent_channels = constant_channels(source.span(0, min(source.sample_rate_hz, source.frames)))
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:

@@ -103,6 +103,8 @@ class DatasetSettings:
         What else sounds in every recording, of `SOUNDS`; a vehicle's signal is its own where there is one.
     preset : str
         Name of the levels of everything that is not geometry.
+    sounds_folder : str
+        Recordings, a folder a kind of sound, that take the place of synthesis; none where empty.
 
     Raises
     ------
@@ -126,6 +128,7 @@ class DatasetSettings:
     preset: str = DEFAULT_PRESET
     sounds: tuple[str, ...] = ()
     bandwidth_hz: float | None = None
+    sounds_folder: str = ""
 
     def __post_init__(self) -> None:
         in_range("n_static", self.n_static, 0, MAX_RECORDINGS)
@@ -372,7 +375,7 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
 def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
-    settings = replace(drawn, preset=preset(wanted.preset))
+    settings = replace(drawn, preset=replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder))
     if wanted.bandwidth_hz is not None:
         settings = replace(settings, sample_rate_hz=rate_for(wanted.bandwidth_hz))
     if wanted.sounds:

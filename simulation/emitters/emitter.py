@@ -1,10 +1,18 @@
-"""Sounds of a kind at its level: pressure at 1 m, at any sample rate."""
+"""Sounds of a kind at its level: pressure at 1 m, at any sample rate; drawn, or cut out of recordings.
 
-from collections.abc import Callable
+A folder of recordings holds a folder a kind, named as in `SOUNDS`, with WAV or FLAC files of that kind.
+"""
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
+import scipy.signal
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
+from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.settings import SoundKind
@@ -46,15 +54,72 @@ TRANSITION = 0.05  # of the Nyquist frequency, below it
 BLOCK_S, LOUD_DB = 0.125, 10.0
 
 
-def emitted(kind: SoundKind, samples: int, sample_rate_hz: float, rng: np.random.Generator) -> Float32Array:
+SUFFIXES, MOST_FILES = (".wav", ".flac"), 10_000
+# Of a recording so much is read, and its level is that of this part: a stretch between two barks is silent,
+# and shall not be made as loud as a bark.
+READ_S = 60.0
+FINEST = 1000  # Denominator of the ratio of two rates: less than a millionth off
+
+
+def emitted(
+    kind: SoundKind, samples: int, sample_rate_hz: float, rng: np.random.Generator, sounds_folder: str = ""
+) -> Float32Array:
     """Draw a sound at its level: pressure in Pa at 1 m in front, in the free field, shape (samples,)."""
     factor = int(np.ceil(LOWEST_RATE_HZ / sample_rate_hz))
-    rate = factor * sample_rate_hz
-    drawn = SYNTHESES[kind.name](max(samples, int(LEVEL_FROM_S * sample_rate_hz)) * factor, rate, rng)
-    drawn *= REFERENCE_PA * 10.0 ** (kind.level_db / 20.0) / loud_pressure(a_weighted(drawn, rate), rate)
-    piece = drawn[: samples * factor]
-    piece = piece * gate(len(piece), rate, [(0.0, len(piece) / rate)], EDGE_S)
+    rate, length = factor * sample_rate_hz, samples * factor
+    pressure_pa = REFERENCE_PA * 10.0 ** (kind.level_db / 20.0)
+    if files := sound_files(sounds_folder, kind.name):
+        piece = pressure_pa * _recorded(files, length, rate, rng)
+    else:
+        piece = SYNTHESES[kind.name](max(samples, int(LEVEL_FROM_S * sample_rate_hz)) * factor, rate, rng)
+        piece *= pressure_pa / loud_pressure(a_weighted(piece, rate), rate)
+        piece = _with_edges(piece[:length], rate)
     return _band_limited(piece, factor).astype(np.float32)
+
+
+def sound_files(folder: str, kind: str) -> list[Path]:
+    """Return the recordings of a kind in a folder of them, in the order of their names."""
+    found = Path(folder, kind).glob("*") if folder else ()
+    return sorted(path for path in found if path.suffix.lower() in SUFFIXES)
+
+
+def recorded_kinds(folder: str) -> tuple[str, ...]:
+    """Return the kinds that a folder has recordings of; refuse other names, and what cannot be read."""
+    kinds = sorted(path.name for path in Path(folder).glob("[!.]*") if path.is_dir())
+    for kind in kinds or ["none"]:
+        files = sound_files(folder, kind)
+        if kind not in SYNTHESES or not 1 <= len(files) <= MOST_FILES:
+            told = f"expected folders of 1 to {MOST_FILES} WAV or FLAC files named {', '.join(SYNTHESES)}"
+            raise InputFileError(folder, f"{told}, got {kind} with {len(files)}")
+        for path in files:
+            open_audio(path, strict=False, short=True).close()
+    return tuple(kinds)
+
+
+def _recorded(files: Sequence[Path], samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Return stretches of recordings one after another until they are long enough, of level one."""
+    pieces, missing = list[FloatArray](), samples
+    while missing > 0:
+        sound = _read(files[int(rng.integers(len(files)))], missing, rate_hz, rng)
+        first = int(rng.integers(max(len(sound) - missing, 0) + 1))
+        pieces.append(_with_edges(sound[first : first + missing], rate_hz))
+        missing -= len(pieces[-1])
+    return np.concatenate(pieces)
+
+
+def _read(path: Path, samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Return the first channel of a recording or of a part of it, of level one, shape (n,)."""
+    with open_audio(path, strict=False, short=True) as source:
+        own_hz = source.sample_rate_hz
+        length = min(source.frames, round(max(READ_S, samples / rate_hz + 1.0) * own_hz))
+        sound = source.span(int(rng.integers(source.frames - length + 1)), length)[:, 0]
+    ratio = Fraction(rate_hz / own_hz).limit_denominator(FINEST)
+    heard = scipy.signal.resample_poly(sound.astype(np.float64), ratio.numerator, ratio.denominator)
+    return np.asarray(heard / (loud_pressure(a_weighted(heard, rate_hz), rate_hz) + np.finfo(float).tiny))
+
+
+def _with_edges(piece: FloatArray, rate_hz: float) -> FloatArray:
+    return piece * gate(len(piece), rate_hz, [(0.0, len(piece) / rate_hz)], EDGE_S)
 
 
 def a_weight(frequency_hz: FloatArray) -> FloatArray:
@@ -77,7 +142,7 @@ def a_weighted(signal: FloatArray, rate_hz: float) -> FloatArray:
 
 def loud_pressure(signal: FloatArray, rate_hz: float) -> float:
     """RMS over the eighths of a second that are within 10 dB of the loudest."""
-    block = int(BLOCK_S * rate_hz)
+    block = min(int(BLOCK_S * rate_hz), len(signal))
     power = np.square(signal[: len(signal) // block * block]).reshape(-1, block).mean(axis=1)
     return float(np.sqrt(power[power >= power.max() * 10.0 ** (-LOUD_DB / 10.0)].mean()))
 

@@ -117,7 +117,7 @@ def add_sound(
     before = SILENT_BLOCKS * KNOT_SAMPLES
     signal = np.zeros(blocks * KNOT_SAMPLES, np.float32)
     level = np.float32(10.0 ** (sound.level_offset_db / 20.0))
-    signal[before : before + samples] = level * emitted(sound.what, samples, rate, rng)
+    signal[before : before + samples] = level * emitted(sound.what, samples, rate, rng, preset.sounds_folder)
     time = sound.start_s + (np.arange(blocks + 1) - SILENT_BLOCKS) * KNOT_SAMPLES / rate
     track = SoundTrack(time, *sound.at(time), sound.facing(time))
     _add_from(static, signal, track, sound.what, site, preset, receiver, rng)
@@ -139,7 +139,7 @@ def add_signal(
     heading = np.arctan2(kind.faces * (front_y - rear_y), kind.faces * (front_x - rear_x))
     place = (front_x, front_y) if kind.faces > 0.0 else (rear_x, rear_y)
     track = SoundTrack(path.time_s, *place, heading)
-    pressure = emitted(kind, samples, receiver.sample_rate_hz, rng)
+    pressure = emitted(kind, samples, receiver.sample_rate_hz, rng, preset.sounds_folder)
     _add_from(static, pressure, track, kind, site, preset, receiver, rng)
 
 

@@ -249,12 +249,8 @@ def _semitones(chord: np.ndarray[tuple[int], np.dtype[np.int64]], note: int) -> 
 
 
 # Notes of a major scale over a tonic, how long they are and how they decay (assumed): any instrument.
-SCALE, TUNE_TONIC_HZ, NOTE_S, NOTE_DECAY_S = (
-    (0, 2, 4, 5, 7, 9, 11, 12),
-    (150.0, 700.0),
-    (0.12, 0.8),
-    (0.3, 3.0),
-)
+SCALE, TUNE_TONIC_HZ = (0, 2, 4, 5, 7, 9, 11, 12), (150.0, 700.0)
+NOTE_S, NOTE_DECAY_S = (0.12, 0.8), (0.3, 3.0)
 VIBRATO, VIBRATO_HZ, MOST_PARTS = 0.006, 5.5, 4
 
 

@@ -104,6 +104,8 @@ class Preset:
         Share of the energy that rough walls scatter instead of mirroring it, at high frequencies, 0..1.
     late_lobe_share : float
         Share of the late field that comes from a site's own directions.
+    sounds_folder : str
+        Folder with recordings, a folder a kind of sound, that take the place of synthesis; none where empty.
 
     Raises
     ------
@@ -146,6 +148,7 @@ class Preset:
     screen_cap_db: float = _within(5.0, 60.0, 24.0)
     wall_scattering: float = _within(0.0, 1.0, 0.15)
     late_lobe_share: float = _within(0.0, 1.0, 0.75)
+    sounds_folder: str = ""
 
     def __post_init__(self) -> None:
         octaves = finite_array("ambient_octaves_db", self.ambient_octaves_db, (8,))

@@ -27,12 +27,8 @@ from .manoeuvres import LEFT, Manoeuvre, Motion
 from .rendering import FADE_S, Microphones, event_sound
 
 # Passes at 2 to 12 m, the microphone 1 to 2 m above the road.
-DISTANCES_M, HEIGHTS_M, SPEEDS_MPS, ACCELERATIONS_MPS2 = (
-    (2.0, 12.0),
-    (1.0, 2.0),
-    (5.0, 16.0),
-    (0, 0, 0, 1.2, -1.5),
-)
+DISTANCES_M, HEIGHTS_M = (2.0, 12.0), (1.0, 2.0)
+SPEEDS_MPS, ACCELERATIONS_MPS2 = (5.0, 16.0), (0, 0, 0, 1.2, -1.5)
 FAR_M = 300.0
 # Spread of single vehicles about their kind, and of recorders and ambience; dB, by octave.
 _VEHICLE_DB, _RECORDER_DB, _MOST_DB, _TILT_DB, _CUTS_HZ = 4.0, 3.0, 6.0, 1.0, (30.0, 150.0)

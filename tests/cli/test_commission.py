@@ -1,5 +1,6 @@
 """`worldstate model make` from an array file to a model that can be read, and its exam."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -71,3 +72,38 @@ def test_an_ego_that_drives_gets_a_sequence_of_its_own(tmp_path: Path) -> None:
     assert model.domain is not None and model.domain.ego_motion == "moving"
     assert model.sequence is not None and model.sequence.alarm is not None
     assert model.sequence.alarm.onsets_per_hour == 60.0
+
+
+def clips_of(folder: Path, road_user: str) -> list[str]:
+    """Write a clip and its table; return the options that learn from it."""
+    rng = np.random.default_rng(2)
+    soundfile.write(folder / "clip.wav", 0.1 * rng.standard_normal(3 * 16_000), 16_000)
+    (folder / "clips.csv").write_text(f"file,kind,recording,road_user\nclip.wav,pump,r,{road_user}\n")
+    return ["--sounds", str(folder), "--kinds", str(folder / "clips.csv")]
+
+
+def test_clips_that_cannot_be_learned_are_refused_before_anything_is_rendered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["model", "make", "--quick", "--out", str(tmp_path / "model.json")]
+    for options, told in (
+        (["--kinds", "clips.csv"], "--sounds, --kinds: expected both"),
+        (clips_of(tmp_path, "ufo"), "clips.csv: line 2: road_user"),
+    ):
+        assert main([*command, *options]) == 2
+        assert told in capsys.readouterr().err
+    assert not (tmp_path / "model.streams").exists()
+
+
+@pytest.mark.slow
+def test_a_model_of_recorded_clips_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mics.csv").write_text(ARRAY)
+    out, options = tmp_path / "model.json", clips_of(tmp_path, "")
+    command = ["model", "make", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]
+    assert main([*command, "--no-exam", *options]) == 0
+    model = read_model(out)
+    assert model.guard is not None and "pump" in model.guard.foreign
+    assert model.road_users is not None and not model.provenance.fit_for_use
+    digest = hashlib.sha256((tmp_path / "clips.csv").read_bytes()).hexdigest()
+    for told in (model.provenance.classifier, capsys.readouterr().out):
+        assert "pump 1" in told and digest in told and "not the project's own" in told

@@ -28,7 +28,7 @@ from worldstate.operations.training.training import TrainingSettings, train_mode
 from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.stream.settings import StreamSettings
 
-from .guard_training import CHOSEN_FOR_GUARD, close_rows, train_guard
+from .guard_training import CHOSEN_FOR_GUARD, CLIPS_EACH, SoundRows, close_rows, train_guard
 from .heard_stream import (
     CommissionSettings,
     HeardStream,
@@ -39,6 +39,7 @@ from .heard_stream import (
     mounting_streams,
     mountings,
 )
+from .recorded_clips import RecordedClips
 from .road_user_training import CHOSEN_FOR_ROAD_USERS, fit_road_users, road_user_rows, with_close
 from .sequence_training import LabelledStream, calibrated_margin_s, stream_truth, train_sequence
 from .simulated_windows import (
@@ -164,13 +165,15 @@ def commission(
     source: str = "labelled windows",
     excluded_lists: Sequence[str] = (),
     quiet: Sequence[Path] = (),
+    recorded: RecordedClips | None = None,
     jobs: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
     """Make a model for an array from simulated streets, and from labelled windows where there are any.
 
-    Recordings without vehicles set the alarm in place of the simulated streets without hazards. The model
-    says where the labelled windows come from and which lists of them were left out.
+    Recordings without vehicles set the alarm in place of the simulated streets without hazards; guard and
+    road users are learned from recorded clips as well. The model says where the labelled windows and the
+    clips come from and which lists of windows were left out.
     """
     check_extra("sklearn")
     streams, rng = [], np.random.default_rng(settings.seed)
@@ -195,11 +198,15 @@ def commission(
         simulated=beside,
     )
     on_step()
-    # What streets sound like is learned from several of them: two are none that are left out.
+    # What streets sound like is learned from several of them: two are none that are left out. With recorded
+    # clips it is tried all the same, beside two simulated ones a kind.
     guard = road_users = None
     about = model.provenance.classifier
-    if not settings.quick:
-        close = close_rows(rate_hz, rng, jobs=jobs)
+    if recorded is not None or not settings.quick:
+        close = close_rows(rate_hz, rng, 2 if settings.quick else CLIPS_EACH, jobs)
+        if recorded is not None:
+            close = SoundRows.joined([close, recorded.rows])
+            about = f"{about}; {recorded.told}"
         guard = train_guard(array, streams, close, rng, jobs)
         sites = list(dict.fromkeys(one.site for one in streams))
         passes = road_user_rows(array, sites, rate_hz, rng, jobs=jobs)

@@ -313,9 +313,14 @@ def street_excesses(rows: SoundRows) -> dict[str, FloatArray]:
 
 
 def fit_guard(rows: SoundRows, threshold: float = 0.0) -> DomainGuard:
-    """Fit the coefficients of a guard to all rows, with a threshold from elsewhere."""
-    foreign, signals = (_named(rows, names) for names in (FOREIGN, SIGNALS))
+    """Fit the coefficients of a guard to all rows, with a threshold from elsewhere.
+
+    A kind that the simulator does not have is a foreign sound of its own.
+    """
     names = {**dict.fromkeys((*STREET, ""), "street"), **FOREIGN, **SIGNALS}
+    others = {kind: kind for kind in np.unique(rows.kinds).tolist() if kind not in names}
+    foreign, signals = (_named(rows, kinds) for kinds in (FOREIGN | others, SIGNALS))
+    names |= others
     kept = ~np.isin(rows.kinds, (*STREET[:-1], "")) | (np.arange(len(rows.kinds)) % _EVERY == 0)
     order = ["street", *foreign, *signals]
     kinds = rows.kinds[kept]

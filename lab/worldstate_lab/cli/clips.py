@@ -27,12 +27,12 @@ from typing import Any
 import numpy as np
 
 from worldstate.abduction.road_users import DomainGuard, Familiar, Foreign, RoadUserModel
-from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.files.file_io import load_npz, read_rows
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
-from worldstate.commissioning.guard_training import IDLING, characters, rows_of_clip
+from worldstate.commissioning.guard_training import IDLING, rows_of_clip
+from worldstate.commissioning.recorded_clips import heard_clip
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
@@ -40,7 +40,7 @@ from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc
 from worldstate_lab.streets.set_classifiers import boosted_area
 
-LOWEST_RATE_HZ, MEMORY_S, MOST_SECONDS, MOST_BYTES = 8000.0, 2.1, 600.0, 1 << 30
+MOST_BYTES = 1 << 30
 NUMBERS = len(MEASURES) + len(BANDS)
 SAID, FOLDS = 0.9, 4
 # Which of the simulator's kinds a kind of clip is held against.
@@ -82,7 +82,7 @@ def read_clips(
     else:
         heard = []
         for row in rows:
-            heard.append(_heard(table.parent / row["file"]))
+            heard.append(heard_clip(table.parent / row["file"]))
             advance()
         measures, clip = np.concatenate(heard), np.repeat(np.arange(len(rows)), list(map(len, heard)))
     return ClipNumbers(measures, clip, said["kind"], said["recording"], said["road_user"])
@@ -98,16 +98,6 @@ def _archived(path: Path, clips: int) -> tuple[FloatArray, IndexArray]:
         return measures.astype(np.float64), clip.astype(np.intp)
 
     return load_npz(path, "numbers of clips", MOST_BYTES, read)
-
-
-def _heard(path: Path) -> FloatArray:
-    with open_audio(path) as source:
-        rate = float(source.sample_rate_hz)
-        in_range(f"{path}: sample rate", rate, LOWEST_RATE_HZ, 400_000.0)
-        in_range(f"{path}: seconds", source.frames / rate, 0.1, MOST_SECONDS)
-        sound = np.concatenate([block[:, 0] for block in source.blocks()])
-    lead = round(MEMORY_S * rate) if len(sound) < MEMORY_S * rate else 0
-    return characters(np.pad(sound, (lead, 0), mode="symmetric"), rate)[0]
 
 
 def judged(clips: ClipNumbers, guard: DomainGuard, model: RoadUserModel) -> dict[str, Any]:

@@ -4,6 +4,12 @@ Simulate streets for an array, listen to them, learn what a window and what thre
 the alarm to what hazard-free streets allow, and examine all of it on five other junctions: approaches
 detected, lead, alarms an hour, both sides, times to visible. Usable before any microphone is bought.
 
+--sounds FOLDER --kinds TABLE learns kinds of road users and the guard from clips of your own, too. TABLE is a
+CSV file with the columns file (below FOLDER), kind, recording and, optionally, road_user: car, van, truck,
+tram, motorcycle or bicycle. Every recording counts as much as a simulated clip. Any kind but siren, horn,
+reversing beeper, bicycle bell (warning signals) and street is a foreign sound. The model says that it was
+learned so.
+
 Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes on
 there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
 
@@ -12,6 +18,7 @@ Examples
   worldstate model make --array mics.csv --out my_model.json --streams streams --jobs 2
   worldstate model make --array mics.csv --out my_model.json --streams streams --quiet night.wav
   worldstate model make --array mics.csv --out my_model.json --streams streams --mounting-errors
+  worldstate model make --array mics.csv --out my_model.json --sounds my_sounds --kinds my_sounds/clips.csv
   worldstate model make --array mics.csv --out moving.json --streams streams --ego moving --jobs 2
   worldstate model make --array mics.csv --out try.json --quick
 """
@@ -22,9 +29,11 @@ from typing import TYPE_CHECKING
 
 from worldstate import adapters, frontend
 from worldstate.cli.common import command, inputs, output, progress
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.commissioning.heard_stream import CommissionSettings
+    from worldstate.commissioning.recorded_clips import RecordedClips
     from worldstate.operations.metrics.approach_table import Figures
 
 # Alarms an hour by what the ego does: its own noise leaves less to be heard of others.
@@ -49,6 +58,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
     quiet = "recordings without a vehicle: the alarm is set on them"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
+    add("--sounds", type=Path, metavar="FOLDER", help="clips of your own, which --kinds lists")
+    add("--kinds", type=Path, metavar="TABLE", help="file, kind, recording and road_user of each of --sounds")
     command.add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
     allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"
     add("--onsets", type=float, metavar="N", help=allowed)
@@ -73,6 +84,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     settings = _settings(arguments)
     folder = arguments.streams or arguments.out.with_suffix(".streams")
     array = inputs.given_array(arguments) or frontend.ovad_array()
+    recorded = _recorded(arguments)
     # Streams take nearly all of the time; what is learned from them counts as a few more.
     steps = len(heard_stream.learned_streams(settings)) + commission.LEARNING_STEPS
     with progress.progress_bar("commissioning", steps) as bar:
@@ -84,6 +96,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
             source=arguments.source or getattr(arguments.labelled, "name", ""),
             excluded_lists=[path.name for path in arguments.exclude],
             quiet=arguments.quiet,
+            recorded=recorded,
             jobs=arguments.jobs,
             on_step=bar.advance,
         )
@@ -107,6 +120,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         report["reference"] = dict(stream_exam.REFERENCE)
     if arguments.report is not None:
         output.write_report(arguments.report, report)
+    lines += [] if recorded is None else ["", recorded.told]
     lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
     return output.CommandResult(report, told, lines)
 
@@ -120,6 +134,20 @@ def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":
     group: Group = "dynamic" if arguments.ego == "moving" else "static"
     table = adapters.read_features(arguments.labelled).group(group)
     return table.without([name for path in arguments.exclude for name in read_ids(path)])
+
+
+def _recorded(arguments: argparse.Namespace) -> "RecordedClips | None":
+    """Hear the clips that are learned, too; None without any."""
+    from worldstate.adapters.files.file_io import read_rows
+    from worldstate.commissioning.recorded_clips import read_recorded
+
+    folder, table = arguments.sounds, arguments.kinds
+    if (folder is None) != (table is None):
+        raise InvalidArgumentError("--sounds, --kinds: expected both or none of them")
+    if table is None:
+        return None
+    with progress.progress_bar("hearing", len(list(read_rows(table, ("file",))))) as bar:
+        return read_recorded(folder, table, bar.advance)
 
 
 def _mounted(

@@ -11,7 +11,9 @@ ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound
 
 --sounds adds what is no vehicle at a drawn place, in every recording: people, bells, tools, music, birds,
 rain that may soil the lens, gusts. Sirens, horns and beepers are the vehicle's where there is one, and come
-from another street where there is none.
+from another street where there is none. In the list a folder stands for recordings of your own: it holds a
+folder a kind, named as the kind, with WAV or FLAC files. These kinds sound, and stretches of the files take
+the place of their synthesis, mono and at the level of the kind.
 
 --scene is another place, where the ego stands: a van ahead, piers at a ramp, a wall that ends at a merge, an
 open road, a wide crossing, a house on one side only, a parked van; "all" is every place and junction in turn.
@@ -30,6 +32,7 @@ Examples
 --------
   worldstate sim make --out sim --static 4 --seed 1
   worldstate sim make --out sim --dynamic 10 --kind electric --jobs 2
+  worldstate sim make --out sim --sounds my_sounds,rain
   worldstate sim make --out hours --minutes 60 --site SA1 --traffic busy --bandwidth 2000 --jobs 2
   worldstate run sim/SA1/left/1_00_0000
 """
@@ -62,8 +65,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     command.add_choice(parser, "--scene", "what hides the vehicle", JUNCTION, *simulation.PLACES, "all")
     command.add_choice(parser, "--kind", "vehicle", *simulation.KINDS)
     command.add_choice(parser, "--preset", "how busy the street is", *simulation.PRESETS)
-    told = f"what else sounds, separated by commas: {', '.join(simulation.SOUNDS)}"
-    add("--sounds", type=_words, default=(), metavar="KINDS", help=told)
+    told = f"what else sounds, separated by commas: {', '.join(simulation.SOUNDS)}; or a folder of recordings"
+    add("--sounds", type=_words, default=(), metavar="KINDS|FOLDER", help=told)
     inputs.add_array_options(parser, "OVAD's")
     add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -95,7 +98,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         "out": str(arguments.out),
         "recordings": len(rows),
         "approaches": sum(row.approach != "none" for row in rows),
-        **{name: getattr(arguments, name) for name in ("scene", "kind", "sounds", "preset", "seed")},
+        **{name: getattr(settings, name) for name in ("scene", "kind", "sounds", "preset", "seed")},
         "folders": [row.folder.as_posix() for row in rows],
     }
     return output.CommandResult(summary)
@@ -131,6 +134,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
     from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
+    kinds, folder = _sounds(arguments.sounds)
     rate_hz, band = SAMPLE_RATE_HZ, arguments.bandwidth
     if band is not None:
         rate_hz = rate_for(ground.in_range("--bandwidth", band, *BANDWIDTHS_HZ))
@@ -140,26 +144,39 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
         seed=arguments.seed,
         traffic=replace(
             traffic_named(arguments.traffic),
-            sounds=dict.fromkeys((kind for kind in arguments.sounds if kind not in SIGNALS), PER_HOUR),
-            signals=dict.fromkeys((kind for kind in arguments.sounds if kind in SIGNALS), SIGNAL_SHARE),
+            sounds=dict.fromkeys((kind for kind in kinds if kind not in SIGNALS), PER_HOUR),
+            signals=dict.fromkeys((kind for kind in kinds if kind in SIGNALS), SIGNAL_SHARE),
         ),
-        preset=simulation.preset(arguments.preset),
+        preset=replace(simulation.preset(arguments.preset), sounds_folder=folder),
         sample_rate_hz=rate_hz,
     )
 
 
 def _settings(arguments: argparse.Namespace) -> "simulation.DatasetSettings":
-
-    static = arguments.static
-    same = "seed", "scene", "kind", "video", "preset", "sounds"
+    static, (kinds, folder) = arguments.static, _sounds(arguments.sounds)
+    same = "seed", "scene", "kind", "video", "preset"
     return simulation.DatasetSettings(
         n_static=(0 if arguments.dynamic else 4) if static is None else static,
         n_dynamic=arguments.dynamic,
         duration_s=arguments.duration,
         video_width_px=arguments.video_width,
         bandwidth_hz=arguments.bandwidth,
+        sounds=kinds,
+        sounds_folder=folder,
         **{name: getattr(arguments, name) for name in same},
     )
+
+
+def _sounds(words: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
+    """Return the kinds that sound, and the folder with recordings of some of them; empty without one."""
+    from worldstate.simulation.emitters.emitter import recorded_kinds
+
+    folders = [word for word in words if word not in simulation.SOUNDS and Path(word).is_dir()]
+    if len(folders) > 1:
+        raise InvalidArgumentError(f"--sounds: expected one folder at most, got {', '.join(folders)}")
+    recorded = [kind for folder in folders for kind in recorded_kinds(folder)]
+    named = [word for word in words if word not in (*folders, *recorded)]
+    return (*named, *recorded), "".join(folders)
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -1,0 +1,123 @@
+"""Clips of a user's own: what is learned of them, who counts how much, and what is refused."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.abduction.road_users import DomainGuard, Foreign
+from worldstate.commissioning.guard_training import CLOSE, SoundRows, fit_guard, of_guard, rows_of_clip
+from worldstate.commissioning.recorded_clips import HOPS_EACH, heard_clip, read_recorded
+from worldstate.commissioning.road_user_training import RoadUserRows, with_close
+from worldstate.frontend.spectra.sound_character import MEASURES
+from worldstate.ground.errors import InputFileError
+
+RATE = 16_000
+
+
+def table(folder: Path, rows: list[tuple[str, ...]]) -> Path:
+    path = folder / "clips.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("file", "kind", "recording", "road_user"), *rows])
+    return path
+
+
+def pump(path: Path, seed: int) -> str:
+    """Write a machine that the simulator does not have: noise in twenty strokes a second."""
+    rng, time = np.random.default_rng(seed), np.arange(4 * RATE) / RATE
+    noise = np.convolve(rng.standard_normal(len(time)), np.ones(int(rng.integers(3, 9))), "same")
+    strokes = 1.0 + 0.7 * np.sin(2.0 * np.pi * rng.uniform(18.0, 22.0) * time)
+    soundfile.write(path, 0.02 * strokes * noise, RATE)
+    return path.name
+
+
+def simulated() -> SoundRows:
+    """Render some close clips: streets, foreign sounds and signals."""
+    names = [*("light", "idling light", "heavy", "voice", "dog", "music", "siren", "horns")] * 3
+    draws = zip(names, range(len(names)), np.random.default_rng(5).spawn(len(names)), strict=True)
+    return SoundRows.joined([rows_of_clip(6000.0, one) for one in draws])
+
+
+def foreign_share(guard: DomainGuard, measures: np.ndarray) -> float:
+    return float(np.mean([isinstance(guard.judge(one), Foreign) for one in measures[:, : len(MEASURES)]]))
+
+
+def test_a_new_foreign_sound_is_called_foreign_more_often_where_it_was_not_heard(tmp_path: Path) -> None:
+    rows = [(pump(tmp_path / f"{n}.wav", n), "pump", f"r{n}", "") for n in range(8)]
+    learned = read_recorded(tmp_path, table(tmp_path, rows))
+    held_out = np.concatenate(
+        [heard_clip(tmp_path / pump(tmp_path / f"{n}.wav", n)) for n in (101, 102, 103)]
+    )
+    base = simulated()
+    before = fit_guard(of_guard(base))
+    after = fit_guard(of_guard(SoundRows.joined([base, learned.rows])))
+    assert "pump" in after.foreign and "pump" not in before.foreign
+    assert foreign_share(after, held_out) > foreign_share(before, held_out) + 0.2
+    # Vehicles are the street as before.
+    street = base.select(np.isin(base.kinds, ["light", "heavy"])).measures
+    assert foreign_share(after, street) < foreign_share(before, street) + 0.05
+
+
+def test_every_recording_counts_as_much_however_long_and_under_whichever_name(tmp_path: Path) -> None:
+    rows = [
+        (pump(tmp_path / f"{n}.wav", n), *rest)
+        for n, rest in enumerate(
+            [
+                ("tram", "r0", ""),
+                ("anything", "r1", "car"),
+                ("anything", "r1", "car"),
+                ("speech", "r2", ""),
+                ("reversing beeper", "r3", ""),
+                ("street", "r4", ""),
+                ("pump", "r5", ""),
+                ("siren", "r1", ""),
+            ]
+        )
+    ]
+    path = table(tmp_path, rows)
+    learned = read_recorded(tmp_path, path)
+    kinds, hops = np.unique(learned.rows.kinds, return_counts=True)
+    assert dict(zip(kinds.tolist(), hops.tolist(), strict=True)) == dict.fromkeys(
+        ["beeper", CLOSE, "light", "pump", "siren", "tram", "voice"], HOPS_EACH
+    )
+    assert learned.recordings == {
+        "tram": 1,
+        "car": 1,
+        "speech": 1,
+        "reversing beeper": 1,
+        "street": 1,
+        "pump": 1,
+        "siren": 1,
+    }
+    assert "car 1, speech 1" in learned.told and learned.digest in learned.told
+    assert "not the project's own" in learned.told
+    path.write_text(path.read_text() + "\n")
+    assert read_recorded(tmp_path, path).digest != learned.digest
+    nothing = np.zeros(0)
+    none = RoadUserRows(
+        np.zeros((0, learned.rows.measures.shape[1])),
+        nothing.astype(str),
+        nothing.astype(str),
+        nothing.astype(bool),
+        nothing.astype(bool),
+    )
+    vehicles = with_close(none, learned.rows)
+    assert set(vehicles.kinds.tolist()) == {"light", "tram"}
+    assert set(of_guard(learned.rows).kinds.tolist()) == {CLOSE, "pump", "siren", "beeper", "voice"}
+
+
+@pytest.mark.parametrize(
+    ("row", "told"),
+    [
+        (("a.wav", "pump", "r", "ufo"), "line 2: road_user: expected one of"),
+        (("a.wav", "", "r", ""), "line 2: kind"),
+        (("b.wav", "pump", "r", ""), "b.wav"),
+        (None, "at least one clip"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused(tmp_path: Path, row: tuple[str, ...] | None, told: str) -> None:
+    pump(tmp_path / "a.wav", 1)
+    with pytest.raises(InputFileError, match=told):
+        read_recorded(tmp_path, table(tmp_path, [] if row is None else [row]))

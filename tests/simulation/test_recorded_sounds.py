@@ -1,0 +1,123 @@
+"""Recordings in the place of synthesis: their spectrum, the level of the table, and what is refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from scipy.signal import butter, sosfilt
+
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError
+from worldstate.simulation import SOUNDS, SimulationSettings, SoundSettings, preset, simulate_recording, site
+from worldstate.simulation.emitters.emitter import SYNTHESES, emitted, recorded_kinds
+
+PAIR = MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
+REFERENCE_PA = 2e-5
+
+
+def band_noise(seconds: float, rate: float, low_hz: float = 950.0, high_hz: float = 1050.0) -> np.ndarray:
+    white = np.random.default_rng(1).standard_normal(round(seconds * rate))
+    noise = sosfilt(butter(4, (low_hz, high_hz), "bandpass", fs=rate, output="sos"), white)
+    return np.asarray(0.1 * noise / np.abs(noise).max())
+
+
+def folder_of(root: Path, kind: str, sound: np.ndarray, rate: int, suffix: str = "wav") -> str:
+    (root / kind).mkdir(parents=True, exist_ok=True)
+    soundfile.write(root / kind / f"one.{suffix}", sound, rate)
+    return str(root)
+
+
+@pytest.mark.parametrize("rate", [6_000.0, 47_998.0])
+@pytest.mark.parametrize("suffix", ["wav", "flac"])
+def test_a_recording_has_its_spectrum_and_the_level_of_its_kind(tmp_path, rate, suffix):
+    """Round 1 kHz the A-weighting is 0 dB: the level is the plain one. The second channel is not heard."""
+    sound = np.column_stack([band_noise(5.0, 44_100), band_noise(5.0, 44_100, 200.0, 300.0)])
+    folder = folder_of(tmp_path, "dog", sound, 44_100, suffix)
+    heard = emitted(SOUNDS["dog"], round(3.0 * rate), rate, np.random.default_rng(2), folder)
+    assert heard.shape == (round(3.0 * rate),) and heard.dtype == np.float32
+    level_db = 10.0 * np.log10(np.square(heard, dtype=np.float64).mean() / REFERENCE_PA**2)
+    assert level_db == pytest.approx(SOUNDS["dog"].level_db, abs=1.0)
+    power, hz = np.abs(np.fft.rfft(heard)) ** 2, np.fft.rfftfreq(len(heard), 1.0 / rate)
+    assert power[(hz > 900.0) & (hz < 1100.0)].sum() > 0.98 * power.sum()
+
+
+def test_a_short_recording_goes_on_and_a_pause_stays_one(tmp_path):
+    folder = folder_of(tmp_path, "dog", band_noise(0.3, 16_000), 16_000)
+    heard = emitted(SOUNDS["dog"], 24_000, 8_000.0, np.random.default_rng(2), folder)
+    assert np.square(heard).reshape(-1, 800).mean(axis=1).min() > 0.0
+    # One bark in twenty seconds: what else is in the file is not made as loud as it.
+    barks = 1e-4 * np.random.default_rng(1).standard_normal(20 * 16_000)
+    barks[:4_800] += band_noise(0.3, 16_000)
+    folder = folder_of(tmp_path, "dog", barks, 16_000)
+    levels = [
+        np.square(emitted(SOUNDS["dog"], 8_000, 8_000.0, np.random.default_rng(seed), folder)).mean()
+        for seed in range(20)
+    ]
+    assert np.median(levels) < 1e-2 * (REFERENCE_PA * 10.0 ** (SOUNDS["dog"].level_db / 20.0)) ** 2
+
+
+def test_a_kind_without_recordings_is_synthesised_as_before(tmp_path):
+    folder = folder_of(tmp_path, "dog", band_noise(2.0, 16_000), 16_000)
+    with_folder, without = (
+        emitted(SOUNDS["horn"], 8_000, 8_000.0, np.random.default_rng(3), one) for one in (folder, "")
+    )
+    assert with_folder.tobytes() == without.tobytes()
+
+
+def test_a_recording_is_carried_by_the_street(tmp_path):
+    """Its line stands 20 dB above the same street without it, later by the way at each microphone."""
+    folder = folder_of(tmp_path, "tone", band_noise(4.0, 16_000), 16_000)
+    street = SimulationSettings(site("SB1"), "none", duration_s=2.0, sample_rate_hz=6_000.0)
+    sounding = replace(
+        street,
+        preset=replace(preset(), sounds_folder=folder),
+        sounds=(SoundSettings("tone", 0.0, 2.0, (4.0, 0.0)),),
+    )
+    quiet, loud = (
+        np.abs(np.fft.rfft(simulate_recording(one, np.random.default_rng(4), PAIR).audio, axis=0)) ** 2
+        for one in (street, sounding)
+    )
+    hz = np.fft.rfftfreq(12_000, 1.0 / 6_000.0)
+    band, beside = (hz > 950.0) & (hz < 1050.0), (hz > 2000.0) & (hz < 2500.0)
+    assert (loud[band].sum(axis=0) > 100.0 * quiet[band].sum(axis=0)).all()
+    assert (loud[beside].sum(axis=0) < 2.0 * quiet[beside].sum(axis=0)).all()
+
+
+def test_folders_are_named_as_kinds_and_hold_sound(tmp_path):
+    folder = folder_of(tmp_path / "good", "siren", band_noise(0.3, 16_000), 16_000)
+    (tmp_path / "good" / ".git").mkdir()
+    assert recorded_kinds(folder) == ("siren",)
+    (tmp_path / "good" / "siren" / "broken.wav").write_bytes(b"no sound")
+    with pytest.raises(InputFileError, match=r"broken\.wav"):
+        recorded_kinds(folder)
+    for name, got in (("vuvuzela", "got vuvuzela"), ("rain", "got rain"), ("dog", "got dog with 0")):
+        (tmp_path / f"bad {name}" / name).mkdir(parents=True)
+        with pytest.raises(InputFileError, match=got) as refused:
+            recorded_kinds(str(tmp_path / f"bad {name}"))
+        assert all(kind in str(refused.value) for kind in SYNTHESES)
+    with pytest.raises(InputFileError, match="got none"):
+        recorded_kinds(str(tmp_path / "good" / ".git"))
+
+
+def test_the_command_takes_a_folder_among_the_kinds(tmp_path, capsys):
+    write_array_xml(tmp_path / "pair.xml", PAIR)
+    folder = folder_of(tmp_path / "own", "voice", band_noise(2.0, 16_000), 16_000)
+    command = ["sim", "make", "--static", "1", "--duration", "0.5", "--bandwidth", "2000"]
+    command += ["--array", str(tmp_path / "pair.xml"), "--json"]
+    audio = []
+    for out, jobs in (("a", "1"), ("b", "2")):
+        given = ["--sounds", f"rain,{folder}", "--jobs", jobs, "--out", str(tmp_path / out)]
+        assert main([*command, *given]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["sounds"] == ["rain", "voice"]
+        audio.append((tmp_path / out / told["folders"][0] / "out_multi.wav").read_bytes())
+    assert audio[0] == audio[1]
+    truth = json.loads((tmp_path / "a" / told["folders"][0] / "truth.json").read_text())
+    assert truth["settings"]["preset"]["sounds_folder"] == folder
+    assert main([*command, "--sounds", f"{folder},{tmp_path}", "--out", str(tmp_path / "c")]) == 2
+    assert "one folder at most" in capsys.readouterr().err
