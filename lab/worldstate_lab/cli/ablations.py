@@ -35,7 +35,13 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.metrics.approach_table import ApproachTable, auroc, onset_outcome, rising_edges
+from worldstate.operations.metrics.approach_table import (
+    ApproachTable,
+    auroc,
+    mean_of,
+    onset_outcome,
+    rising_edges,
+)
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS, best_weight, labelled_windows
 from worldstate_lab.metrics.intervals import calibration_error_sampling, deal_folds
@@ -250,15 +256,10 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
         ece=expected_calibration_error(risk, hazards) if both else None,
         ece_floor=calibration_error_sampling(risk, rng)[0] if both else None,
         brier=brier_score(risk, hazards) if both else None,
-        awareness=_share([one.aware[one.stream.after_sight()] for one in approaches]),
-        vision_only=_share([one.stream.seen[one.stream.after_sight()] for one in approaches]),
+        awareness=mean_of([f for one in approaches for f in one.aware[one.stream.after_sight()]]),
+        vision_only=mean_of([f for one in approaches for f in one.stream.seen[one.stream.after_sight()]]),
         approach_weight=float(np.mean([one.weight for one in scored])),
     )
-
-
-def _share(flags: Sequence[BoolArray]) -> float | None:
-    hops = np.concatenate(flags) if flags else np.empty(0)
-    return float(hops.mean()) if hops.size else None
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
