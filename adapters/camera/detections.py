@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Protocol
@@ -449,10 +449,11 @@ def _log(path: Path, rows: Mapping[int, list[Row]], frame_rate_hz: float) -> Det
         raise InputFileError(path, f"expected frame numbers from 0 to {min(count, MAX_FRAMES) - 1}")
     if max(map(len, rows.values()), default=0) > MAX_BOXES_A_FRAME:
         raise InputFileError(path, f"expected at most {MAX_BOXES_A_FRAME} boxes a frame")
-    found = [_frame(rows.get(number, [])) for number in range(count)]
+    found = [frame_of_rows(rows.get(number, [])) for number in range(count)]
     return DetectionLog.at_rate(found, frame_rate_hz, source=str(path))
 
 
-def _frame(rows: list[Row]) -> DetectionFrame:
+def frame_of_rows(rows: Sequence[Row]) -> DetectionFrame:
+    """Return the boxes of one image, a row each."""
     boxes = np.array([row[0] for row in rows], dtype=np.float64).reshape(-1, 4)
     return DetectionFrame(boxes, np.array([row[1] for row in rows]), tuple(row[2] for row in rows))

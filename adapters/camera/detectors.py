@@ -92,7 +92,7 @@ class MotionDetector:
         if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or not frame.size:
             raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
         height, width = frame.shape[:2]
-        small = self._reduced(frame)
+        small = reduced_to(frame, WIDTH_PX)
         mask = self._moving(small)
         self._seen += 1
         if self._seen <= WARM_UP:
@@ -107,14 +107,6 @@ class MotionDetector:
         model = self._cv2.createBackgroundSubtractorMOG2(HISTORY, MOG2_VARIANCES, detectShadows=False)
         model.setVarMin(least / MOG2_VARIANCES)
         return model
-
-    def _reduced(self, frame: ImageArray) -> ImageArray:
-        height, width = frame.shape[:2]
-        if width <= WIDTH_PX:
-            return frame
-        size = (WIDTH_PX, max(round(height * WIDTH_PX / width), 1))
-        reduced: ImageArray = self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
-        return reduced
 
     def _moving(self, frame: ImageArray) -> ImageArray:
         """Return the mask of moving pixels, specks removed and parts of one object joined."""
@@ -143,6 +135,16 @@ class MotionDetector:
         width_px = max(EDGE_WIDTH * frame.shape[1], NARROWEST_EDGE_PX)
         shares = [outlined_share(apart, labels == number, width_px) for number in numbers]
         return np.array(shares) >= OUTLINED
+
+
+def reduced_to(frame: ImageArray, width_px: int) -> ImageArray:
+    """Return an image of at most so many columns, its shape kept."""
+    height, width = frame.shape[:2]
+    if width <= width_px:
+        return frame
+    cv2, size = optional("cv2"), (width_px, max(round(height * width_px / width), 1))
+    small: ImageArray = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+    return small
 
 
 def _difference(frame: ImageArray, background: ImageArray) -> Float32Array:

@@ -47,7 +47,7 @@ class FamilyCounts:
     def __add__(self, other: "FamilyCounts") -> "FamilyCounts":
         """Return the counts of two sets of images."""
         mine, theirs = astuple(self), astuple(other)
-        return FamilyCounts(*(_tuples(np.add(a, b)) for a, b in zip(mine, theirs, strict=True)))
+        return FamilyCounts(*(as_tuples(np.add(a, b)) for a, b in zip(mine, theirs, strict=True)))
 
     def miss_rates(self, repeats: float = 1.0) -> FloatArray:
         """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation."""
@@ -68,7 +68,8 @@ class FamilyCounts:
         return (np.array(self.clutter) + PRIOR) / (np.array(self.sectors) + 2.0 * PRIOR)
 
 
-def _tuples(values: FloatArray) -> Any:
+def as_tuples(values: FloatArray) -> Any:
+    """Return counts as a table of misses holds them: numbers, or rows of numbers."""
     rows = values.tolist()
     return tuple(tuple(row) for row in rows) if values.ndim == 2 else tuple(rows)
 

@@ -31,24 +31,35 @@ SILENCE = 1e-12
 
 
 class PlaneWaves:
-    """Steering vectors of the directions that an array can tell apart."""
+    """Steering vectors of the directions that microphones (M, 3) can tell apart.
 
-    def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
-        azimuth, elevation = _directions()
-        delays = MicrophoneArray(array.centred_m).delays_s(azimuth, elevation)
+    Shapes: waves_rad (2, D), azimuths and elevations to choose from.
+    """
+
+    def __init__(self, positions_m: FloatArray, frequencies_hz: FloatArray, waves_rad: FloatArray) -> None:
+        delays = MicrophoneArray(positions_m).delays_s(*waves_rad)
         kept = np.unique(np.round(delays / _SAME_S), axis=0, return_index=True)[1]
-        self.is_steep = np.abs(elevation[kept]) > _STEEP
-        phase = -2j * np.pi * frequencies_hz[:, None, None] * delays[kept].T
+        (self.azimuths_rad, self.elevations_rad), self.delays_s = waves_rad[:, kept], delays[kept]
+        phase = -2j * np.pi * frequencies_hz[:, None, None] * self.delays_s.T
         self.beams: Complex64Array = np.exp(phase).astype(np.complex64)
 
     def agreement(self, coherence: Complex64Array) -> Complex64Array:
-        r"""Agreement of every channel with all others for a wave from every direction, (K, M, D).
+        r"""Agreement of every channel with all others for a wave from every direction, (..., K, M, D).
 
         .. math:: g_{kmd} = \overline{a_{kmd}} \sum_{j \ne m} R_{kmj}\, a_{kjd}
 
-        Shapes: coherence (K, M, M), its diagonal zero.
+        Shapes: coherence (..., K, M, M), its diagonal zero.
         """
         return np.asarray(self.beams.conj() * (coherence @ self.beams))
+
+
+def diffuse_coherence(positions_m: FloatArray, frequencies_hz: FloatArray) -> FloatArray:
+    r"""Coherence of a diffuse field between microphones (M, 3), (K, M, M).
+
+    .. math:: \Gamma_{kij} = \frac{\sin(2 \pi f_k d_{ij} / c)}{2 \pi f_k d_{ij} / c}
+    """
+    distance = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1)
+    return np.asarray(np.sinc(2.0 * frequencies_hz[:, None, None] * distance / SPEED_OF_SOUND_M_S))
 
 
 def direction_weights(agreement: Complex64Array) -> Float32Array:
@@ -69,16 +80,15 @@ def log_sharpness(agreement: Complex64Array) -> float:
     return float(np.log(max(float(np.square(power).sum(dtype=np.float64)), SILENCE)))
 
 
-def _directions() -> tuple[FloatArray, FloatArray]:
-    """Azimuths and elevations about one step apart, (D,) each, mirrored about the x and y axes alike."""
+def _directions() -> FloatArray:
+    """Azimuths and elevations about one step apart, (2, D), mirrored about the x and y axes alike."""
     rows = []
     for elevation in np.radians(_ELEVATIONS_DEG):
         quarter = np.linspace(0.0, np.pi / 2, round(90.0 / _STEP_DEG * np.cos(elevation)) + 1)
         half = np.concatenate([quarter, np.pi - quarter[:-1]])
         azimuth = np.concatenate([half, -half[(half > 0.0) & (half < np.pi)]])
         rows.append(np.stack([azimuth, np.full(len(azimuth), elevation)]))
-    azimuths, elevations = np.concatenate(rows, axis=1)
-    return azimuths, elevations
+    return np.concatenate(rows, axis=1)
 
 
 # Up to here every exchange of two channels is tried; a larger array predicts each position well enough from
@@ -298,7 +308,7 @@ class DelayCheck:
             self._delays = np.where(good, found, self._delays)
         self.log_sharpness = log_sharpness(agreement)
         self._values.append(np.where(good, self._delays, np.nan))
-        near = float(weights @ self._waves.is_steep) > _NEAR
+        near = float(weights @ (np.abs(self._waves.elevations_rad) > _STEEP)) > _NEAR
         self._far.append(not near or len(good) > _FEW_CHANNELS)
 
     @property
@@ -386,9 +396,7 @@ def position_weights(array: MicrophoneArray, frequencies_hz: FloatArray, usable:
 
     Shapes: frequencies_hz (K,), usable (M,).
     """
-    positions = array.positions_m
-    distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    field = np.sinc(2.0 * frequencies_hz[:, None, None] * distance / SPEED_OF_SOUND_M_S)
+    field = diffuse_coherence(array.positions_m, frequencies_hz)
     inverse = np.linalg.inv(field + np.diag(np.where(usable, _NOISE, _UNUSABLE)))
     own = np.einsum("kmm->km", inverse)
     weights = -inverse / own[:, :, None]
@@ -552,7 +560,7 @@ class GeometryCheck:
         most = _MANY_BINS if n <= MAX_CHANNELS else _FEW_BINS
         self._bins = high[:: max(-(-len(high) // most), 1)]
         chosen = frequencies_hz[self._bins]
-        waves = PlaneWaves(array, chosen)
+        waves = PlaneWaves(array.centred_m, chosen, _directions())
         self._fit = PositionFit(array, frequencies_hz)
         self._order, self._delay = OrderCheck(waves), DelayCheck(array, waves, chosen)
         self._sum = np.zeros((len(chosen), n, n), np.complex64)

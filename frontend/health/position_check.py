@@ -28,6 +28,8 @@ from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequ
 from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray, IndexArray
 from worldstate.ground.values import wrap_angle
 
+from .geometry_check import PlaneWaves, diffuse_coherence
+
 # A frame, and a part of the sound in which one source dominates: a syllable of speech.
 _FRAME_S, _PART_S = 0.032, 0.25
 # Up to here every exchange of two channels is tried. One hypothesis of 56 channels takes half a second.
@@ -45,7 +47,7 @@ _EXTENTS = 16.0
 _ELEVATIONS_RAD = np.radians([0.0, 13.0, -13.0, 26.0, -26.0])
 # From ahead on, so that of two directions that an array hears alike the one ahead is kept.
 _AZIMUTHS_RAD = np.radians(sorted(range(-180, 180, 5), key=abs))
-_SAME_S = 2e-6
+_WAVES_RAD = np.array(np.meshgrid(_AZIMUTHS_RAD, _ELEVATIONS_RAD)).reshape(2, -1)
 # Within an eighth of its size an array is called right: sources above its plane make it seem smaller.
 _RIGHT = (1.0, 0.92, 1.09)
 _OFF = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0, 10.0, 25.4, 39.37, 1 / 10, 1 / 25.4, 1 / 39.37)
@@ -76,21 +78,15 @@ class _Hypothesis:
     """What plane waves and a diffuse field explain, for positions (M, 3) and frequencies (K,)."""
 
     def __init__(self, positions_m: FloatArray, frequencies_hz: FloatArray) -> None:
-        azimuth, elevation = (one.ravel() for one in np.meshgrid(_AZIMUTHS_RAD, _ELEVATIONS_RAD))
-        delays = MicrophoneArray(positions_m).delays_s(azimuth, elevation)
-        kept = np.unique(np.round(delays / _SAME_S), axis=0, return_index=True)[1]
-        self.azimuths_rad, self.delays_s = azimuth[kept], delays[kept]
-        phase = -2j * np.pi * frequencies_hz[:, None, None] * self.delays_s.T
-        self._beams = np.exp(phase).astype(np.complex64)
-        apart = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1)
-        self._pairs = len(apart) * (len(apart) - 1)
-        self._diffuse = np.sinc(2.0 * frequencies_hz[:, None, None] * apart / SPEED_OF_SOUND_M_S)
+        self.waves = PlaneWaves(positions_m, frequencies_hz, _WAVES_RAD)
+        self._pairs = len(positions_m) * (len(positions_m) - 1)
+        self._diffuse = diffuse_coherence(positions_m, frequencies_hz)
         np.einsum("kmm->km", self._diffuse)[...] = 0.0
         self._power = np.square(self._diffuse).sum(axis=(1, 2))[:, None] / self._pairs
         self._shared = self._on_beams(self._diffuse.astype(np.complex64))
 
     def _on_beams(self, coherence: Complex64Array) -> FloatArray:
-        return np.asarray((self._beams.conj() * (coherence @ self._beams)).real.sum(axis=-2) / self._pairs)
+        return np.asarray(self.waves.agreement(coherence).real.sum(axis=-2) / self._pairs)
 
     def explained(self, coherence: Complex64Array) -> FloatArray:
         """Energy explained by a wave from each direction, (S, D), in parts of coherence (S, K, M, M)."""
@@ -247,7 +243,7 @@ class _Comparison:
 
     def _azimuth(self) -> tuple[float, FloatArray]:
         """Azimuth that explains most of all parts, and how far from there that of each part is, (S,)."""
-        explained, azimuths = self._claimed.explained(self._coherence), self._claimed.azimuths_rad
+        explained, azimuths = self._claimed.explained(self._coherence), self._claimed.waves.azimuths_rad
         at = float(azimuths[explained.sum(axis=0).argmax()])
         return at, np.abs(wrap_angle(azimuths[explained.argmax(axis=1)] - at))
 
@@ -342,8 +338,8 @@ class _Comparison:
     def _miss(self, azimuths_rad: FloatArray, at_rad: float) -> float:
         """Least angle between a direction and others, each as the array hears it: ahead for behind."""
         delays = MicrophoneArray(self._positions).delays_s(azimuths_rad)
-        nearest = np.square(delays[:, None] - self._claimed.delays_s).sum(axis=-1).argmin(axis=1)
-        return float(np.abs(wrap_angle(self._claimed.azimuths_rad[nearest] - at_rad)).min())
+        nearest = np.square(delays[:, None] - self._claimed.waves.delays_s).sum(axis=-1).argmin(axis=1)
+        return float(np.abs(wrap_angle(self._claimed.waves.azimuths_rad[nearest] - at_rad)).min())
 
 
 def _turned(angle_rad: float) -> str:

@@ -21,7 +21,6 @@ from worldstate_lab.streets.set_classifiers import (
 from worldstate_lab.streets.simulated_windows import (
     DECIMATION,
     MEASURES,
-    NFFT,
     RATE_HZ,
     WindowPlan,
     describe_windows,
@@ -36,7 +35,7 @@ from worldstate_lab.streets.simulated_windows import (
 from worldstate.abduction.signature.ensemble import mirror_features
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.frontend.array.microphone_array import ovad_array
-from worldstate.frontend.direction.feature import published_feature
+from worldstate.frontend.direction.feature import feature_nfft, published_feature
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.scene.presets import preset
 
@@ -193,14 +192,13 @@ def test_the_released_windows_have_the_known_figures():
 def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
     """Band-limited noise from one side, at both rates: the same bins, hence the same feature."""
     rng, n = np.random.default_rng(6), 48_000
+    longer = n + DECIMATION * feature_nfft(RATE_HZ)
     offsets = ovad_array().centred_m
-    spectrum = np.fft.rfft(rng.standard_normal(n + DECIMATION * NFFT))
-    frequency = np.fft.rfftfreq(n + DECIMATION * NFFT, 1 / (DECIMATION * RATE_HZ))
+    spectrum = np.fft.rfft(rng.standard_normal(longer))
+    frequency = np.fft.rfftfreq(longer, 1 / (DECIMATION * RATE_HZ))
     spectrum[frequency > 3000.0] = 0.0
     delays = -offsets @ np.array([np.cos(0.7), np.sin(0.7), 0.0]) / 343.0
-    sound = np.fft.irfft(
-        spectrum * np.exp(-2j * np.pi * frequency * delays[:, None]), n + DECIMATION * NFFT
-    ).T
+    sound = np.fft.irfft(spectrum * np.exp(-2j * np.pi * frequency * delays[:, None]), longer).T
     sound += 0.3 * scipy.signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(sound.shape), axis=0)
     full = published_feature(sound[:n], ovad_array(), DECIMATION * RATE_HZ)
     arrays = ovad_array(), permuted_array()

@@ -10,11 +10,10 @@ target outside that sector is kept from the camera's scan.
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import partial
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from worldstate.ground import FloatArray, NotUsable
 from worldstate.ground.errors import MissingExtraError
 from worldstate.measurement.measurement import Bearing
 
-from .hop_costs import Milliseconds
+from .hop_costs import Milliseconds, elapsed_ms
 
 try:
     from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
@@ -203,10 +202,9 @@ def tracker_times(rng: np.random.Generator) -> dict[str, Milliseconds]:
     for n in (*ENTITIES, *CROWD):
         times[f"update_{n}"], times[f"state_{n}"] = _world_times(hops(n, rng))
     for n in ENTITIES:
-        times[f"numpy_batch_{n}"] = [_cpu_ms(partial(_batch_step, *_batch(n, rng))) for _ in range(HOPS)]
-    if find_spec("stonesoup") is not None:
-        times["jpda_1"] = list(_jpda_times(hops(1, rng)))
-    return times
+        steps = [partial(_batch_step, *_batch(n, rng)) for _ in range(HOPS)]
+        times[f"numpy_batch_{n}"] = [elapsed_ms(step, time.process_time) for step in steps]
+    return times | {"jpda_1": list(_jpda_times(hops(1, rng)))}
 
 
 def hops(n: int, rng: np.random.Generator) -> list[Measurement]:
@@ -234,7 +232,7 @@ def _world_times(measured: list[Measurement]) -> tuple[Milliseconds, Millisecond
         start = time.process_time()
         world = world.update(one)
         updates.append(1e3 * (time.process_time() - start))
-        states.append(_cpu_ms(partial(getattr, world, "state")))
+        states.append(elapsed_ms(partial(getattr, world, "state"), time.process_time))
     return updates[WARM_UP:], states[WARM_UP:]
 
 
@@ -258,12 +256,6 @@ def _jpda_times(measured: list[Measurement]) -> Iterator[float]:
     tracker = Jpda()
     for hop, one in enumerate(measured):
         taken, when = scans(one, (-0.5, 0.5)), scan_time(one)
-        spent_ms = _cpu_ms(partial(tracker.step, taken, when))
+        spent_ms = elapsed_ms(partial(tracker.step, taken, when), time.process_time)
         if hop >= WARM_UP:
             yield spent_ms
-
-
-def _cpu_ms(call: Callable[[], object]) -> float:
-    start = time.process_time()
-    call()
-    return 1e3 * (time.process_time() - start)

@@ -35,9 +35,15 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.metrics.approach_table import ApproachTable, auroc, onset_outcome, rising_edges
+from worldstate.operations.metrics.approach_table import (
+    ApproachTable,
+    auroc,
+    mean_of,
+    onset_outcome,
+    rising_edges,
+)
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS
+from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS, best_weight, labelled_windows
 from worldstate_lab.metrics.intervals import calibration_error_sampling, deal_folds
 from worldstate_lab.metrics.stream_statistic import (
     StatisticSwitches,
@@ -204,16 +210,16 @@ class _Learned:
         self, streams: Sequence[HopTable], prior: Sequence[float], switches: AblationSwitches
     ) -> None:
         free = [stream for stream in streams if stream.hazard_free]
-        approaches = [stream for stream in streams if stream.before_sight().any()]
+        parted = [*free, *(stream for stream in streams if stream.before_sight().any())]
         self._prior, self._switches = prior, switches
-        self.weight = self._best_weight(free, approaches)
-        calm = [self._statistic(stream, self.weight) for stream in free]
-        self.gamma = neyman_pearson_threshold(calm, switches.alpha, switches.sustain_hops)
+        self.weight = best_weight(parted, switches.approach_weights, self._statistic)
+        scores = [self._statistic(stream, self.weight) for stream in parted]
+        self.gamma = neyman_pearson_threshold(scores[: len(free)], switches.alpha, switches.sustain_hops)
         presence = [self._presence(stream) for stream in free]
         self.presence_gamma = neyman_pearson_threshold(presence, switches.alpha)
         self._risk_map = None
-        if switches.calibrated and approaches:
-            self._risk_map = fit_isotonic(*_windows(calm, self._hazards(approaches, self.weight)))
+        if switches.calibrated and len(parted) > len(free):
+            self._risk_map = fit_isotonic(*labelled_windows(parted, scores))
 
     def score(self, stream: HopTable) -> _Scored:
         statistic = self._statistic(stream, self.weight)
@@ -228,34 +234,14 @@ class _Learned:
     def _presence(self, stream: HopTable) -> FloatArray:
         return presence_statistic(stream, self._prior, self._switches.statistic_with(0.0))
 
-    def _hazards(self, approaches: Sequence[HopTable], weight: float) -> list[FloatArray]:
-        return [self._statistic(stream, weight)[stream.before_sight()] for stream in approaches]
-
-    def _best_weight(self, free: Sequence[HopTable], approaches: Sequence[HopTable]) -> float:
-        weights = self._switches.approach_weights
-        if len(weights) == 1 or not approaches:
-            return weights[0]
-        areas = []
-        for weight in weights:
-            calm = [self._statistic(stream, weight) for stream in free]
-            areas.append(auroc(*_windows(calm, self._hazards(approaches, weight))) or 0.0)
-        return weights[int(np.argmax(areas))]
-
-
-def _windows(calm: Sequence[FloatArray], hazards: Sequence[FloatArray]) -> tuple[FloatArray, BoolArray]:
-    scores = np.concatenate([*calm, *hazards])
-    return scores, np.arange(scores.size) >= sum(part.size for part in calm)
-
 
 def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
     free = [one for one in scored if one.stream.hazard_free]
     approaches = [one for one in scored if one.stream.before_sight().any()]
-    statistic, hazards = _windows(
-        [one.statistic for one in free], [one.statistic[one.stream.before_sight()] for one in approaches]
-    )
-    risk, _ = _windows(
-        [one.risk for one in free], [one.risk[one.stream.before_sight()] for one in approaches]
-    )
+    parted = [*free, *approaches]
+    streams = [one.stream for one in parted]
+    statistic, hazards = labelled_windows(streams, [one.statistic for one in parted])
+    risk, _ = labelled_windows(streams, [one.risk for one in parted])
     found = ApproachTable(
         [onset_outcome(one.stream.time_s[rising_edges(one.alarm)], one.stream.t0_s) for one in approaches],
         [one.alarm for one in free],
@@ -270,15 +256,10 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
         ece=expected_calibration_error(risk, hazards) if both else None,
         ece_floor=calibration_error_sampling(risk, rng)[0] if both else None,
         brier=brier_score(risk, hazards) if both else None,
-        awareness=_share([one.aware[one.stream.after_sight()] for one in approaches]),
-        vision_only=_share([one.stream.seen[one.stream.after_sight()] for one in approaches]),
+        awareness=mean_of([f for one in approaches for f in one.aware[one.stream.after_sight()]]),
+        vision_only=mean_of([f for one in approaches for f in one.stream.seen[one.stream.after_sight()]]),
         approach_weight=float(np.mean([one.weight for one in scored])),
     )
-
-
-def _share(flags: Sequence[BoolArray]) -> float | None:
-    hops = np.concatenate(flags) if flags else np.empty(0)
-    return float(hops.mean()) if hops.size else None
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -26,6 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -144,22 +145,24 @@ def _spectra(audio: Float32Array) -> FloatArray:
 _NAME = re.compile(r"(Site[12])_([LR])_(\d+)_Trial\d+")
 
 
-@dataclass(frozen=True, slots=True)
-class PlaceFigures:
-    """Figures of one pass; None where nothing is known to score against."""
-
-    name: str
-    hops: int
-    hidden_hops: int
-    side_right: int  # Hidden hops in which the likelier side is the right one
-    stated: float  # Share of hops in which a place is stated
-    rmse_m: float | None = None
-    hidden_rmse_m: float | None = None
-    coverage: float | None = None  # Of the 90 % interval
-    ray_rmse_m: float | None = None
-    ray_hidden_rmse_m: float | None = None
-    constant_rmse_m: float | None = None
-    constant_hidden_rmse_m: float | None = None
+# Figures of one pass, and the heads of their columns; those of errors are None where no place is known.
+_COUNTS = {
+    "hops": "hops",
+    "hidden_hops": "hidden",
+    "side_right": "side",  # Hidden hops in which the likelier side is the right one
+    "stated": "stated",  # Share of hops in which a place is stated
+}
+_ERRORS = {
+    "rmse_m": "error",
+    "hidden_rmse_m": "hidden",
+    "coverage": "in 90 %",
+    "ray_rmse_m": "rays",
+    "ray_hidden_rmse_m": "hidden",
+    "constant_rmse_m": "const.",
+    "constant_hidden_rmse_m": "hidden",
+}
+_COLUMNS = _COUNTS | _ERRORS
+PlaceFigures = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +194,7 @@ def place_exam(
         figures = _figures(name, said, right)
         if np.isfinite(table.along_m).any():
             beside = followed_places(plain[site], table)
-            figures = _with_errors(figures, table.along_m, said, beside, WALLS[site])
+            figures |= _errors(table.along_m, said, beside, WALLS[site])
         found.append(figures)
         on_pass()
     return PlaceExam(tuple(found[: len(trials)]), tuple(found[len(trials) :]), 1e3 * spent_s / max(hops, 1))
@@ -258,51 +261,32 @@ def _figures(name: str, said: Sequence[PlaceEstimate], right: FloatArray) -> Pla
     hidden = right != 0.0
     stated = float(np.mean([one.stated for one in said]))
     as_said = np.where(left > 0.5, 1.0, -1.0) == right
-    return PlaceFigures(name, len(said), int(hidden.sum()), int(as_said[hidden].sum()), stated)
+    counts = {"hidden_hops": int(hidden.sum()), "side_right": int(as_said[hidden].sum())}
+    return {"name": name, "hops": len(said), **counts, "stated": stated, **dict.fromkeys(_ERRORS)}
 
 
-def _with_errors(
-    figures: PlaceFigures,
-    along_m: FloatArray,
-    said: Sequence[PlaceEstimate],
-    beside: Sequence[PlaceEstimate],
-    walls: StreetWalls,
+def _errors(
+    along_m: FloatArray, said: Sequence[PlaceEstimate], beside: Sequence[PlaceEstimate], walls: StreetWalls
 ) -> PlaceFigures:
-    """Add errors and coverage; the best constants are one place, and one distance while hidden."""
+    """Return errors and coverage; the best constants are one place, and one distance while hidden."""
     known, hidden = np.isfinite(along_m), _hidden(along_m, walls)
     ends = np.array([one.interval_m for one in said])
     covered = (ends[:, 0] <= along_m) & (along_m <= ends[:, 1])
     ours, rays = (np.array([one.mean_m for one in each]) - along_m for each in (said, beside))
     whole, apart = along_m - along_m[known].mean(), np.abs(along_m) - np.abs(along_m[hidden]).mean()
-    return replace(
-        figures,
-        rmse_m=_rms(ours[known]),
-        hidden_rmse_m=_rms(ours[hidden]),
-        coverage=float(covered[known].mean()),
-        ray_rmse_m=_rms(rays[known]),
-        ray_hidden_rmse_m=_rms(rays[hidden]),
-        constant_rmse_m=_rms(whole[known]),
-        constant_hidden_rmse_m=_rms(apart[hidden]),
-    )
+    return {
+        "rmse_m": _rms(ours[known]),
+        "hidden_rmse_m": _rms(ours[hidden]),
+        "coverage": float(covered[known].mean()),
+        "ray_rmse_m": _rms(rays[known]),
+        "ray_hidden_rmse_m": _rms(rays[hidden]),
+        "constant_rmse_m": _rms(whole[known]),
+        "constant_hidden_rmse_m": _rms(apart[hidden]),
+    }
 
 
 def _rms(errors_m: FloatArray) -> float:
     return float(np.sqrt(np.mean(errors_m**2)))
-
-
-_COLUMNS = {
-    "hops": "hops",
-    "hidden_hops": "hidden",
-    "side_right": "side",
-    "stated": "stated",
-    "rmse_m": "error",
-    "hidden_rmse_m": "hidden",
-    "coverage": "in 90 %",
-    "ray_rmse_m": "rays",
-    "ray_hidden_rmse_m": "hidden",
-    "constant_rmse_m": "const.",
-    "constant_hidden_rmse_m": "hidden",
-}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -321,10 +305,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         exam = place_exam(arguments.trials, arguments.passes, arguments.seed, bar.advance)
     rows: list[tuple[str, ...]] = []
     for title, figures in (("trials", exam.trials), ("simulated", exam.passes)):
-        found = [asdict(one) for one in figures]
         if title == "trials":
-            rows += [_row(one["name"], one) for one in found]
-        scored = [one for one in found if one["rmse_m"] is not None]
+            rows += [_row(one["name"], one) for one in figures]
+        scored = [one for one in figures if one["rmse_m"] is not None]
         if scored:
             means = {name: sum(one[name] for one in scored) / len(scored) for name in _COLUMNS}
             rows.append(_row(f"{title}, mean of {len(scored)}", means))

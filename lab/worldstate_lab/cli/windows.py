@@ -34,7 +34,6 @@ Examples
 """
 
 import argparse
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,7 +49,7 @@ from worldstate.abduction.cueing.risk_map import (
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, read_ids
-from worldstate.adapters.files.file_io import atomic_path
+from worldstate.adapters.files.file_io import write_rows
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.output import CommandResult, check_outputs
@@ -59,7 +58,7 @@ from worldstate.cli.model.fit import add_table_options, read_beside
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.approach_table import auroc
+from worldstate.operations.metrics.approach_table import auroc, mean_of
 from worldstate.operations.training.training import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
 from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
@@ -70,7 +69,6 @@ from worldstate_lab.metrics.intervals import (
     macro,
     middle,
     paired_gains,
-    rate,
     recording_draws,
     worst_rate,
 )
@@ -112,8 +110,8 @@ def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray],
             "auroc_macro": macro(by_site),
             "auroc_pooled": auroc(score, labels),
             "worst_group_auroc": min(by_site.values()),
-            "tpr": rate(decision, hazards[rows]),
-            "fpr": rate(decision, hazard_free[rows]),
+            "tpr": mean_of(decision[hazards[rows]]),
+            "fpr": mean_of(decision[hazard_free[rows]]),
             "worst_group_fpr": worst_rate(decision, hazard_free[rows], sites[rows]),
             "ece": expected_calibration_error(risk, labels),
             "brier": brier_score(risk, labels),
@@ -126,10 +124,10 @@ def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArra
     """Return accuracy, area and rates of one junction; None where a label is missing there."""
     scored = here & (table.hazards | table.hazard_free)
     return {
-        "accuracy": rate(predictions.classes == table.labels, here),
+        "accuracy": mean_of((predictions.classes == table.labels)[here]),
         "auroc": auroc(predictions.score[scored], table.hazards[scored]),
-        "tpr": rate(predictions.decision, here & table.hazards),
-        "fpr": rate(predictions.decision, here & table.hazard_free),
+        "tpr": mean_of(predictions.decision[here & table.hazards]),
+        "fpr": mean_of(predictions.decision[here & table.hazard_free]),
     }
 
 
@@ -165,25 +163,23 @@ def mean_figures(figures: Sequence[Figures]) -> Figures:
     >>> mean_figures([{"tpr": 0.5, "fpr": None}, {"tpr": 1.0, "fpr": None}])
     {'tpr': 0.75, 'fpr': None}
     """
-    means: Figures = {}
-    for key in figures[0]:
-        values = [figure[key] for figure in figures if figure[key] is not None]
-        means[key] = float(np.mean(values)) if values else None  # type: ignore[arg-type]
-    return means
+    return {
+        key: mean_of([value for figure in figures if (value := figure[key]) is not None])
+        for key in figures[0]
+    }
 
 
 def write_predictions(
     path: str | Path, table: FeatureTable, passes: Sequence[Predictions], seeds: Sequence[int]
 ) -> None:
     """Write one row a window and seed, whole or not at all; floats as they are, to the last digit."""
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for seed, one in zip(seeds, passes, strict=True):
-            about = one.folds, table.recordings, table.environments, table.labels
-            told = *one.probabilities.T, one.score, one.risk, one.decision.astype(int)
-            rows = zip(*(column.tolist() for column in (*about, *told)), strict=True)
-            writer.writerows([seed, *row] for row in rows)
+    rows: list[list[object]] = []
+    for seed, one in zip(seeds, passes, strict=True):
+        about = one.folds, table.recordings, table.environments, table.labels
+        told = *one.probabilities.T, one.score, one.risk, one.decision.astype(int)
+        columns = (column.tolist() for column in (*about, *told))
+        rows += ([seed, *row] for row in zip(*columns, strict=True))
+    write_rows(path, COLUMNS, rows)
 
 
 def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[str, Figures]:

@@ -13,6 +13,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.metrics.approach_table import (
+    mean_of,
     onset_outcome,
     poisson_interval,
     rising_edges,
@@ -202,13 +203,13 @@ def _row(state: Condition, judged: Sequence[_Judged], counts: _Counts) -> Awaren
     return AwarenessRow(
         condition=state,
         degradation=float(np.mean([one.recording.degradation.mean() for one in judged])),
-        miss_rate=_mean(np.concatenate([_asked_miss_rates(one.recording) for one in judged])),
+        miss_rate=mean_of(np.concatenate([_asked_miss_rates(one.recording) for one in judged])),
         vision=_estimate(*counts.vision()),
         any_detection=float(seen.mean()),
         awareness=_estimate(*counts.awareness()),
-        unseen_awareness=_mean(heard[~found]),
+        unseen_awareness=mean_of(heard[~found]),
         detected=float(np.mean([one.detected for one in outcomes])),
-        lead_time_s=_mean([one.lead_s for one in outcomes if one.detected]),
+        lead_time_s=mean_of([one.lead_s for one in outcomes if one.detected]),
         false_alarms_per_hour=_rate([one.alarm for one in free], _hours(judged)),
         false_awareness_per_hour=_rate([one.raised for one in free], _hours(judged)),
         false_awareness=float(np.concatenate([one.raised for one in free]).mean()),
@@ -239,7 +240,3 @@ def _hours(judged: Sequence[_Judged]) -> float:
 
 def _asked_miss_rates(one: HopTable) -> FloatArray:
     return np.asarray(one.miss_rate[(one.answer != UNQUERIED) & one.after_sight()])
-
-
-def _mean(values: Sequence[float] | FloatArray | BoolArray) -> float | None:
-    return float(np.mean(values)) if len(values) else None

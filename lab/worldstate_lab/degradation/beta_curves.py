@@ -11,7 +11,7 @@ import numpy as np
 
 from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.adapters.camera.detections import DetectionLog
-from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, as_tuples
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
@@ -103,7 +103,7 @@ def counts_of(table: HopTable) -> dict[str, FamilyCounts]:
     counts = {}
     for family in FAMILIES:
         chosen = table.family == family
-        looks, misses = (_rows(table.columns[name][chosen]) for name in ("looks", "misses"))
+        looks, misses = (as_tuples(table.columns[name][chosen]) for name in ("looks", "misses"))
         counts[str(family)] = FamilyCounts(looks[:-1], misses[:-1], looks[-1], misses[-1])
     return counts
 
@@ -162,10 +162,6 @@ def _fall(
 ) -> Iterable[Fall]:
     if by > 0.0:
         yield Fall(along, where, float(by), *middle(drawn))
-
-
-def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, values.tolist()))
 
 
 def _band(value: FloatArray, drawn: FloatArray) -> Band:

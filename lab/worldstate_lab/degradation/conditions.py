@@ -33,7 +33,7 @@ from worldstate.adapters.camera.camera_health import (
     strength,
 )
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
-from worldstate.adapters.camera.detectors import Background, MotionDetector
+from worldstate.adapters.camera.detectors import Background, MotionDetector, reduced_to
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import Video
@@ -265,7 +265,7 @@ def look(
     period = max(round(HEALTH_PERIOD_S * rate_hz), 1)
     with _one_opencv_thread():
         for number, frame in enumerate(video.frames()):
-            small = _reduced(frame, width_px)
+            small = reduced_to(frame, width_px)  # Once for all detectors
             for state in conditions:
                 staged = state.stage(small, rng, frame.shape[1] / small.shape[1])
                 for name, rows in boxes.items():
@@ -329,17 +329,6 @@ def degradation_in(readings: HopTable, condition: str, rates: MissRates) -> Degr
 
 def _measured(readings: Sequence[HopTable], condition: Condition, name: str) -> FloatArray:
     return np.concatenate([one.columns[name][one.condition == condition.name] for one in readings])
-
-
-def _reduced(frame: ImageArray, width_px: int) -> ImageArray:
-    """Reduce an image as detectors do, once for all of them."""
-    height, width = frame.shape[:2]
-    if width <= width_px:
-        return frame
-    size = (width_px, max(round(height * width_px / width), 1))
-    cv2 = optional("cv2")
-    reduced: ImageArray = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
-    return reduced
 
 
 def _centre(frame: ImageArray) -> ImageArray:

@@ -1,6 +1,6 @@
 """Rows of Table I that decide from sound: published, sustained and calibrated rules, and whole chains."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.metrics.approach_table import auroc, onset_outcome, rising_edges
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.metrics.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate_lab.trials.classification import SIDE_COLUMNS, posteriors
 from worldstate_lab.trials.trial import LEFT, RIGHT, Decide, Decisions, Trial
@@ -57,14 +58,29 @@ def _share(flags: Sequence[bool]) -> float:
     return sum(flags) / max(len(flags), 1)
 
 
-def labelled_windows(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> tuple[FloatArray, BoolArray]:
+def labelled_windows(
+    streams: Sequence[HopTable], scores: Sequence[FloatArray]
+) -> tuple[FloatArray, BoolArray]:
     """Return score and hazard label of all windows up to T0 and all hazard-free ones, shape (n,) each."""
-    used = [
-        score if trial.hazard_free else score[trial.hops.before_sight()]
-        for trial, score in zip(trials, scores, strict=True)
-    ]
-    labels = [np.full(score.size, not trial.hazard_free) for trial, score in zip(trials, used, strict=True)]
+    pairs = list(zip(streams, scores, strict=True))
+    used = [score if one.hazard_free else score[one.before_sight()] for one, score in pairs]
+    labels = [np.full(score.size, not one.hazard_free) for one, score in zip(streams, used, strict=True)]
     return np.concatenate(used), np.concatenate(labels)
+
+
+def best_weight(
+    streams: Sequence[HopTable],
+    weights: Sequence[float],
+    statistic: Callable[[HopTable, float], FloatArray],
+) -> float:
+    """Return the weight of looming with the largest window AUROC; of equals the smallest."""
+    if len(weights) == 1:
+        return weights[0]
+
+    def area(weight: float) -> float:
+        return auroc(*labelled_windows(streams, [statistic(one, weight) for one in streams])) or 0.0
+
+    return max(weights, key=lambda weight: (area(weight), -weight))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,14 +127,15 @@ class CalibratedCue:
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
         """Set k, the weight of looming, gamma(alpha) and the risk map."""
-        hops, weight = best_sustain(calibration, self.evidence), self._best_weight(calibration)
-        scores = [self._statistic(trial, weight) for trial in calibration]
-        calm = [s for trial, s in zip(calibration, scores, strict=True) if trial.hazard_free]
+        hops, streams = best_sustain(calibration, self.evidence), [trial.hops for trial in calibration]
+        weight = best_weight(streams, LOOMING_WEIGHTS if self.looming else (0.0,), self._statistic)
+        scores = [self._statistic(one, weight) for one in streams]
+        calm = [score for one, score in zip(streams, scores, strict=True) if one.hazard_free]
         gamma = neyman_pearson_threshold(calm, self.alpha, hops)
-        risk_map = fit_isotonic(*labelled_windows(calibration, scores))
+        risk_map = fit_isotonic(*labelled_windows(streams, scores))
 
         def decide(trial: Trial) -> Decisions:
-            score = self._statistic(trial, weight)
+            score = self._statistic(trial.hops, weight)
             return Decisions.of(
                 trial.hops.time_s,
                 sustained_alarm(score >= gamma, hops),
@@ -131,21 +148,10 @@ class CalibratedCue:
 
         return decide
 
-    def _statistic(self, trial: Trial, weight: float) -> FloatArray:
+    def _statistic(self, hops: HopTable, weight: float) -> FloatArray:
         switches = StatisticSwitches(use_absence=self.absence, approach_weight=weight)
-        stream = trial.hops.replace(log_likelihoods=trial.hops.columns[self.evidence])
-        return stream_statistic(stream, trial.hops.about["prior"][self.evidence], switches)
-
-    def _best_weight(self, calibration: Sequence[Trial]) -> float:
-        """Return the weight with the largest window AUROC on the calibration recordings."""
-        if not self.looming:
-            return 0.0
-
-        def area(weight: float) -> float:
-            scores = [self._statistic(trial, weight) for trial in calibration]
-            return auroc(*labelled_windows(calibration, scores)) or 0.0
-
-        return max(LOOMING_WEIGHTS, key=lambda weight: (area(weight), -weight))
+        stream = hops.replace(log_likelihoods=hops.columns[self.evidence])
+        return stream_statistic(stream, hops.about["prior"][self.evidence], switches)
 
 
 @dataclass(frozen=True, slots=True)

@@ -311,17 +311,6 @@ def macro(by_group: Mapping[str, float]) -> float:
     return float(np.mean(list(by_group.values())))
 
 
-def rate(decisions: BoolArray, among: BoolArray) -> float | None:
-    """Return the share of decisions among the chosen rows, None where there are none.
-
-    Examples
-    --------
-    >>> rate(np.array([True, False, True]), np.array([True, True, False]))
-    0.5
-    """
-    return float(decisions[among].mean()) if among.any() else None
-
-
 def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> float:
     r"""Return the share of hazard-free windows that are in alarm at the junction where it is largest.
 
@@ -335,8 +324,7 @@ def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> fl
     >>> worst_rate(np.array([True, False, False, False]), free, np.array([0, 0, 1, 1]))
     0.5
     """
-    rates = [rate(alarms, hazard_free & (sites == site)) for site in np.unique(sites[hazard_free])]
-    return max(one for one in rates if one is not None)
+    return max(float(alarms[hazard_free & (sites == one)].mean()) for one in np.unique(sites[hazard_free]))
 
 
 def worst_group(values: Mapping[str, float], worse: Literal["low", "high"]) -> tuple[str, float]:

@@ -19,16 +19,12 @@ class StatisticSwitches:
 
     # False drops the answer of the channel that was asked: the signature alone, beta = 1.
     use_absence: bool = True
-    # Absence with this beta at every hop, whatever was answered: the statistic that thresholds are set on.
-    fixed_miss_rate: float | None = None
     # Nats by which the log-odds rise with each standard deviation of the approach rate above zero; where it
     # is not usable it is marginalised.
     approach_weight: float = 0.0
 
     def __post_init__(self) -> None:
         in_range("approach_weight", self.approach_weight, 0.0, 100.0)
-        if self.fixed_miss_rate is not None:
-            in_range("fixed_miss_rate", self.fixed_miss_rate, 0.0, 1.0)
 
 
 def stream_statistic(
@@ -73,8 +69,6 @@ def _log_visible(stream: HopTable, switches: StatisticSwitches) -> FloatArray:
     """Log p(V | visible) / p(V | hidden or none) at every hop."""
     if not switches.use_absence:
         return np.zeros(len(stream))
-    if switches.fixed_miss_rate is not None:
-        return np.full(len(stream), np.log(switches.fixed_miss_rate))
     beta, answer = stream.miss_rate, stream.answer
     # Where nothing is present the clutter does not matter, and 1 keeps its logarithm finite.
     clutter = np.where(answer == PRESENT, stream.clutter_rate, 1.0)

@@ -18,7 +18,7 @@ from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import asked_again
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Row, frame_of_rows
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import Model
@@ -51,7 +51,7 @@ _STILL_M = 1e-3  # Of a tenth of a second: slower ones keep their heading
 def stream_detections(heard: HeardStream, rng: np.random.Generator) -> DetectionLog:
     """Return the boxes of everybody in view, missed as often as the paper's detector misses them."""
     camera, site = PinholeCamera(), junction_named(heard.site)
-    frames: dict[int, list[tuple[FloatArray, float, str]]] = {}
+    frames: dict[int, list[Row]] = {}
     kinds = dict(zip(heard.vehicles.vehicle.tolist(), heard.vehicles.kind.tolist(), strict=True))
     for number, name in kinds.items():
         kind, mine = vehicle_kind(name), heard.rows.vehicle == number
@@ -62,12 +62,12 @@ def stream_detections(heard: HeardStream, rng: np.random.Generator) -> Detection
             box = _box(camera, site, kind, float(x[at]), float(y[at]), int(crossing[at]))
             if box is None or rng.random() < miss_rate(float(x[at]), float(y[at])):
                 continue
-            noisy = np.array(inside(box + rng.normal(0.0, BOX_NOISE_PX, 4), camera))
+            noisy = inside(box + rng.normal(0.0, BOX_NOISE_PX, 4), camera)
             frame = round(float(time_s[at]) / FRAME_S)
             score = float(np.clip(rng.normal(0.95, 0.03), 0.3, 0.999))
             frames.setdefault(frame, []).append((noisy, score, kind.label))
     last = round(float(heard.hops.time_s[-1]) / FRAME_S)
-    every = [_frame(frames.get(at, [])) for at in range(last + 1)]
+    every = [frame_of_rows(frames.get(at, [])) for at in range(last + 1)]
     return DetectionLog.at_rate(every, 1.0 / FRAME_S, source=heard.hops.name)
 
 
@@ -97,13 +97,6 @@ def _box(
         return project(camera, site, x, (ends[0], ends[1]), kind)
     half = 0.5 * kind.width_m
     return project(camera, site, x, (y - half, y + half), kind)
-
-
-def _frame(boxes: list[tuple[FloatArray, float, str]]) -> DetectionFrame:
-    if not boxes:
-        return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
-    pixels, scores, labels = zip(*boxes, strict=True)
-    return DetectionFrame(np.stack(pixels), np.array(scores), tuple(labels))
 
 
 def measurements(

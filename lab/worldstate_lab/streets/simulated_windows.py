@@ -13,25 +13,14 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
-import scipy.signal
 
 from worldstate.adapters.datasets.feature_extraction import WINDOW_S, window_ends_s
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.frontend.array.steering import cross_spectra, one_blas_thread
-from worldstate.frontend.direction.feature import (
-    FEATURE_BAND_HZ,
-    FEATURE_RATE_HZ,
-    FEATURE_SEGMENTS,
-    feature_nfft,
-    feature_steering,
-    pair_sum_of,
-    segment_feature,
-)
-from worldstate.frontend.spectra.stft import band_bins, whiten
+from worldstate.frontend.direction.feature import FEATURE_RATE_HZ, published_feature
 from worldstate.ground.checks import in_range
-from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray, TextArray
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, TextArray
 from worldstate.operations.metrics.approach_table import auroc
 from worldstate.simulation.dataset.recording import simulate_recording
 from worldstate.simulation.parallel import in_processes
@@ -200,9 +189,8 @@ def median_rows(one: FeatureTable, other: FeatureTable) -> dict[FigureKey, tuple
 
 DECIMATION = 4
 RATE_HZ = FEATURE_RATE_HZ / DECIMATION
-NFFT = feature_nfft(RATE_HZ)
 # Changes whenever a window of the same seed would be another one.
-LAYOUT = 3
+LAYOUT = 4
 # The first window is a second long and ends at T0 at the earliest; the last ends a frame (.1 s), a moving
 # ego's delay (.5 s) and the front window's (1.5 s) after it.
 ENTRY_S, DURATION_S = 1.65, 3.8
@@ -294,18 +282,4 @@ def permuted_array() -> MicrophoneArray:
 
 def window_features(samples: Float32Array, arrays: Sequence[MicrophoneArray]) -> FloatArray:
     """Compute the published feature of a window at `RATE_HZ` by each array, shape (n, 56) -> (arrays, 60)."""
-    bins = band_bins(FEATURE_BAND_HZ, RATE_HZ, NFFT)
-    spectra = scipy.signal.stft(samples, nperseg=NFFT, axis=0)[2][bins.start : bins.stop]
-    whitened = whiten(np.ascontiguousarray(spectra.transpose(2, 0, 1), np.complex64))
-    length = len(whitened) // FEATURE_SEGMENTS
-    with one_blas_thread():
-        matrices = [
-            cross_spectra(whitened[i * length :][:length].transpose(1, 0, 2)) for i in range(FEATURE_SEGMENTS)
-        ]
-        return np.array([_feature(matrices, array, bins, length) for array in arrays])
-
-
-def _feature(matrices: list[Complex64Array], array: MicrophoneArray, bins: range, length: int) -> FloatArray:
-    steering = feature_steering(array, bins, RATE_HZ, NFFT)
-    sums = [pair_sum_of(one, steering) for one in matrices]
-    return np.concatenate([segment_feature([s], length, len(bins), array.n_microphones) for s in sums])
+    return np.array([published_feature(samples, array, RATE_HZ) for array in arrays])

@@ -23,7 +23,7 @@ from worldstate.adapters.camera.detections import (
     Detector,
     kept_and_parked,
 )
-from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, as_tuples
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, Video
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
@@ -218,8 +218,8 @@ class AbsenceTally:
         """Return the counts so far by family."""
         every = zip(self._looks, self._misses, self._sectors, self._clutter, strict=True)
         return {
-            family: FamilyCounts(_rows(looks), _rows(misses), tuple(sectors), tuple(clutter))
-            for family, (looks, misses, sectors, clutter) in zip(self._settings.families, every, strict=True)
+            family: FamilyCounts(*map(as_tuples, counted))
+            for family, counted in zip(self._settings.families, every, strict=True)
         }
 
     def _bins(self, boxes_px: FloatArray) -> IntArray:
@@ -267,10 +267,6 @@ def reference_by(detector: Detector, video: Video) -> DetectionLog:
     # Its miss rate on clean frames is then zero by definition: only the degraded ones tell anything.
     found = [detector.detect(frame) for frame in video.frames()]
     return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
-
-
-def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in values.tolist())
 
 
 def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | None]]:

@@ -240,7 +240,7 @@ class ApproachTable:
         return [one if one.ndim == 1 else np.asarray(one.any(axis=1)) for one in self.hazard_free]
 
 
-def mean_of(values: Sequence[float] | Sequence[bool] | BoolArray) -> float | None:
+def mean_of(values: Sequence[float] | Sequence[bool] | FloatArray | BoolArray) -> float | None:
     """Return the mean, None of nothing."""
     return float(np.mean(values)) if len(values) else None
 
