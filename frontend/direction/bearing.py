@@ -270,7 +270,7 @@ def bearing_of(
     spectrum: FloatArray, peaks: Sequence[Peak], azimuths_rad: FloatArray, least_prominence: float
 ) -> AcousticBearing:
     """Return the first of the peaks of a spectrum (A,) as a bearing; the middle of the grid if none."""
-    uniform = uniform_std_rad(azimuths_rad)
+    uniform = float(azimuths_rad[-1] - azimuths_rad[0]) / math.sqrt(12.0)
     if not peaks:
         return AcousticBearing(float(0.5 * (azimuths_rad[0] + azimuths_rad[-1])), uniform, 1.0)
     best = peaks[0]
@@ -279,22 +279,17 @@ def bearing_of(
     return AcousticBearing(best.azimuth_rad, std, best.prominence)
 
 
-def uniform_std_rad(azimuths_rad: FloatArray) -> float:
-    """Return the standard deviation of a direction that may be any of a grid (A,)."""
-    return float(azimuths_rad[-1] - azimuths_rad[0]) / math.sqrt(12.0)
-
-
 def _std_rad(spectrum: FloatArray, best: Peak, azimuths_rad: FloatArray) -> float:
     share, peak = best.value * (1.0 - 1.0 / best.prominence), int(spectrum.argmax())
     ratio = share / max(1.0 - best.value, _LEAST_REST)
     excess = np.maximum(spectrum / share - 1.0 / (best.prominence - 1.0), 0.0)
     density = np.exp((excess - excess[peak]) * (ratio / _TEMPERATURE))
-    total = density.sum()
+    density /= density.sum()
     first, last = _lobe(excess, peak)
     density[first : last + 1] = 0.0
-    others = float(density @ np.square(wrap_angle(azimuths_rad - best.azimuth_rad)) / total)
-    width = _top_width(excess, peak) * float(azimuths_rad[1] - azimuths_rad[0])
-    return math.hypot(_LEAST_STD_RAD, _DISPLACEMENT * width / ratio, math.sqrt(others))
+    others = float(density @ np.square(wrap_angle(azimuths_rad - best.azimuth_rad)))
+    moved = _DISPLACEMENT * _top_width(excess, peak) * float(azimuths_rad[1] - azimuths_rad[0]) / ratio
+    return math.hypot(_LEAST_STD_RAD, moved, math.sqrt(others))
 
 
 def _top_width(excess: FloatArray, peak: int) -> float:
@@ -316,14 +311,14 @@ class BearingScatter:
 
     Examples
     --------
-    >>> scatter = BearingScatter(most_rad=1.0)
+    >>> scatter = BearingScatter()
     >>> stated = [scatter.widened(AcousticBearing(0.2 * (k % 3), 0.1, 2.0)).std_rad for k in range(7)]
     >>> [round(one, 2) for one in stated]
     [0.1, 0.1, 0.1, 0.1, 0.1, 0.41, 0.33]
     """
 
-    def __init__(self, most_rad: float) -> None:
-        self._most_rad, self._sum, self._weight = most_rad, 0.0, 0.0
+    def __init__(self) -> None:
+        self._sum, self._weight = 0.0, 0.0
         self._past: deque[AcousticBearing] = deque(maxlen=_APART)
 
     def widened(self, bearing: AcousticBearing) -> AcousticBearing:
@@ -331,12 +326,12 @@ class BearingScatter:
         if len(self._past) == _APART:
             before = self._past[0]
             weight = 1.0 / (bearing.std_rad**2 + before.std_rad**2)
-            turned = float(wrap_angle(bearing.azimuth_rad - before.azimuth_rad))
-            self._sum = _KEEP * self._sum + weight * turned**2
+            squared = wrap_angle(bearing.azimuth_rad - before.azimuth_rad) ** 2
+            self._sum = _KEEP * self._sum + weight * squared
             self._weight = _KEEP * self._weight + weight
         self._past.append(bearing)
         added = math.sqrt(self._sum / self._weight) if self._weight else 0.0
-        return replace(bearing, std_rad=min(math.hypot(bearing.std_rad, added), self._most_rad))
+        return replace(bearing, std_rad=math.hypot(bearing.std_rad, added))
 
 
 def _lobe(excess: FloatArray, peak: int) -> tuple[int, int]:
