@@ -207,7 +207,7 @@ class FrontEnd:
         self._start_ns = start_ns
         self._azimuths = settings.azimuths_rad()
         self._azimuths.flags.writeable = False
-        self._scatter = direction.BearingScatter()
+        self._scatter = direction.BearingScatter(float(np.ptp(self._azimuths) / np.sqrt(12.0)))
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz)
         with one_blas_thread():
             self._spectra = HopSpectra(array, self.sample_rate_hz, settings)

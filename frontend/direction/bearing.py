@@ -312,14 +312,14 @@ class BearingScatter:
 
     Examples
     --------
-    >>> scatter = BearingScatter()
+    >>> scatter = BearingScatter(most_rad=1.0)
     >>> stated = [scatter.widened(AcousticBearing(0.2 * (k % 3), 0.1, 2.0)).std_rad for k in range(7)]
     >>> [round(one, 2) for one in stated]
     [0.1, 0.1, 0.1, 0.1, 0.1, 0.41, 0.33]
     """
 
-    def __init__(self) -> None:
-        self._sum, self._weight = 0.0, 0.0
+    def __init__(self, most_rad: float) -> None:
+        self._most_rad, self._sum, self._weight = most_rad, 0.0, 0.0
         self._past: deque[AcousticBearing] = deque(maxlen=_APART)
 
     def widened(self, bearing: AcousticBearing) -> AcousticBearing:
@@ -332,7 +332,7 @@ class BearingScatter:
             self._weight = _KEEP * self._weight + weight
         self._past.append(bearing)
         added = math.sqrt(self._sum / self._weight) if self._weight else 0.0
-        return replace(bearing, std_rad=math.hypot(bearing.std_rad, added))
+        return replace(bearing, std_rad=min(math.hypot(bearing.std_rad, added), self._most_rad))
 
 
 def _lobe(excess: FloatArray, peak: int) -> tuple[int, int]:

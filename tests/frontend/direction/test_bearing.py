@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+from worldstate.frontend.direction.bearing import AcousticBearing, BearingScatter
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -77,6 +78,16 @@ def test_bearings_that_contradict_one_another_are_stated_wider() -> None:
     first = (np.arange(n) // (RATE // 2) % 2 == 0)[:, None]
     assert hear(array, lone)[-1].bearing_std_rad < np.radians(2.0)
     assert hear(array, np.where(first, lone, other))[-1].bearing_std_rad > np.radians(25.0)
+
+
+def test_sharp_bearings_that_agree_do_not_outweigh_contradictions() -> None:
+    """A steady image in a wall, stated a degree sharp, after bearings 60 degrees apart, stated 15 degrees."""
+    scatter = BearingScatter(most_rad=np.radians(52.0))
+    degrees = [0.0, 60.0] * 15 + [0.0] * 30
+    stated = [scatter.widened(AcousticBearing(np.radians(d), np.radians(15 - 14 * (k >= 30)), 2.0)).std_rad
+              for k, d in enumerate(degrees)]  # fmt: skip
+    assert max(stated) <= np.radians(52.0)
+    assert stated[-1] > np.radians(20.0)
 
 
 @pytest.mark.parametrize("microphones", SPREAD)
