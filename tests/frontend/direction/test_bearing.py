@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+from worldstate.frontend.direction.bearing import AcousticBearing, BearingScatter
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -56,24 +55,39 @@ def test_a_bearing_of_noise_is_not_called_sharp(kind: str, microphones: int) -> 
     assert np.median(stated) > 30.0
 
 
-@settings(max_examples=12, deadline=None)
-@given(
-    microphones=st.integers(4, 24),
-    azimuth_deg=st.floats(-60, 60),
-    elevation_deg=st.floats(-15, 2),
-    snr_db=st.floats(3, 25),
-    seed=st.integers(0, 1000),
-)
-def test_the_error_of_a_lone_source_is_within_what_is_stated(
-    microphones: int, azimuth_deg: float, elevation_deg: float, snr_db: float, seed: int
-) -> None:
-    rng, n = np.random.default_rng(seed), round(1.3 * RATE)
-    array = MicrophoneArray(rng.uniform([-0.05, -0.4, -0.3], [0.05, 0.4, 0.3], (microphones, 3)))
-    noise = rng.standard_normal((n, microphones)) * 10 ** (-snr_db / 20)
-    for frame in hear(array, wave(array, azimuth_deg, elevation_deg, n, seed) + noise):
-        assert frame.prominence > frame.least_prominence
-        assert abs(np.degrees(frame.bearing_rad) - azimuth_deg) < 2.0 * np.degrees(frame.bearing_std_rad)
-        assert frame.bearing_std_rad < np.radians(40)
+def test_the_error_of_a_lone_source_is_what_is_stated() -> None:
+    """Drawn arrays, directions and 3 to 25 dB of noise that is independent between microphones."""
+    scores, n = [], round(1.1 * RATE)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        microphones = int(rng.integers(4, 25))
+        azimuth_deg, elevation_deg = rng.uniform(-60, 60), rng.uniform(-15, 2)
+        array = MicrophoneArray(rng.uniform([-0.05, -0.4, -0.3], [0.05, 0.4, 0.3], (microphones, 3)))
+        noise = rng.standard_normal((n, microphones)) * 10 ** (-rng.uniform(3, 25) / 20)
+        for frame in hear(array, wave(array, azimuth_deg, elevation_deg, n, seed) + noise):
+            assert frame.prominence > frame.least_prominence
+            assert frame.bearing_std_rad < np.radians(40)
+            scores.append((np.degrees(frame.bearing_rad) - azimuth_deg) / np.degrees(frame.bearing_std_rad))
+    assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.3
+
+
+def test_bearings_that_contradict_one_another_are_stated_wider() -> None:
+    """Two sources that sound in turn, as where a wall reflects; a lone one keeps what it states."""
+    array, n = SPREAD[14], 4 * RATE
+    lone, other = wave(array, 30.0, 0.0, n, 6), wave(array, -20.0, 0.0, n, 7)
+    first = (np.arange(n) // (RATE // 2) % 2 == 0)[:, None]
+    assert hear(array, lone)[-1].bearing_std_rad < np.radians(2.0)
+    assert hear(array, np.where(first, lone, other))[-1].bearing_std_rad > np.radians(25.0)
+
+
+def test_sharp_bearings_that_agree_do_not_outweigh_contradictions() -> None:
+    """A steady image in a wall, stated a degree sharp, after bearings 60 degrees apart, stated 15 degrees."""
+    scatter = BearingScatter(most_rad=np.radians(52.0))
+    degrees = [0.0, 60.0] * 15 + [0.0] * 30
+    stated = [scatter.widened(AcousticBearing(np.radians(d), np.radians(15 - 14 * (k >= 30)), 2.0)).std_rad
+              for k, d in enumerate(degrees)]  # fmt: skip
+    assert max(stated) <= np.radians(52.0)
+    assert stated[-1] > np.radians(20.0)
 
 
 @pytest.mark.parametrize("microphones", SPREAD)
