@@ -19,6 +19,7 @@ SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, i
 MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
 MAX_OCCLUDERS = 4
 _MOVING = re.compile(r"D([AB]\d+)")  # Named or drawn: where the ego moves at the place S..
+_TRACED = re.compile(r"T[AB]\d{1,6}")
 # The fits want smooth side walls, and a rough one opposite: shop fronts, doors, parked bicycles.
 ROUGHNESS_A, ROUGHNESS_B = (1.0, 4.0), (0.3, 1.0)
 WALL_END_M = 99.0  # openings before a wall begins and after it ends go on to here
@@ -172,7 +173,7 @@ def site(name: str) -> Site:
     Parameters
     ----------
     name : str
-        One of `SITES` or `MOVING_SITES`.
+        One of `SITES` or `MOVING_SITES`, or TA1, TB1, TA2, ... of the second renderer.
 
     Returns
     -------
@@ -191,7 +192,8 @@ def site(name: str) -> Site:
     """
     if name in MOVING_SITES:
         return replace(site("S" + name[1:]), name=name)
-    one_of("site", name, SITES + MOVING_SITES)
+    if not _TRACED.fullmatch(name):
+        one_of("site", name, (*SITES, *MOVING_SITES, "TA1", "TB1"))
     return PLANS[name] if name in PLANS else drawn_site(name)
 
 

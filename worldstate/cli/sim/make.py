@@ -79,7 +79,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--minutes", type=float, metavar="M", help="its length")
     # Any word is taken: the library refuses a moving ego with its reason.
     sites = simulation.SITES
-    add("--site", default=sites[0], help=f"{', '.join(sites)} (default: {sites[0]})")
+    add(
+        "--site",
+        default=sites[0],
+        help=f"{', '.join(sites)}, or TA1, TB1, ... of the second renderer (default: {sites[0]})",
+    )
     add("--traffic", choices=[*TRAFFICS], default="calm", help="how much drives (default: calm)")
 
 
@@ -134,7 +138,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
     from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
-    kinds, folder = _sounds(arguments.sounds)
+    (kinds, folder), traffic = _sounds(arguments.sounds), traffic_named(arguments.traffic)
     rate_hz, band = SAMPLE_RATE_HZ, arguments.bandwidth
     if band is not None:
         rate_hz = rate_for(ground.in_range("--bandwidth", band, *BANDWIDTHS_HZ))
@@ -143,8 +147,11 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
         minutes=arguments.minutes,
         seed=arguments.seed,
         traffic=replace(
-            traffic_named(arguments.traffic),
-            sounds=dict.fromkeys((kind for kind in kinds if kind not in SIGNALS), PER_HOUR),
+            traffic,
+            sounds={
+                **traffic.sounds,
+                **dict.fromkeys((one for one in kinds if one not in SIGNALS), PER_HOUR),
+            },
             signals=dict.fromkeys((kind for kind in kinds if kind in SIGNALS), SIGNAL_SHARE),
         ),
         preset=replace(simulation.preset(arguments.preset), sounds_folder=folder),
