@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worldstate_lab.streets.simulated_windows import NFFT, RATE_HZ, simulated_window_pair
+from worldstate_lab.streets.simulated_windows import RATE_HZ, simulated_window_pair
 
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.bearing import srp_phat
-from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
+from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD, feature_nfft
 from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz
 from worldstate.simulation import SITES, SimulationSettings, Site, preset, simulate_recording, site
 
-AZIMUTHS_RAD = np.radians(np.arange(-90.0, 91.0))
+AZIMUTHS_RAD, NFFT = np.radians(np.arange(-90.0, 91.0)), feature_nfft(RATE_HZ)
 BAND_HZ = (300.0, 1500.0)
 # Nothing but the vehicle and the corners.
 QUIET = replace(

@@ -24,7 +24,7 @@ from worldstate.simulation.stream.arrivals import (
     draw_sounds,
 )
 from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, drive_along, emerges
-from worldstate.simulation.stream.settings import FLOWS, HAZARDS, StreamSettings, Traffic, traffic_named
+from worldstate.simulation.stream.settings import HAZARDS, StreamSettings, Traffic, traffic_named
 from worldstate.simulation.stream.truth import (
     CLUTTER_IMAGES,
     CLUTTER_PER_HOUR,
@@ -62,7 +62,7 @@ def test_a_busy_hour_holds_every_event_and_only_hazards_come_out_of_an_arm(name:
     events = events_of("busy", name, seed=1)
     vehicles = [vehicle_truth(number, event, settings) for number, event in enumerate(events)]
     told = describe_events(vehicles, (), {})["vehicles"]
-    assert {one["flow"] for one in told} == {*FLOWS, "follows"} - {"queue"}
+    assert {one["flow"] for one in told} == {*traffic_named("busy").per_hour, "follows"}
     assert {one["kind"] for one in told} >= {"light", "medium", "heavy", "electric", "bicycle"}
     for one, vehicle in zip(told, vehicles, strict=True):
         assert one["hazard"] == (one["flow"] in {*HAZARDS, "follows"})

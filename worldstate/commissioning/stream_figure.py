@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 FLOW_COLOURS = {
     "left": RED, "right": RED, "both": RED, "queue": RED, "follows": ORANGE, "waits": PURPLE,
     "turns_away": BLUE, "parks": SKY, "far": "0.5", "from_behind": GREEN, "from_ahead": YELLOW,
+    "stands": BLUE, "leaves": SKY, "joins": SKY,
 }  # fmt: skip
 MAP_M = 60.0  # as far to the sides
 WALLS_M = 12.0  # the ego's own street is drawn this far behind it
