@@ -12,8 +12,15 @@ from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Loomin
 from worldstate.frontend.approach.tone import ToneReading, ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import one_blas_thread
-from worldstate.frontend.direction import bearing as direction
-from worldstate.frontend.direction.bearing import Peak, find_peaks, noise_prominence, normalised
+from worldstate.frontend.direction.bearing import (
+    BearingScatter,
+    Peak,
+    bearing_of,
+    find_peaks,
+    noise_prominence,
+    normalised,
+    uniform_std_rad,
+)
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.hop_spectra import SILENCE, Hop, HopCutter
@@ -207,7 +214,7 @@ class FrontEnd:
         self._start_ns = start_ns
         self._azimuths = settings.azimuths_rad()
         self._azimuths.flags.writeable = False
-        self._scatter = direction.BearingScatter(float(np.ptp(self._azimuths) / np.sqrt(12.0)))
+        self._scatter = BearingScatter(uniform_std_rad(self._azimuths))
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz)
         with one_blas_thread():
             self._spectra = HopSpectra(array, self.sample_rate_hz, settings)
@@ -333,7 +340,7 @@ class FrontEnd:
         heard = self._heard(BEARING_HOPS)
         spectrum, floor = self._srp(heard), self._least_prominence
         peaks = find_peaks(spectrum, self._azimuths)
-        bearing = self._scatter.widened(direction.bearing_of(spectrum, peaks, self._azimuths, floor))
+        bearing = self._scatter.widened(bearing_of(spectrum, peaks, self._azimuths, floor))
         window = sum(hop.share for hop in self._hops) / WINDOW_HOPS
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),

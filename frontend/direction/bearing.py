@@ -266,11 +266,16 @@ class AcousticBearing:
     prominence: float  # Peak-to-median ratio, >= 1; 1 in silence
 
 
+def uniform_std_rad(azimuths_rad: FloatArray) -> float:
+    """Return the standard deviation of a direction that may be anywhere on a grid."""
+    return float(azimuths_rad[-1] - azimuths_rad[0]) / math.sqrt(12.0)
+
+
 def bearing_of(
     spectrum: FloatArray, peaks: Sequence[Peak], azimuths_rad: FloatArray, least_prominence: float
 ) -> AcousticBearing:
     """Return the first of the peaks of a spectrum (A,) as a bearing; the middle of the grid if none."""
-    uniform = float(azimuths_rad[-1] - azimuths_rad[0]) / math.sqrt(12.0)
+    uniform = uniform_std_rad(azimuths_rad)
     if not peaks:
         return AcousticBearing(float(0.5 * (azimuths_rad[0] + azimuths_rad[-1])), uniform, 1.0)
     best = peaks[0]

@@ -125,8 +125,8 @@ class Site:
 
     @property
     def is_traced(self) -> bool:
-        """Whether its sound is carried by rays through drawn houses: the name begins with T."""
-        return self.name.startswith("T")
+        """Whether its sound is carried by rays through drawn houses: TA1, TB1 and so on."""
+        return _TRACED.fullmatch(self.name) is not None
 
     @property
     def far_kerb_m(self) -> float:
@@ -264,7 +264,7 @@ def drawn_site(name: str) -> Site:
     True
     """
     rng = site_generator(name)
-    if name.startswith("T"):
+    if _TRACED.fullmatch(name):
         return _traced_site(name, rng)
     with_wall = name[:2] in ("SA", "DA")
     ahead, corners = rng.uniform(4.5, 5.2), rng.uniform(2.3, 3.1, 2)

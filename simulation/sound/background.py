@@ -166,16 +166,21 @@ def add_background(
     azimuth = azimuths_all_round(preset.ambient_waves, rng)
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, len(azimuth)))
     directions, offsets = unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m
-    wind = wind_density(preset.wind_100hz_db + here.wind_db, grid.frequencies_hz, ROOF_SLOPE, ROOF_FLOOR_HZ)
-    electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / NOISE_BAND_HZ
     field = WaveField(
         grid,
         plane_wave_delays(directions, offsets) + receiver.skew_s,
         level_curve(here.octaves_db, grid.frequencies_hz),
         _Town(site, preset, here, azimuth).power(grid, rng),
-        wind + electronic,
+        own_noise_density(preset, here, grid.frequencies_hz),
     )
     field.add_to(out, rng)
+
+
+def own_noise_density(preset: Preset, here: Ambience, frequencies_hz: FloatArray) -> FloatArray:
+    """Power spectral density of what a microphone hears by itself, wind and electronics, Pa^2/Hz, (F,)."""
+    wind = wind_density(preset.wind_100hz_db + here.wind_db, frequencies_hz, ROOF_SLOPE, ROOF_FLOOR_HZ)
+    electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / NOISE_BAND_HZ
+    return np.asarray(wind + electronic)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

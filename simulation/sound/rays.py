@@ -19,20 +19,12 @@ import numpy as np
 from scipy.signal import oaconvolve
 from scipy.special import modfresnelm
 
-from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.junction import Site, site_generator
-from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, level_curve
+from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, level_curve
 from worldstate.simulation.scene.presets import Ambience, Preset
 
-from .background import (
-    NOISE_BAND_HZ,
-    ROOF_FLOOR_HZ,
-    ROOF_SLOPE,
-    BlockGrid,
-    WaveField,
-    far_passages_s,
-    wind_density,
-)
+from .background import BlockGrid, WaveField, far_passages_s, own_noise_density
 from .delay import Emission, SampledSignal
 from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS
 from .receiver import Receiver, add_along, add_to_all
@@ -124,10 +116,19 @@ def azimuths_rad() -> FloatArray:
     return -np.pi + (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS
 
 
+def _direction_numbers(azimuth_rad: FloatArray) -> IndexArray:
+    """Return which direction each azimuth of -pi to pi belongs to, shape (n,)."""
+    return ((azimuth_rad + np.pi) * DIRECTIONS / (2.0 * np.pi)).astype(np.intp) % DIRECTIONS
+
+
 @lru_cache(maxsize=8)
 def reached(site: Site, height_m: float) -> Reached:
     """Trace the rays of a site once."""
     return trace(drawn_houses(site), height_m, site_generator(site.name, "rays"))
+
+
+def _reached_by(receiver: Receiver, site: Site) -> Reached:
+    return reached(site, round(float(receiver.centre_m[2]), 3))
 
 
 def trace(houses: Houses, height_m: float, rng: np.random.Generator, rays: int = RAYS) -> Reached:
@@ -138,35 +139,21 @@ def trace(houses: Houses, height_m: float, rng: np.random.Generator, rays: int =
     of rays that left in this direction, l metres of which lie in the cell of volume V; the road mirrors, and
     source levels stand over hard ground already.
     """
-    azimuth = rng.uniform(-np.pi, np.pi, rays)
-    launched = np.minimum(((azimuth + np.pi) * DIRECTIONS / (2.0 * np.pi)).astype(int), DIRECTIONS - 1)
-    slope = _tangent(rng.uniform(-STEEPEST, STEEPEST, rays))
-    at = np.zeros((rays, 2))
-    flat = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
-    height, gone = np.full(rays, height_m), np.zeros(rays)
-    energy = np.full((rays, len(OCTAVES_HZ)), STEEPEST / rays)
+    going = _launched(height_m, rays, rng)
     shape = (*(round((high - low) / CELL_M) for low, high in PLAN_M), DIRECTIONS, len(OCTAVES_HZ))
     left, early, out = np.zeros(shape), np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     lengths, heard = [], []
     for bounce in range(BOUNCES):
-        wall, way = _next_wall(houses, at, flat)
+        wall, way = _next_wall(houses, going)
         if bounce:
-            deposit = _deposit(left, launched, at, flat, height, slope, way, energy, rng)
+            deposit = _deposit(left, going, way, rng)
             early += deposit if bounce <= EARLY_BOUNCES else 0.0
-            lengths.append(gone)
-            heard.append(energy[:, 3] * np.minimum(way, 20.0))
+            lengths.append(going.gone_m)
+            heard.append(going.energy[:, 3] * np.minimum(way, 20.0))
         escaped = ~np.isfinite(way)
-        np.add.at(out, launched[escaped], energy[escaped].mean(axis=1))
-        way[escaped] = 0.0
-        on = ~escaped & (np.abs(height + slope * way) < houses.height_m[wall])
-        wall, launched, slope, way = wall[on], launched[on], slope[on], way[on]
-        at, height = at[on] + way[:, None] * flat[on], height[on] + slope * way
-        far = way * np.hypot(1.0, slope)
-        gone = gone[on] + far
-        energy = energy[on] * houses.kept[wall] * 10.0 ** (-far[:, None] * OCTAVE_DB_PER_M / 10.0)
-        flat, slope = _reflected(houses, wall, flat[on], slope, rng)
-        at = at + 1e-6 * flat
-        if not len(at):
+        np.add.at(out, going.direction[escaped], going.energy[escaped].mean(axis=1))
+        going = _reflected(houses, going, wall, np.where(escaped, 0.0, way), ~escaped, rng)
+        if not len(going.height_m):
             break
     whole = left.sum(axis=(0, 1, 3))
     decay_s = _decay_s(np.concatenate(lengths), np.concatenate(heard))
@@ -175,58 +162,92 @@ def trace(houses: Houses, height_m: float, rng: np.random.Generator, rays: int =
     return Reached(4.0 * np.pi * left / volume, np.minimum(early / (whole + 1e-30), 1.0), shares, decay_s)
 
 
-def _tangent(sine: FloatArray) -> FloatArray:
-    return np.asarray(sine / np.sqrt(1.0 - sine**2))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rays:
+    """Rays that are still between the houses; the road is unfolded, so that heights may be negative."""
+
+    direction: IndexArray  # shape (n,): The one in which each left the array
+    at_m: FloatArray  # shape (n, 2)
+    flat: FloatArray  # shape (n, 2): Unit vector of its way seen from above
+    height_m: FloatArray  # shape (n,)
+    slope: FloatArray  # shape (n,): Rise in a metre seen from above
+    gone_m: FloatArray  # shape (n,)
+    energy: FloatArray  # shape (n, 8)
 
 
-def _next_wall(houses: Houses, at: FloatArray, flat: FloatArray) -> tuple[IndexArray, FloatArray]:
+def _launched(height_m: float, count: int, rng: np.random.Generator) -> _Rays:
+    """Send rays from the array into all azimuths, and elevations up to the steepest, alike."""
+    azimuth = rng.uniform(-np.pi, np.pi, count)
+    sine = rng.uniform(-STEEPEST, STEEPEST, count)
+    return _Rays(
+        _direction_numbers(azimuth),
+        np.zeros((count, 2)),
+        np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1),
+        np.full(count, height_m),
+        np.asarray(sine / np.sqrt(1.0 - sine**2)),
+        np.zeros(count),
+        np.full((count, len(OCTAVES_HZ)), STEEPEST / count),
+    )
+
+
+def _next_wall(houses: Houses, rays: _Rays) -> tuple[IndexArray, FloatArray]:
     """Return the front that every ray meets next and how far it is seen from above; infinite for none."""
-    nearest, which = np.full(len(at), np.inf), np.zeros(len(at), np.intp)
+    (x, y), (flat_x, flat_y) = rays.at_m.T, rays.flat.T
+    nearest, which = np.full(len(x), np.inf), np.zeros(len(x), np.intp)
     for number, (start, end) in enumerate(houses.ends_m):
         along = end - start
-        across = flat[:, 0] * along[1] - flat[:, 1] * along[0]
+        across = flat_x * along[1] - flat_y * along[0]
         with np.errstate(divide="ignore", invalid="ignore"):
-            way = ((start[0] - at[:, 0]) * along[1] - (start[1] - at[:, 1]) * along[0]) / across
-            part = ((start[0] - at[:, 0]) * flat[:, 1] - (start[1] - at[:, 1]) * flat[:, 0]) / across
+            way = ((start[0] - x) * along[1] - (start[1] - y) * along[0]) / across
+            part = ((start[0] - x) * flat_y - (start[1] - y) * flat_x) / across
         hit = (way > 1e-5) & (part >= 0.0) & (part <= 1.0) & (way < nearest)
         nearest[hit], which[hit] = way[hit], number
     return which, nearest
 
 
-def _deposit(
-    left: FloatArray,
-    launched: IndexArray,
-    at: FloatArray,
-    flat: FloatArray,
-    height: FloatArray,
-    slope: FloatArray,
-    way: FloatArray,
-    energy: FloatArray,
-    rng: np.random.Generator,
-) -> FloatArray:
+def _deposit(left: FloatArray, rays: _Rays, way_m: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Leave the energy of every ray in the cells on its way, and return what each direction left."""
-    longest = np.minimum(way, 120.0)
+    longest = np.minimum(way_m, 120.0)
     count = np.ceil(longest / STEP_M).astype(int)
-    ray = np.repeat(np.arange(len(at)), count)
+    ray = np.repeat(np.arange(len(way_m)), count)
     number = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
     metres = (number + rng.random(len(ray))) * longest[ray] / count[ray]
-    low = np.abs(height[ray] + slope[ray] * metres) < BELOW_M
+    low = np.abs(rays.height_m[ray] + rays.slope[ray] * metres) < BELOW_M
     ray, metres, share = ray[low], metres[low], (longest[ray] / count[ray])[low]
-    place = at[ray] + metres[:, None] * flat[ray]
+    place = rays.at_m[ray] + metres[:, None] * rays.flat[ray]
     cell = np.floor((place - np.array(PLAN_M)[:, 0]) / CELL_M).astype(int)
     inside = ((cell >= 0) & (cell < left.shape[:2])).all(axis=1)
-    ray, cell, length = ray[inside], cell[inside], (share * np.hypot(1.0, slope[ray]))[inside]
-    flat_index = (cell[:, 0] * left.shape[1] + cell[:, 1]) * DIRECTIONS + launched[ray]
-    each, size = energy[ray] * length[:, None], left[..., 0].size
+    ray, cell, length = ray[inside], cell[inside], (share * np.hypot(1.0, rays.slope[ray]))[inside]
+    index = (cell[:, 0] * left.shape[1] + cell[:, 1]) * DIRECTIONS + rays.direction[ray]
+    each, size = rays.energy[ray] * length[:, None], left[..., 0].size
     for band in range(left.shape[3]):
-        left[..., band] += np.bincount(flat_index, each[:, band], size).reshape(left.shape[:3])
-    return np.asarray(np.bincount(launched[ray], each.sum(axis=1), DIRECTIONS))
+        left[..., band] += np.bincount(index, each[:, band], size).reshape(left.shape[:3])
+    return np.asarray(np.bincount(rays.direction[ray], each.sum(axis=1), DIRECTIONS))
 
 
 def _reflected(
+    houses: Houses, rays: _Rays, wall: IndexArray, way_m: FloatArray, met: BoolArray, rng: np.random.Generator
+) -> _Rays:
+    """Return the rays that met a front below its roof, mirrored there, or sent anywhere by Lambert's law."""
+    on = met & (np.abs(rays.height_m + rays.slope * way_m) < houses.height_m[wall])
+    wall, way, slope, flat = wall[on], way_m[on], rays.slope[on], rays.flat[on]
+    at, far = rays.at_m[on] + way[:, None] * flat, way * np.hypot(1.0, slope)
+    new_flat, new_slope = _new_ways(houses, wall, flat, slope, rng)
+    return _Rays(
+        rays.direction[on],
+        at + 1e-6 * new_flat,  # off the front, so that the next one is another
+        new_flat,
+        rays.height_m[on] + slope * way,
+        new_slope,
+        rays.gone_m[on] + far,
+        rays.energy[on] * houses.kept[wall] * 10.0 ** (-far[:, None] * OCTAVE_DB_PER_M / 10.0),
+    )
+
+
+def _new_ways(
     houses: Houses, wall: IndexArray, flat: FloatArray, slope: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Mirror a ray in its wall, or send it anywhere by Lambert's law."""
+    """Return where rays go on from a front, seen from above, and their slopes."""
     along = houses.ends_m[wall, 1] - houses.ends_m[wall, 0]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
     towards = np.einsum("nd,nd->n", flat, normal)
@@ -344,7 +365,7 @@ class _Way:
 
 def _echoes(source: TracedSource, site: Site, receiver: Receiver, rng: np.random.Generator) -> list[_Way]:
     """Return the directions from which rays came."""
-    here = reached(site, round(float(receiver.centre_m[2]), 3))
+    here = _reached_by(receiver, site)
     energy = _at(here.energy, source.x_m, source.y_m)
     loud = energy.sum(axis=2).max(axis=0)
     # Echoes do not come all at once.
@@ -466,11 +487,11 @@ def add_traced_background(
     away is heard by one of these.
     """
     grid, own = BlockGrid(out.shape[1], receiver.sample_rate_hz), site_generator(site.name, "town")
-    opened = reached(site, round(float(receiver.centre_m[2]), 3)).open
+    opened = _reached_by(receiver, site).open
     azimuth = rng.uniform(-np.pi, np.pi, WAVES)
     elevation = np.abs(rng.normal(0.0, 0.3, WAVES))
-    number = ((azimuth + np.pi) * DIRECTIONS / (2.0 * np.pi)).astype(int) % DIRECTIONS
-    by_gaps = opened[number] / opened[number].sum()
+    opened = opened[_direction_numbers(azimuth)]
+    by_gaps = opened / opened.sum()
     sky, time = own.uniform(*SKY_SHARE), grid.middles_s
     octaves = here.octaves_db + OCTAVE_DB * own.standard_normal(len(OCTAVES_HZ))
     wander = np.stack([_wander(time, WANDER_S, WANDER_DB, rng) for _ in azimuth], axis=1)
@@ -480,11 +501,10 @@ def add_traced_background(
         level = 10.0 ** (rng.uniform(*PASSING_DB) / 10.0) * side / side.sum()
         power += level * np.exp(-(((time - loudest_s) / rng.uniform(*PASSING_S)) ** 2))[:, None]
     power *= 10.0 ** ((wander + _wander(time, TOWN_S, TOWN_DB, rng)[:, None]) / 10.0)
-    wind = wind_density(preset.wind_100hz_db + here.wind_db, grid.frequencies_hz, ROOF_SLOPE, ROOF_FLOOR_HZ)
-    electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / NOISE_BAND_HZ
+    noise = own_noise_density(preset, here, grid.frequencies_hz)
     delays = plane_wave_delays(unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m)
     density = level_curve(octaves, grid.frequencies_hz)
-    WaveField(grid, delays + receiver.skew_s, density, power, wind + electronic).add_to(out, rng)
+    WaveField(grid, delays + receiver.skew_s, density, power, noise).add_to(out, rng)
 
 
 def _wander(time_s: FloatArray, every_s: float, spread_db: float, rng: np.random.Generator) -> FloatArray:

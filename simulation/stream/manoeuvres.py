@@ -221,7 +221,7 @@ def stands(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     return replace(away, motion=motion, arrives_s=motion.reaches_s(stop.at_m))
 
 
-def leaves(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+def drives_off(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     """Pull out from the kerb behind the corner and drive away from the junction."""
     y = _hidden_y_m(driver, rng.uniform(6.0, 30.0))
     lane = driver.lane_m(into=True)
@@ -294,7 +294,7 @@ MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
     "from_ahead": from_ahead,
     "queue": emerges,
     "stands": stands,
-    "leaves": leaves,
+    "leaves": drives_off,
     "joins": joins,
 }
 

@@ -200,21 +200,34 @@ def commission(
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out. With recorded
     # clips it is tried all the same, beside two simulated ones a kind.
-    guard = road_users = None
-    about = model.provenance.classifier
     if recorded is not None or not settings.quick:
-        close = close_rows(rate_hz, rng, 2 if settings.quick else CLIPS_EACH, jobs)
-        if recorded is not None:
-            close = SoundRows.joined([close, recorded.rows])
-            about = f"{about}; {recorded.told}"
-        guard = train_guard(array, streams, close, rng, jobs)
-        sites = list(dict.fromkeys(one.site for one in streams))
-        passes = road_user_rows(array, sites, rate_hz, rng, jobs=jobs)
-        road_users = fit_road_users(with_close(passes, close))
-        about = f"{about}; {CHOSEN_FOR_GUARD}; {CHOSEN_FOR_ROAD_USERS}"
-    provenance = replace(model.provenance, classifier=about, fit_for_use=not settings.quick)
-    made = replace(model, provenance=provenance, sequence=sequence, guard=guard, road_users=road_users)
+        model = _with_ears(model, array, streams, recorded, 2 if settings.quick else CLIPS_EACH, rng, jobs)
+    provenance = replace(model.provenance, fit_for_use=not settings.quick)
+    made = replace(model, provenance=provenance, sequence=sequence)
     return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made
+
+
+def _with_ears(
+    model: Model,
+    array: MicrophoneArray,
+    streams: Sequence[HeardStream],
+    recorded: RecordedClips | None,
+    clips_each: int,
+    rng: np.random.Generator,
+    jobs: int,
+) -> Model:
+    """Return a model with a guard and kinds of road users, learned close by and in the streets."""
+    rate_hz, about = streams[0].hops.about["sample_rate_hz"], model.provenance.classifier
+    close = close_rows(rate_hz, rng, clips_each, jobs)
+    if recorded is not None:
+        close, about = SoundRows.joined([close, recorded.rows]), f"{about}; {recorded.told}"
+    guard = train_guard(array, streams, close, rng, jobs)
+    sites = list(dict.fromkeys(one.site for one in streams))
+    passes = road_user_rows(array, sites, rate_hz, rng, jobs=jobs)
+    about = f"{about}; {CHOSEN_FOR_GUARD}; {CHOSEN_FOR_ROAD_USERS}"
+    provenance = replace(model.provenance, classifier=about)
+    road_users = fit_road_users(with_close(passes, close))
+    return replace(model, provenance=provenance, guard=guard, road_users=road_users)
 
 
 def with_quiet_alarm(
