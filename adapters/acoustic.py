@@ -208,7 +208,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         InvalidArgumentError
             If it is out of range.
         """
-        if self.front_end.settings.ego_noise is not None:
+        if self.front_end.settings.ego_noise:
             self.front_end.learn_ego_noise(none_probability)
 
     def interpret(self, frame: AcousticFrame) -> Measurement:

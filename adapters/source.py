@@ -30,8 +30,7 @@ from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, feature_nfft
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
 from worldstate.state import Context
@@ -64,10 +63,9 @@ class ListenSettings:
         Time constant of that, seconds; see `SiteEstimateSettings`.
     grounding : Grounding, optional
         Weighs the model's scores with bearing, approach and engine line, eq. (5); off where not given.
-    ego_noise : bool or EgoNoiseSettings
+    ego_noise : bool
         Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
-        spatial spectrum, bearing and prominence. The signature hears what it was trained with: a model that
-        was trained on windows without that noise hears such.
+        spatial spectrum, bearing and prominence; the signature hears the sound as it is.
     boxes : DetectionFilter
         Which of the camera's boxes count: classes, score, height.
     uncalibrated : bool
@@ -92,7 +90,7 @@ class ListenSettings:
     site_adaptation: bool = True
     forgetting_s: float | None = None
     grounding: Grounding | None = None
-    ego_noise: bool | EgoNoiseSettings = False
+    ego_noise: bool = False
     boxes: DetectionFilter = field(default_factory=DetectionFilter)
     uncalibrated: bool = False
 
@@ -109,7 +107,7 @@ class ListenSettings:
             nfft=feature_nfft(sample_rate_hz),
             azimuth_span_deg=(-half_deg, half_deg),
             srp_band_hz=self.band_hz or default_band_hz(array, sample_rate_hz),
-            ego_noise=EgoNoiseSettings() if self.ego_noise is True else self.ego_noise or None,
+            ego_noise=self.ego_noise,
         )
 
     def site(self) -> SiteEstimateSettings | None:
@@ -376,9 +374,6 @@ def open_source(
     told = moving_ego or (ego is not None and ego.moves)
     moves = bool(told or (recording and recording.moving_ego) or context.ego_speed_mps)
     known = model if isinstance(model, Model) else read_model(model, moving_ego=moves)
-    if settings.ego_noise is True and known.domain and known.domain.feature == CLEANED_FEATURE_VERSION:
-        # Trained without ego-noise: it is taken out of the feature, too.
-        settings = replace(settings, ego_noise=EgoNoiseSettings(feature=True))
     heard_by, policy = _array_and_policy(sound, known, _read(array, read_array), settings, moves)
     first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
     source = Source(

@@ -14,8 +14,8 @@ import numpy as np
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.direction.bearing import steered_power
-from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum, pair_sum_of
-from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit, spanned
+from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum_of
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
@@ -70,9 +70,6 @@ class HopCutter:
                 self._index, self._filled = self._index + 1, 0
                 self._start, self._end = self._end, hop_end(self._index, self._rate_hz)
                 yield hop
-
-
-Steered = tuple[Complex64Array, Steering]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +129,10 @@ class HopSpectra:
         self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not monitored")
         heard_hz = bin_frequencies_hz(self.feature_bins, sample_rate_hz, nfft)
         self.monitor = ChannelMonitor(array, heard_hz) if settings.watch_channels else None
-        self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
+        self.ego_noise: EgoNoise | None = None
+        if settings.ego_noise:
+            split = ElevationSplit.of(array, frequencies)
+            self.ego_noise = EgoNoise(2.0 * sample_rate_hz / nfft, array.n_microphones, self.beams, split)
 
     def push(self, samples: Float32Array) -> HopSums:
         """Return the sums over the frames that these samples (n, M) complete, lost ones left out."""
@@ -147,9 +147,10 @@ class HopSpectra:
         health = self._unmonitored
         if self.monitor is not None:
             health = self.monitor.push(samples, energies, powers, matrices)
-        prewhitened = self._whitened(spectra, health.mask)
         health.mask.silence(whitened)
-        srp, pairs = self._sums(prewhitened, whitened, matrices, health.mask)
+        srp = self._steered(spectra, whitened, health.mask)
+        pairs = pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
+        pairs = pairs * health.mask.pair_scale
         mean_square = energies.sum(axis=0) / max(len(energies), 1)
         share = float(lost.mean())
         reason = "lost samples" if share else None
@@ -168,47 +169,16 @@ class HopSpectra:
         total = powers[:, self._looming].sum(axis=1, dtype=np.float64)
         return np.asarray(total * (2.0 / (0.375 * self._nfft**2)))
 
-    def _whitened(self, spectra: Complex64Array, mask: ChannelMask) -> list[Steered]:
-        """Prewhitened spectra, phase transform included, and their beams; none without ego-noise settings."""
-        if self.ego_noise is None or not len(spectra):
-            return []
-        mask.silence(spectra)
-        prewhitened = self.ego_noise.process(spectra)
-        for whitened, _ in prewhitened:
-            mask.silence(whitened)
-        return prewhitened
-
-    def _sums(
-        self,
-        prewhitened: list[Steered],
-        whitened: Complex64Array,
-        matrices: Complex64Array,
-        mask: ChannelMask,
-    ) -> tuple[FloatArray, Complex128Array]:
-        """Return steered power and pair sums of one hop, scaled to all microphones."""
-        n_rows = len(self.beams)
-        rows = prewhitened[:n_rows] or [(whitened[:, self._srp], beams) for beams in self.beams]
-        if len(prewhitened) > n_rows:
-            pairs = pair_sum(*prewhitened[n_rows], self._order)
-        else:
-            pairs = pair_sum_of(mask.cross(matrices), self._feature_beams, self._order)
-        power = np.concatenate([steered_power(*row) for row in rows]) * mask.power_scale
-        if self.ego_noise is not None and len(whitened):
-            power = self.ego_noise.levelled(power, len(whitened))
-        return power, pairs * mask.pair_scale
-
-    def _ego_noise(
-        self, array: MicrophoneArray, sample_rate_hz: float, bins: range, settings: FrontEndSettings
-    ) -> EgoNoise | None:
-        chosen, nfft = settings.ego_noise, settings.nfft
-        if chosen is None:
-            return None
-        beams = [(row, self._srp) for row in self.beams]
-        if chosen.feature:
-            beams.append((self._feature_beams, self._feature))
-        learned = bins[spanned(part for _, part in beams)]
-        split = ElevationSplit.of(array, bin_frequencies_hz(learned, sample_rate_hz, nfft))
-        return EgoNoise(2.0 * sample_rate_hz / nfft, array.n_microphones, beams, split)
+    def _steered(self, spectra: Complex64Array, whitened: Complex64Array, mask: ChannelMask) -> FloatArray:
+        """Return the steered power of one hop, scaled to all microphones."""
+        inside, beams = whitened[:, self._srp], self.beams
+        heard = self.ego_noise if len(spectra) else None
+        if heard is not None:
+            mask.silence(spectra)
+            inside, beams = heard.process(spectra[:, self._srp])
+            mask.silence(inside)
+        power = np.concatenate([steered_power(inside, row) for row in beams]) * mask.power_scale
+        return power if heard is None else heard.levelled(power, len(spectra))
 
     def _centre(self, heard: BoolArray) -> float:
         """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""

@@ -7,8 +7,7 @@ import numpy as np
 
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, FEATURE_NFFT, FEATURE_VERSION
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.direction.feature import FEATURE_NFFT
 from worldstate.ground import FloatArray, InvalidArgumentError, in_range
 
 Band = tuple[float, float]
@@ -41,8 +40,8 @@ class FrontEndSettings:
         Band in which an engine line is searched, Hz, for example (20, 400); None switches it off.
     srp_band_hz, level_band_hz : (float, float)
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
-    ego_noise : EgoNoiseSettings, optional
-        Settings of ego-noise suppression, used with `FrontEnd.learn_ego_noise`; None switches it off.
+    ego_noise : bool
+        Whiten the noise of the own vehicle before steering: see `FrontEnd.learn_ego_noise`.
     watch_channels : bool
         Detect faulty microphones, lost samples and masking noise, and leave them out.
     character : bool
@@ -66,7 +65,7 @@ class FrontEndSettings:
     tone_band_hz: Band | None = None
     srp_band_hz: Band = BAND_HZ
     level_band_hz: Band = (50.0, 8000.0)
-    ego_noise: EgoNoiseSettings | None = None
+    ego_noise: bool = False
     watch_channels: bool = True
     character: bool = False
     feature_order: tuple[int, ...] | None = None
@@ -84,12 +83,6 @@ class FrontEndSettings:
             low, high = getattr(self, name) or ENGINE_BAND_HZ
             in_range(f"{name}: lower end", low, 0.0, np.inf)
             in_range(f"{name}: upper end", high, low, np.inf, open_low=True, open_high=True)
-
-    @property
-    def feature_version(self) -> str:
-        """Which feature is computed, as a model names what it was trained on."""
-        cleaned = self.ego_noise is not None and self.ego_noise.feature
-        return CLEANED_FEATURE_VERSION if cleaned else FEATURE_VERSION
 
     def azimuths_rad(self) -> FloatArray:
         """Return the grid of azimuths, one a degree, ascending from right to left.

@@ -277,17 +277,16 @@ class FrontEnd:
         Raises
         ------
         InvalidArgumentError
-            Out of range, or `settings.ego_noise` is None.
+            Out of range, or `settings.ego_noise` is off.
 
         Examples
         --------
-        >>> from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
         >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
-        >>> front_end = FrontEnd(array, 8000, FrontEndSettings(ego_noise=EgoNoiseSettings()))
+        >>> front_end = FrontEnd(array, 8000, FrontEndSettings(ego_noise=True))
         >>> front_end.learn_ego_noise(1.0)
         """
         if self._spectra.ego_noise is None:
-            raise InvalidArgumentError("settings.ego_noise: expected EgoNoiseSettings, got None")
+            raise InvalidArgumentError("settings.ego_noise: expected True, got False")
         self._spectra.ego_noise.weight = in_range("none_probability", none_probability, 0.0, 1.0)
 
     def _checked(self, block: ArrayLike) -> Float32Array:

@@ -2,8 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import groupby
-from operator import attrgetter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -13,10 +11,7 @@ from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.file_io import number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import FEATURE_VERSION, feature_nfft, published_feature
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.stream import FrontEnd
+from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 
@@ -55,9 +50,7 @@ def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
     return windows
 
 
-def extract_features(
-    windows: list[LabelledWindow], array: MicrophoneArray, *, ego_noise: bool = False
-) -> Iterator[FloatArray]:
+def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> Iterator[FloatArray]:
     """Yield the published feature of each window, shape (60,).
 
     Parameters
@@ -66,9 +59,6 @@ def extract_features(
         From `read_labels`.
     array : MicrophoneArray
         In the order of the channels.
-    ego_noise : bool
-        Listen to every file from its beginning, learn the noise of the own vehicle on the way and take it out
-        of the spectra.
 
     Yields
     ------
@@ -92,31 +82,8 @@ def extract_features(
     ...     [feature.shape for feature in extract_features([window], array)]
     [(60,)]
     """
-    if ego_noise:
-        for path, here in groupby(windows, key=attrgetter("path")):
-            yield from _cleaned_features(path, list(here), array)
-        return
     for samples, rate_hz in read_windows(windows, array.n_microphones):
         yield published_feature(samples, array, rate_hz)
-
-
-def _cleaned_features(
-    path: Path, windows: list[LabelledWindow], array: MicrophoneArray
-) -> Iterator[FloatArray]:
-    """Yield the features of windows of one file, of the last hop that ends within each."""
-    with open_audio(path, array.n_microphones) as source:
-        rate = source.sample_rate_hz
-        ends = [_ends_at(source, window) for window in windows]
-        settings = FrontEndSettings(nfft=feature_nfft(rate), ego_noise=EgoNoiseSettings(feature=True))
-        front_end = FrontEnd(array, rate, settings)
-        # Nobody says here when a source is near. Only what comes from below the horizon is learned, which a
-        # vehicle in the street is not.
-        front_end.learn_ego_noise(1.0)
-        heard: dict[int, FloatArray] = {}
-        for block in source.blocks(rate):
-            heard |= {frame.sample_index: frame.feature for frame in front_end.process(block)}
-        # A hop ends at the nearest sample: its window may end half a sample after the one that was asked for.
-        yield from (heard[max(at for at in heard if at <= end + 1)] for end in ends)
 
 
 def read_windows(
@@ -129,10 +96,7 @@ def read_windows(
 
 
 def feature_table(
-    windows: list[LabelledWindow],
-    features: list[FloatArray],
-    array: MicrophoneArray,
-    version: str = FEATURE_VERSION,
+    windows: list[LabelledWindow], features: list[FloatArray], array: MicrophoneArray
 ) -> FeatureTable:
     """Return windows and features, in the same order, as a table that names the array which heard them.
 
@@ -142,7 +106,7 @@ def feature_table(
     labels, ids, environments, recordings = (np.array(column) for column in columns)
     t0_frames = tuple(w.t0_frame for w in windows)
     rates = {_rate_hz(path) for path in {w.path for w in windows}}
-    domain = domain_of(array, sorted(rates), environments.tolist(), version)
+    domain = domain_of(array, sorted(rates), environments.tolist())
     return FeatureTable(np.array(features), labels, ids, environments, recordings, t0_frames, domain)
 
 

@@ -21,17 +21,13 @@ UNFIT = "the model says that it is unfit for use"
 _LOG = logging.getLogger(__name__)
 
 
-def domain_of(
-    array: MicrophoneArray,
-    rates_hz: Sequence[float],
-    environments: Sequence[str],
-    feature: str = published.FEATURE_VERSION,
-) -> ModelDomain:
+def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: Sequence[str]) -> ModelDomain:
     """Return the domain of windows that an array heard at these rates, the ego as the environments say."""
     alike = [_rate_of_long_frames(rate, published.feature_nfft(rate)) for rate in rates_hz]
     low, high = (1.0 - published.RATE_TOLERANCE) * min(alike), (1.0 + published.RATE_TOLERANCE) * max(alike)
     motion = ego_motion_of(environments)
-    return ModelDomain(array.name, array.positions_m, (low, high), published.FEATURE_BAND_HZ, feature, motion)
+    feature, band_hz = published.FEATURE_VERSION, published.FEATURE_BAND_HZ
+    return ModelDomain(array.name, array.positions_m, (low, high), band_hz, feature, motion)
 
 
 def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
@@ -113,7 +109,7 @@ def feature_order(
         got = f"{sample_rate_hz:g} Hz and frames of {settings.nfft}"
         raise OutOfDomainError(f"sample rate: {expected}, got {got}. {way_out}")
     made_with = _feature(domain.feature, domain.band_hz)
-    got = _feature(settings.feature_version, published.FEATURE_BAND_HZ)
+    got = _feature(published.FEATURE_VERSION, published.FEATURE_BAND_HZ)
     if got != made_with:
         raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {way_out}")
     order = check_array(domain, array, way_out)

@@ -33,8 +33,6 @@ FEATURE_AZIMUTHS_RAD.flags.writeable = False
 FEATURE_BAND_HZ = (50.0, 1500.0)
 FEATURE_VERSION = "SRP-PHAT pairs 1"
 """Version of the feature, kept in every model; another number whenever the values for a sound change."""
-CLEANED_FEATURE_VERSION = f"{FEATURE_VERSION}, ego-noise whitened"
-"""Version of the same sums of spectra that the own vehicle's noise was taken out of."""
 FEATURE_NFFT = 512
 FEATURE_RATE_HZ = 47_998.0  # of the released sound
 FEATURE_SEGMENTS = 2

@@ -22,7 +22,7 @@ it: noise then reads 1/M at any speed.
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -56,29 +56,6 @@ _RECENT_HOPS = 5.0
 _URGENT_BINS, _ANOTHER_SHARE, _ANOTHER_LENGTH = 4, 0.2, 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class EgoNoiseSettings:
-    r"""Settings of learning and suppressing the noise of the own vehicle.
-
-    .. math:: y = \hat R^{-1/2} x, \qquad \hat R \leftarrow (1 - s)\, \hat R / p + s I
-
-    with the learned noise covariance R, as far as it comes from below the horizon, its mean power p, and the
-    shrinkage s.
-
-    Parameters
-    ----------
-    feature : bool
-        Compute the published feature from prewhitened sound, too; its classifier was trained without.
-
-    Examples
-    --------
-    >>> EgoNoiseSettings(feature=True).feature
-    True
-    """
-
-    feature: bool = False
-
-
 class EgoNoise:
     """Learn the ego-noise of a stream and whiten its spectra, hop by hop."""
 
@@ -89,16 +66,14 @@ class EgoNoise:
         self,
         frames_per_s: float,
         n_microphones: int,
-        beams: Sequence[tuple[Steering, slice]],
+        beams: Sequence[Steering],
         elevation_split: "ElevationSplit | None" = None,
     ) -> None:
         self.weight = 0.0
         self.ego_share = 0.0
         self._split = elevation_split
-        self._beams = [WhitenedBeams(plain) for plain, _ in beams]
-        self._bins = spanned(bins for _, bins in beams)
-        first, n_bins = self._bins.start, self._bins.stop - self._bins.start
-        self._slices = [slice(bins.start - first, bins.stop - first) for _, bins in beams]
+        self._beams = [WhitenedBeams(plain) for plain in beams]
+        n_bins = len(beams[0].weights)
         self._covariance = NoiseCovariance(n_bins, n_microphones, 0.5 * _FORGETTING_S * frames_per_s)
         self._roots = np.tile(np.eye(n_microphones, dtype=np.complex64), (n_bins, 1, 1))
         self._guard: GuardDelay[tuple[Complex64Array | None, int]] = GuardDelay(_GUARD_HOPS)
@@ -117,20 +92,17 @@ class EgoNoise:
         """Number of frames in the covariance; every second hop is learned."""
         return self._covariance.n_frames
 
-    def process(self, spectra: Complex64Array) -> list[tuple[Complex64Array, Steering]]:
+    def process(self, spectra: Complex64Array) -> tuple[Complex64Array, tuple[Steering, ...]]:
         r"""Learn and whiten the frames of a hop (frames, bins, M), phase transform included.
 
         .. math:: y = \hat R^{-1/2} x, \qquad Z_m = y_m / |y_m|
 
         with the covariance R learned so far, shrunk by the share of the street.
         """
-        inside = spectra[:, self._bins]
-        self._learn(inside)
+        self._learn(spectra)
         self._refresh()
-        whitened = self._whitened(inside)
-        both = zip(self._slices, self._beams, strict=True)
-        used = bool(self.ego_share)
-        return [(whitened[:, bins], beams.steering if used else beams.plain) for bins, beams in both]
+        used = tuple(beams.steering if self.ego_share else beams.plain for beams in self._beams)
+        return self._whitened(spectra), used
 
     def levelled(self, power: FloatArray, n_frames: int) -> FloatArray:
         r"""Divide a hop's steered power by the level that whitened noise had while it was learned.
@@ -142,8 +114,7 @@ class EgoNoise:
         """
         if not self._aim_frames or not self.ego_share:
             return power
-        n_bins = self._slices[0].stop - self._slices[0].start
-        white = n_frames * n_bins * self._roots.shape[1]
+        white = n_frames * self._roots.shape[0] * self._roots.shape[1]
         level = self._level.push(float(power.mean()) / white, self._gated())
         return np.asarray(power / max(level, 1e-6) ** self.ego_share)
 
@@ -211,27 +182,14 @@ class EgoNoise:
         R = self._covariance.mean(index)
         least = max(_MIN_SHRINKAGE, 1.0 - self.ego_share)
         self._roots[index] = shrunk_inverse_root(R, max(least, white_share(R, self.learned_frames)))
-        for beams, bins in zip(self._beams, self._slices, strict=True):
-            if bins.start <= index < bins.stop:
-                beams.update(index - bins.start, self._roots[index])
+        for beams in self._beams:
+            beams.update(index, self._roots[index])
 
 
 def _use_of(below: float, street: float) -> float:
     """Map the powers below and above the horizon to 0 for a street, 1 for ego-noise."""
     share = share_of(below, street)
     return min(max((share - _STREET_SHARE) / (_EGO_SHARE - _STREET_SHARE), 0.0), 1.0)
-
-
-def spanned(slices: Iterable[slice]) -> slice:
-    """Return the smallest range of bins that contains several.
-
-    Examples
-    --------
-    >>> spanned([slice(2, 5), slice(0, 3)])
-    slice(0, 5, None)
-    """
-    parts = list(slices)
-    return slice(min(part.start for part in parts), max(part.stop for part in parts))
 
 
 def _direction_sum(spectra: Complex64Array) -> Complex64Array:

@@ -17,7 +17,6 @@ from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.bearing import srp_phat
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.hop_spectra import BANDS, NoiseMeter
 from worldstate.frontend.settings import ELEVATIONS_RAD, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
@@ -235,7 +234,7 @@ def resident_bytes() -> int:
 @pytest.mark.slow
 def test_memory_does_not_grow() -> None:
     """Everything is on: nothing is kept of 1500 hops, and what is kept does not get larger."""
-    chosen = replace(EVERYTHING, nfft=256, ego_noise=EgoNoiseSettings())
+    chosen = replace(EVERYTHING, nfft=256, ego_noise=True)
     front_end, sound = FrontEnd(SQUARE, 4_000, chosen), noise_from(SQUARE, 0.5, 4_000, 20.0)
     front_end.learn_ego_noise(1.0)
     hear(front_end, sound, 770)
@@ -343,9 +342,7 @@ def test_lost_sound_comes_back_as_if_nothing_was_lost(kind: str) -> None:
 
 def test_where_a_whole_window_is_lost_nothing_is_heard_and_the_channels_are_not_to_blame() -> None:
     rate, sound = 16_000, noise_from(SQUARE, 0.5, 16_000, 4.0)
-    frames = FrontEnd(SQUARE, rate, replace(EVERYTHING, ego_noise=EgoNoiseSettings())).process(
-        lose(sound, 20_000, 20_000)
-    )
+    frames = FrontEnd(SQUARE, rate, replace(EVERYTHING, ego_noise=True)).process(lose(sound, 20_000, 20_000))
     gone = [frame for frame in frames if frame.lost == 1.0]
     assert len(gone) == 3
     assert all(not frame.feature.any() and frame.prominence == 1.0 for frame in gone)

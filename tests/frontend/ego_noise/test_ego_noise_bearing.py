@@ -1,6 +1,5 @@
 """Ego-noise where people listen: the filter's belief opens and shuts the gate, end to end."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +9,13 @@ import soundfile
 
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.audio.sound_file import open_sound
-from worldstate.adapters.datasets.feature_table import read_features
-from worldstate.adapters.files.acoustic_domain import check_tables
-from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listener import listen_steps, measure_steps
+from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
-from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.simulation.sound.ego_sound import ego_noise
 
@@ -100,47 +94,6 @@ def test_the_signature_hears_what_it_was_trained_with(recording: Path) -> None:
         assert a.measurement.signature == b.measurement.signature
 
 
-def test_a_model_trained_without_ego_noise_hears_none_and_no_other_model_does(
-    recording: Path, tmp_path: Path
-) -> None:
-    """What `extract-features --ego-noise` writes, a model names and `run --ego-noise` hears."""
-    few, short = MicrophoneArray(ARRAY.positions_m[::4], "few"), tmp_path / "short.wav"
-    soundfile.write(short, soundfile.read(recording, frames=3 * RATE)[0][:, ::4], RATE, subtype="FLOAT")
-    rows = {"1": "left,D1,1,short.wav,2.5", "2": "none,D2,2,short.wav,"}
-    labels = tmp_path / "labels.csv"
-    header = "ID,Class,Environment,Recording ID,File,End"
-    labels.write_text("\n".join([header, *(f"{name},{row}" for name, row in rows.items())]))
-    write_array_xml(tmp_path / "few.xml", few)
-    tables = []
-    for name, options in (("raw", []), ("cleaned", ["--ego-noise"])):
-        words = [str(tmp_path), "--labels", str(labels), "--array", str(tmp_path / "few.xml")]
-        assert main(["model", "features", *words, "--out", str(tmp_path / f"{name}.csv"), *options]) == 0
-        tables.append(read_features(tmp_path / f"{name}.csv"))
-    raw, cleaned = tables
-    with pytest.raises(OutOfDomainError, match="ego-noise whitened"):
-        check_tables(raw.domain, cleaned.domain)
-    # White noise has no direction: of the loudest one's lead over the median little is left.
-    lead = [np.log(table.features[0].reshape(2, 30)).max(axis=1) for table in tables]
-    assert (lead[1] < lead[0] - 0.5).all()
-
-    shipped = read_model()
-    models = [replace(shipped, signature=replace(shipped.signature, domain=one.domain)) for one in tables]
-    heard = open_source(short, array=few, model=models[1], settings=ListenSettings(ego_noise=True))
-    # There the first second is not learned, and what was learned is not quite the same.
-    apart = [np.abs(frames(heard, 1.0)[-1].feature - table.features[1]).mean() for table in tables]
-    assert apart[1] < 0.3 * apart[0]
-    for model, asked in ((models[1], False), (models[0], EgoNoiseSettings(feature=True))):
-        source = open_source(short, array=few, model=model, settings=ListenSettings(ego_noise=asked))
-        with pytest.raises(OutOfDomainError, match="ego-noise whitened"):
-            next(measure_steps(source))
-
-
-def test_settings_of_one_s_own(recording: Path) -> None:
-    chosen = EgoNoiseSettings(feature=True)
-    for given, expected in ((False, None), (True, EgoNoiseSettings()), (chosen, chosen)):
-        assert ListenSettings(ego_noise=given).front_end(ARRAY, 48_000.0).ego_noise == expected
-
-
 def test_the_command_line_passes_it_on(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[Source] = []
 
@@ -158,7 +111,7 @@ def test_a_belief_out_of_range_is_refused_and_without_ego_noise_ignored() -> Non
     class Flat:
         def evidence(self, feature: object, /) -> None: ...
 
-    settings = FrontEndSettings(nfft=256, ego_noise=EgoNoiseSettings())
+    settings = FrontEndSettings(nfft=256, ego_noise=True)
     learning = AcousticAdapter(ARRAY, RATE, Flat(), front_end_settings=settings)  # type: ignore[arg-type]
     with pytest.raises(InvalidArgumentError, match="none_probability"):
         learning.set_no_source_probability(1.5)

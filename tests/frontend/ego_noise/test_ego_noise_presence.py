@@ -23,7 +23,6 @@ from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.model_file import read_model
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.simulation import SimulationSettings, draw_settings, simulate_recording
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
@@ -123,7 +122,7 @@ def last_second(sound: Sound, array: MicrophoneArray, scene: Scene, gate: str) -
     Gates: never opened, opened by the filter's own belief, or open all the time, source or not.
     """
     nfft = 512 if scene.rate_hz > 30_000 else 256
-    settings = FrontEndSettings(nfft=nfft, ego_noise=EgoNoiseSettings())
+    settings = FrontEndSettings(nfft=nfft, ego_noise=True)
     read = read_model(None)
     model, policies = read.signature, read.policies
     assert isinstance(model, EnsembleModel)

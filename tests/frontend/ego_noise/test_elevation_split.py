@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings, ElevationSplit, GuardDelay, share_of
+from worldstate.frontend.ego_noise.ego_noise import ElevationSplit, GuardDelay, share_of
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.simulation.sound.ego_sound import ego_noise
@@ -20,7 +20,7 @@ THIN = MicrophoneArray(WHOLE.positions_m[::4])
 BINS_HZ = np.arange(312.5, 1800.0, 125.0)
 JUDGES = {array.n_microphones: ElevationSplit.of(array, BINS_HZ) for array in (WHOLE, THIN)}
 PLAIN = FrontEndSettings(nfft=256)
-LEARNING = replace(PLAIN, ego_noise=EgoNoiseSettings())
+LEARNING = replace(PLAIN, ego_noise=True)
 
 
 def plane_wave(
@@ -57,7 +57,7 @@ def srp_of(array: MicrophoneArray, sound: np.ndarray, chosen: FrontEndSettings, 
     front_end = FrontEnd(array, RATE, chosen)
     cut, frames = round(learn_s * RATE), []
     for weight, part in ((1.0, sound[:cut]), (0.0, sound[cut:])):
-        if chosen.ego_noise is not None:
+        if chosen.ego_noise:
             front_end.learn_ego_noise(weight)
         frames += front_end.process(part)
     return np.array([frame.srp for frame in frames])

@@ -34,8 +34,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
-    ego_noise = "take the own vehicle's noise out, learned from each file's beginning (default: off)"
-    parser.add_argument("--ego-noise", action="store_true", help=ego_noise)
     inputs.add_array_options(parser)
 
 
@@ -45,21 +43,19 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
     from worldstate.adapters.datasets.feature_extraction import feature_table
     from worldstate.adapters.datasets.ovad import choose_array
-    from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, FEATURE_VERSION
+    from worldstate.frontend.direction.feature import FEATURE_VERSION
 
     output.check_outputs(arguments, "out")
     array = choose_array(arguments.dataset, inputs.given_array(arguments))
     windows, left_out = _windows(arguments)
-    cleaned = arguments.ego_noise
-    extracted = adapters.extract_features(windows, array, ego_noise=cleaned)
+    extracted = adapters.extract_features(windows, array)
     features = list(progress.track(extracted, "extracting", len(windows)))
-    version = CLEANED_FEATURE_VERSION if cleaned else FEATURE_VERSION
-    table = feature_table(windows, features, array, version)
+    table = feature_table(windows, features, array)
     adapters.write_features(arguments.out, table)
     summary = {
         "out": str(arguments.out),
         "array": inputs.stance(array),
-        "feature": version,
+        "feature": FEATURE_VERSION,
         "n_windows": len(table),
         "n_left_out": left_out,
         "n_recordings": len(np.unique(table.recording_keys)),
