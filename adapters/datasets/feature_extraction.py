@@ -13,9 +13,10 @@ from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.file_io import number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import FEATURE_VERSION, feature_nfft, published_feature
+from worldstate.frontend.direction.feature import FEATURE_VERSION, feature_rate_hz, published_feature
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.resampling import Resampler
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
@@ -97,7 +98,14 @@ def extract_features(
             yield from _cleaned_features(path, list(here), array)
         return
     for samples, rate_hz in read_windows(windows, array.n_microphones):
-        yield published_feature(samples, array, rate_hz)
+        heard_hz = feature_rate_hz(rate_hz)
+        if heard_hz != rate_hz:
+            resampler = Resampler(array.n_microphones, rate_hz, heard_hz)
+            samples, heard_hz = (
+                np.concatenate([resampler.push(samples), resampler.flush()]),
+                resampler.rate_hz,
+            )
+        yield published_feature(samples, array, heard_hz)
 
 
 def _cleaned_features(
@@ -107,7 +115,7 @@ def _cleaned_features(
     with open_audio(path, array.n_microphones) as source:
         rate = source.sample_rate_hz
         ends = [_ends_at(source, window) for window in windows]
-        settings = FrontEndSettings(nfft=feature_nfft(rate), ego_noise=EgoNoiseSettings(feature=True))
+        settings = FrontEndSettings.heard_at(rate, ego_noise=EgoNoiseSettings(feature=True))
         front_end = FrontEnd(array, rate, settings)
         # Nobody says here when a source is near. Only what comes from below the horizon is learned, which a
         # vehicle in the street is not.
@@ -115,6 +123,7 @@ def _cleaned_features(
         heard: dict[int, FloatArray] = {}
         for block in source.blocks(rate):
             heard |= {frame.sample_index: frame.feature for frame in front_end.process(block)}
+        heard |= {frame.sample_index: frame.feature for frame in front_end.finish()}
         # A hop ends at the nearest sample: its window may end half a sample after the one that was asked for.
         yield from (heard[max(at for at in heard if at <= end + 1)] for end in ends)
 
