@@ -80,6 +80,8 @@ def at_full_rate(heard: Heard) -> list[Step]:
 
 @pytest.mark.parametrize("rate", RATES)
 def test_the_same_sound_is_heard_alike_at_any_rate(heard: Heard, at_full_rate: list[Step], rate: int) -> None:
+    if heard.array is not RING and rate not in (16_000, 44_100):
+        pytest.skip("eight times the microphones take eight times as long")
     found = heard.steps(heard.pipe(rate))
     assert [one.state.stamp_ns for one in found] == [one.state.stamp_ns for one in at_full_rate]
     assert [one.frame.sample_index for one in found][-1] == pytest.approx(6 * rate, abs=1)
