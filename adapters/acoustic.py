@@ -147,8 +147,11 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         sequence: SequenceReader | NotUsable | None = None,
         uncalibrated: bool = False,
     ) -> None:
-        front_end_settings = front_end_settings or FrontEndSettings(nfft=feature_nfft(sample_rate_hz))
         domain: ModelDomain | None = getattr(model, "domain", None)
+        if front_end_settings is None:
+            # A model of one's own hears sound as it is recorded.
+            own = FrontEndSettings(nfft=feature_nfft(sample_rate_hz))
+            front_end_settings = own if domain is None else FrontEndSettings.heard_at(sample_rate_hz)
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)
             front_end_settings = replace(front_end_settings, feature_order=order)

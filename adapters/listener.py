@@ -122,13 +122,14 @@ class Listener:
         self._waiting = _Waiting(source.others, self._since_ns)
         self._part = max(int(sample_rate_hz / PARTS_PER_SECOND), 1)
 
-    def push(self, block: Float32Array) -> list[WorldState]:
+    def push(self, block: Float32Array | None) -> list[WorldState]:
         """Take the next samples; return the state after each hop that ends in them.
 
         Parameters
         ----------
         block : ndarray
-            Shape (n, M), any n; floats of full scale 1, int16 or int32.
+            Shape (n, M), any n; floats of full scale 1, int16 or int32. None at the end of the sound, where
+            a resampled hop still waits for the next samples.
 
         Returns
         -------
@@ -179,8 +180,8 @@ class Listener:
         hearing = None if reader.street is None else reader.street.hearing
         return Checkpoint(self.world, site, reader.history, hearing)
 
-    def steps(self, block: Float32Array) -> Iterator[Step]:
-        """Yield the hops that end in the next samples with what was heard and measured."""
+    def steps(self, block: Float32Array | None) -> Iterator[Step]:
+        """Yield the hops that end in the next samples, or wait at the end, as heard and measured."""
         reader = self._reader if self._source.settings.site_adaptation else None
         for frame, measurement in self.measured(block):
             for other in self._waiting.until(measurement.stamp_ns):
@@ -191,10 +192,11 @@ class Listener:
                 learn_passes(reader.street, self.world.state)
             yield Step(frame, measurement, self.checkpoint)
 
-    def measured(self, block: Float32Array) -> Iterator[tuple[AcousticFrame, Measurement]]:
+    def measured(self, block: Float32Array | None) -> Iterator[tuple[AcousticFrame, Measurement]]:
         """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
-        for part in self._parts(block):
-            for frame in self._adapter.front_end.process(part):
+        hear = self._adapter.front_end
+        for frames in [hear.finish()] if block is None else map(hear.process, self._parts(block)):
+            for frame in frames:
                 # What the belief to go on from has taken in already only fills the windows.
                 if frame.stamp_ns > self._since_ns:
                     yield frame, self._adapter.interpret(frame)
@@ -319,13 +321,14 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
         yield from listener.measured(block)
 
 
-def listened(source: Source) -> Iterator[tuple[Listener, Float32Array]]:
-    """Yield the sound of `source` block by block, each beside the one listener that is to take it."""
+def listened(source: Source) -> Iterator[tuple[Listener, Float32Array | None]]:
+    """Yield the sound of `source` block by block, None last, each beside the one listener to take it."""
     strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
     with open_sound(source.sound, expect_channels=n_microphones, strict=strict) as audio:
         listener = Listener(source, audio.sample_rate_hz)
         for block in audio.blocks(max(audio.sample_rate_hz // PARTS_PER_SECOND, 1)):
             yield listener, block
+        yield listener, None
 
 
 def learn_passes(street: StreetListener | None, state: WorldState) -> None:

@@ -30,7 +30,6 @@ from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
 from worldstate.state import Context
@@ -103,8 +102,8 @@ class ListenSettings:
     def front_end(self, array: MicrophoneArray, sample_rate_hz: float) -> FrontEndSettings:
         """Return the front-end's settings for an array and a sample rate."""
         half_deg = 0.5 * self.azimuth_span_deg
-        return FrontEndSettings(
-            nfft=feature_nfft(sample_rate_hz),
+        return FrontEndSettings.heard_at(
+            sample_rate_hz,
             azimuth_span_deg=(-half_deg, half_deg),
             srp_band_hz=self.band_hz or default_band_hz(array, sample_rate_hz),
             ego_noise=self.ego_noise,

@@ -22,7 +22,7 @@ from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequ
 from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array
 
-from .settings import ELEVATIONS_RAD, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
+from .settings import ELEVATIONS_RAD, HIGHEST_SHARE, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 
 
 def hop_end(index: int, sample_rate_hz: float) -> int:
@@ -134,9 +134,11 @@ class HopSpectra:
             split = ElevationSplit.of(array, frequencies)
             self.ego_noise = EgoNoise(2.0 * sample_rate_hz / nfft, array.n_microphones, self.beams, split)
 
-    def push(self, samples: Float32Array) -> HopSums:
+    def push(self, samples: Float32Array, recorded: Float32Array) -> HopSums:
         """Return the sums over the frames that these samples (n, M) complete, lost ones left out."""
-        lost = np.zeros(len(samples), bool) if self.monitor is None else self.monitor.find_lost(samples)
+        # Faults are looked for in what was recorded: resampled, a clipped sound has no highest value.
+        lost = np.zeros(len(recorded), bool) if self.monitor is None else self.monitor.find_lost(recorded)
+        lost = lost[np.arange(len(samples)) * len(recorded) // len(samples)]
         spectra = self._stft.push(samples)
         heard = self._heard_frames(lost, len(spectra))
         centre, spectra = self._centre(heard), spectra if heard.all() else spectra[heard]
@@ -146,7 +148,7 @@ class HopSpectra:
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
         health = self._unmonitored
         if self.monitor is not None:
-            health = self.monitor.push(samples, energies, powers, matrices)
+            health = self.monitor.push(recorded, energies, powers, matrices)
         health.mask.silence(whitened)
         srp = self._steered(spectra, whitened, health.mask)
         pairs = pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
@@ -240,8 +242,6 @@ def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> Flo
     return np.asarray(np.log(np.maximum(sums, SILENCE)))
 
 
-# Highest frequency that the anti-aliasing filters of usual converters pass, relative to the sample rate.
-_HIGHEST = 0.45
 BANDS = 16
 # Microphones, evenly picked, that are averaged.
 _MOST_CHANNELS = 8
@@ -250,9 +250,12 @@ _MOST_CHANNELS = 8
 class LevelMeter:
     """Log-energy per band and hop, averaged over a few microphones: the level is the same at all of them."""
 
-    def __init__(self, n_channels: int, sample_rate_hz: float, settings: FrontEndSettings) -> None:
+    def __init__(
+        self, n_channels: int, sample_rate_hz: float, settings: FrontEndSettings, recorded_hz: float = np.inf
+    ) -> None:
         low, high = settings.level_band_hz
-        bins = band_bins((low, min(high, _HIGHEST * sample_rate_hz)), sample_rate_hz, settings.nfft)
+        highest = HIGHEST_SHARE * min(sample_rate_hz, recorded_hz)
+        bins = band_bins((low, min(high, highest)), sample_rate_hz, settings.nfft)
         self._bins = range(max(bins.start, 1), bins.stop)
         self._edges = band_edges(self._bins, BANDS)
         # A bin reaches half its width to either side of its frequency.

@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import FEATURE_NFFT
+from worldstate.frontend.direction import feature as published
 from worldstate.ground import FloatArray, InvalidArgumentError, in_range
 
 Band = tuple[float, float]
@@ -48,6 +49,8 @@ class FrontEndSettings:
         Measure what one microphone hears over two seconds: `AcousticFrame.character`.
     feature_order : tuple of int, optional
         Channels in the order in which the feature forms its pairs, where it is not that of the array.
+    heard_rate_hz : float, optional
+        Rate that the sound is brought to before anything but faults of microphones is read; its own if None.
 
     Raises
     ------
@@ -60,7 +63,7 @@ class FrontEndSettings:
     (91,)
     """
 
-    nfft: int = FEATURE_NFFT
+    nfft: int = published.FEATURE_NFFT
     azimuth_span_deg: tuple[float, float] = (-90.0, 90.0)
     tone_band_hz: Band | None = None
     srp_band_hz: Band = BAND_HZ
@@ -69,6 +72,7 @@ class FrontEndSettings:
     watch_channels: bool = True
     character: bool = False
     feature_order: tuple[int, ...] | None = None
+    heard_rate_hz: float | None = None
 
     def __post_init__(self) -> None:
         if self.nfft != int(self.nfft) or self.nfft % 2 or not 4 <= self.nfft <= 65536:
@@ -83,6 +87,20 @@ class FrontEndSettings:
             low, high = getattr(self, name) or ENGINE_BAND_HZ
             in_range(f"{name}: lower end", low, 0.0, np.inf)
             in_range(f"{name}: upper end", high, low, np.inf, open_low=True, open_high=True)
+
+    @classmethod
+    def heard_at(cls, sample_rate_hz: float, **others: Any) -> Self:
+        """Return settings for sound of any rate, with frames as the published feature has them.
+
+        Examples
+        --------
+        >>> chosen = FrontEndSettings.heard_at(44_100)
+        >>> chosen.nfft, chosen.heard_rate_hz, FrontEndSettings.heard_at(47_998).heard_rate_hz
+        (512, 48000.0, None)
+        """
+        rate = published.feature_rate_hz(sample_rate_hz)
+        heard = None if rate == sample_rate_hz else rate
+        return cls(published.feature_nfft(rate), heard_rate_hz=heard, **others)
 
     def azimuths_rad(self) -> FloatArray:
         """Return the grid of azimuths, one a degree, ascending from right to left.
@@ -101,8 +119,8 @@ class FrontEndSettings:
         return np.radians(np.linspace(first, last, round(last - first) + 1))
 
 
-# Room below half the sample rate for the anti-aliasing filter.
-_HIGHEST_SHARE = 0.45
+# Highest frequency that the anti-aliasing filters of usual converters pass, relative to the sample rate.
+HIGHEST_SHARE = 0.45
 # No lower than the paper's band for microphones farther apart: over a band of two octaves the aliases of the
 # spatial spectrum fall on other directions at each frequency, and low bands are blunt. White sources at 0 dB,
 # a pair 1 m apart: median error .9 deg in 150-900 Hz, .2 deg in 300-1800 Hz.
@@ -120,5 +138,5 @@ def default_band_hz(array: MicrophoneArray, sample_rate_hz: float) -> tuple[floa
     # Whole octaves, so that arrays of about the paper's spacing keep the paper's band exactly.
     low, high = BAND_HZ
     spacing = min(max(math.floor(math.log2(array.alias_hz() / high)), 0), _MOST_OCTAVES)
-    octaves = min(spacing, math.floor(math.log2(_HIGHEST_SHARE * sample_rate_hz / high)))
+    octaves = min(spacing, math.floor(math.log2(HIGHEST_SHARE * sample_rate_hz / high)))
     return low * 2.0**octaves, high * 2.0**octaves

@@ -23,9 +23,10 @@ from worldstate.frontend.direction.bearing import (
 )
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
 from worldstate.frontend.health.channel_health import ArrayHealth
-from worldstate.frontend.hop_spectra import SILENCE, Hop, HopCutter
+from worldstate.frontend.hop_spectra import SILENCE, Hop, HopCutter, hop_end
+from worldstate.frontend.spectra.resampling import Resampler
 from worldstate.frontend.spectra.sound_character import SoundCharacter
-from worldstate.frontend.spectra.stft import bin_frequencies_hz
+from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz
 from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, nanoseconds
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.typing import BoolArray, Float32Array
@@ -169,7 +170,8 @@ class FrontEnd:
         One microphone a channel, in the order of the channels. A planar array across the vehicle shows
         sources behind it mirrored to the front: see `MicrophoneArray.ambiguity`.
     sample_rate_hz : float
-        Samples per second; more than twice the highest frequency of the bands.
+        Samples per second, also of those that `sample_index` counts; more than twice the highest frequency
+        of the bands. `FrontEndSettings.heard_at` gives settings for sound of any rate.
     settings : FrontEndSettings, optional
         Bands, windows, grids and stages; the values of the paper by default, with frames of `feature_nfft`.
     start_ns : int
@@ -206,7 +208,11 @@ class FrontEnd:
         self.array = array
         self.sample_rate_hz = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
         self.settings = settings = settings or FrontEndSettings(nfft=feature_nfft(self.sample_rate_hz))
-        hop = self.sample_rate_hz / HOP_RATE_HZ
+        wanted_hz, n_channels = settings.heard_rate_hz, array.n_microphones
+        self._resampler = Resampler(n_channels, self.sample_rate_hz, wanted_hz) if wanted_hz else None
+        self.heard_rate_hz = rate = self._resampler.rate_hz if self._resampler else self.sample_rate_hz
+        band_bins(settings.srp_band_hz, self.sample_rate_hz, settings.nfft)  # refuses what was not recorded
+        hop = rate / HOP_RATE_HZ
         if settings.nfft > hop:
             problem = f"expected at most one hop of {hop:.0f} samples, got {settings.nfft}"
             advice = "sound of a higher rate (6 kHz will do), or shorter frames"
@@ -215,19 +221,20 @@ class FrontEnd:
         self._azimuths = settings.azimuths_rad()
         self._azimuths.flags.writeable = False
         self._scatter = BearingScatter(uniform_std_rad(self._azimuths))
-        self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz)
+        self._cutter, self._recorder = (HopCutter(n_channels, hz) for hz in (rate, self.sample_rate_hz))
+        self._recorded: deque[Float32Array] = deque()
         with one_blas_thread():
-            self._spectra = HopSpectra(array, self.sample_rate_hz, settings)
-            frequencies = bin_frequencies_hz(self._spectra.srp_bins, self.sample_rate_hz, settings.nfft)
-            n_frames = BEARING_HOPS * 2.0 * self.sample_rate_hz / (HOP_RATE_HZ * settings.nfft)
+            self._spectra = HopSpectra(array, rate, settings)
+            frequencies = bin_frequencies_hz(self._spectra.srp_bins, rate, settings.nfft)
+            n_frames = BEARING_HOPS * 2.0 * rate / (HOP_RATE_HZ * settings.nfft)
             self._least_prominence = noise_prominence(self._spectra.beams, array, frequencies, n_frames)
         self._noise = NoiseMeter() if settings.watch_channels else None
         self._levels: FloatArray = np.full(BANDS, np.log(SILENCE))
-        self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
+        self._meter = LevelMeter(n_channels, rate, settings, self.sample_rate_hz)
         band_hz = settings.tone_band_hz
-        self._tone = None if band_hz is None else ToneStage(array, self.sample_rate_hz, band_hz)
+        self._tone = None if band_hz is None else ToneStage(array, rate, band_hz)
         self._energy_floor = EnergyFloor()
-        self._character = SoundCharacter(self.sample_rate_hz) if settings.character else None
+        self._character = SoundCharacter(rate) if settings.character else None
         self._hops: deque[HopSums] = deque(maxlen=WINDOW_HOPS)
 
     def process(self, block: ArrayLike) -> list[AcousticFrame]:
@@ -259,8 +266,14 @@ class FrontEnd:
         [0, 0, 0, 1, 2]
         """
         samples = self._checked(block)
-        frames = (self._process_hop(hop) for hop in self._cutter.cut(samples))
-        return [frame for frame in frames if frame is not None]
+        if self._resampler is not None:
+            self._recorded.extend(hop.samples.copy() for hop in self._recorder.cut(samples))
+            samples = self._resampler.push(samples)
+        return self._process_hops(samples)
+
+    def finish(self) -> list[AcousticFrame]:
+        """Return the results of a hop that has ended and waits for later samples, 16 ms at most."""
+        return [] if self._resampler is None else self._process_hops(self._resampler.flush())
 
     def learn_ego_noise(self, none_probability: float) -> None:
         """Set the probability that no source is present, with which the sound is learned as ego-noise.
@@ -310,9 +323,14 @@ class FrontEnd:
             raise InvalidArgumentError(f"block: {problem}")
         return samples
 
-    def _process_hop(self, hop: Hop) -> AcousticFrame | None:
+    def _process_hops(self, samples: Float32Array) -> list[AcousticFrame]:
+        recorded, hops = self._recorded, self._cutter.cut(samples)
+        frames = (self._process_hop(hop, recorded.popleft() if recorded else hop.samples) for hop in hops)
+        return [frame for frame in frames if frame is not None]
+
+    def _process_hop(self, hop: Hop, recorded: Float32Array) -> AcousticFrame | None:
         with one_blas_thread():
-            self._hops.append(self._spectra.push(hop.samples))
+            self._hops.append(self._spectra.push(hop.samples, recorded))
             levels = self._unmasked(self._meter.push(hop.samples, self._keep, self._hops[-1].heard))
             self._energy_floor.push(float(self._hops[-1].energies[self._used].mean()))
             if self._tone is not None:
@@ -342,8 +360,8 @@ class FrontEnd:
         bearing = self._scatter.widened(bearing_of(spectrum, peaks, self._azimuths, floor))
         window = sum(hop.share for hop in self._hops) / WINDOW_HOPS
         return AcousticFrame(
-            stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
-            sample_index=hop.end,
+            stamp_ns=self._start_ns + nanoseconds(hop.end / self.heard_rate_hz),
+            sample_index=hop_end(hop.index, self.sample_rate_hz),
             azimuths_rad=self._azimuths,
             srp=self._srp(list(self._hops)),
             bearing_rad=bearing.azimuth_rad,
@@ -388,7 +406,7 @@ class FrontEnd:
     def _age_s(self, hops: list[HopSums], end: int) -> float:
         weights = [max(hop.n_frames, 1) for hop in hops]
         centre = sum(n * hop.centre for n, hop in zip(weights, hops, strict=True)) / sum(weights)
-        return (end - centre) / self.sample_rate_hz
+        return (end - centre) / self.heard_rate_hz
 
     def _feature(self) -> FloatArray:
         hops, half = list(self._hops), WINDOW_HOPS // FEATURE_SEGMENTS
@@ -408,7 +426,7 @@ class FrontEnd:
         energies = energies[:, self._used].mean(axis=1)
         if len(hops) < MIN_POINTS or energies.min() <= SILENCE:
             return NotUsable("silence within the window")
-        times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz
+        times = (np.array([hop.centre for hop in hops]) - end) / self.heard_rate_hz
         low, high = LOOMING_BAND_HZ
         scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
         noise = self._energy_floor.read(float(energies.min()), scatter)

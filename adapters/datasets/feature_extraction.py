@@ -11,7 +11,8 @@ from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.file_io import number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import published_feature
+from worldstate.frontend.direction.feature import feature_rate_hz, published_feature
+from worldstate.frontend.spectra.resampling import Resampler
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 
@@ -83,7 +84,14 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
     [(60,)]
     """
     for samples, rate_hz in read_windows(windows, array.n_microphones):
-        yield published_feature(samples, array, rate_hz)
+        heard_hz = feature_rate_hz(rate_hz)
+        if heard_hz != rate_hz:
+            resampler = Resampler(array.n_microphones, rate_hz, heard_hz)
+            samples, heard_hz = (
+                np.concatenate([resampler.push(samples), resampler.flush()]),
+                resampler.rate_hz,
+            )
+        yield published_feature(samples, array, heard_hz)
 
 
 def read_windows(

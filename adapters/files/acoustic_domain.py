@@ -23,7 +23,8 @@ _LOG = logging.getLogger(__name__)
 
 def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: Sequence[str]) -> ModelDomain:
     """Return the domain of windows that an array heard at these rates, the ego as the environments say."""
-    alike = [_rate_of_long_frames(rate, published.feature_nfft(rate)) for rate in rates_hz]
+    heard = map(published.feature_rate_hz, rates_hz)
+    alike = [_rate_of_long_frames(rate, published.feature_nfft(rate)) for rate in heard]
     low, high = (1.0 - published.RATE_TOLERANCE) * min(alike), (1.0 + published.RATE_TOLERANCE) * max(alike)
     motion = ego_motion_of(environments)
     feature, band_hz = published.FEATURE_VERSION, published.FEATURE_BAND_HZ
@@ -101,13 +102,13 @@ def feature_order(
         If array, sample rate, band or feature is not what the model was made with.
     """
     low, high = domain.sample_rate_hz
-    if not low <= _rate_of_long_frames(sample_rate_hz, settings.nfft) <= high:
-        made_for = f"{low:.0f} to {high:.0f} Hz and frames of {published.FEATURE_NFFT}"
-        expected = (
-            f"a model made for {made_for} expects such sound, or a half, a quarter or an eighth of both"
-        )
-        got = f"{sample_rate_hz:g} Hz and frames of {settings.nfft}"
-        raise OutOfDomainError(f"sample rate: {expected}, got {got}. {way_out}")
+    if sample_rate_hz < published.LEAST_RATE_HZ:
+        advice = "record at 8 kHz or more: what the model reads up to 2.7 kHz is not in this sound"
+        raise OutOfDomainError(f"sample rate: expected at least 6000 Hz, got {sample_rate_hz:g} Hz: {advice}")
+    rate, nfft = settings.heard_rate_hz or sample_rate_hz, settings.nfft
+    if not low <= _rate_of_long_frames(rate, nfft) <= high:
+        expected = f"those of the model, {published.FEATURE_NFFT} samples at {low:.0f} to {high:.0f} Hz"
+        raise OutOfDomainError(f"frames: expected {expected}, got {nfft} at {rate:g} Hz. {way_out}")
     made_with = _feature(domain.feature, domain.band_hz)
     got = _feature(published.FEATURE_VERSION, published.FEATURE_BAND_HZ)
     if got != made_with:

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
-from worldstate.frontend.spectra.stft import Decimator, power
+from worldstate.frontend.spectra.resampling import Decimator
+from worldstate.frontend.spectra.stft import power
 from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, ComplexArray, Float32Array, FloatArray

@@ -15,7 +15,8 @@ from scipy.fft import next_fast_len, rfft
 
 from worldstate.ground import FloatArray, IntArray, NotUsable, in_range
 
-from .stft import Decimator, power
+from .resampling import Decimator
+from .stft import power
 
 HOPS_A_SECOND = 10
 EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)

@@ -17,7 +17,6 @@ from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability
-from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.hop_spectra import NoiseMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -290,6 +289,8 @@ def _heard_hops(
         middle.append(samples[:, arrays[0].middle].copy())
         for heard, front_end in zip(frames, front_ends, strict=True):
             heard += front_end.process(samples)
+    for heard, front_end in zip(frames, front_ends, strict=True):
+        heard += front_end.finish()
     if not frames[0]:
         raise InvalidArgumentError(f"{name}: expected more than a second of sound")
     whole = np.concatenate(middle)
@@ -299,11 +300,7 @@ def _heard_hops(
 def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
     """Return what streams are listened to with: everything that evidence reads, microphones trusted."""
     # Simulated microphones do not fail, and watching them takes a third of the time.
-    return FrontEndSettings(
-        nfft=feature_nfft(sample_rate_hz),
-        level_band_hz=LEVEL_BAND_HZ,
-        watch_channels=False,
-    )
+    return FrontEndSettings.heard_at(sample_rate_hz, level_band_hz=LEVEL_BAND_HZ, watch_channels=False)
 
 
 def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from worldstate.frontend.approach.tone import ToneReading, ToneStage
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray, roof_array_56
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.stft import Decimator
+from worldstate.frontend.spectra.resampling import Decimator
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable

@@ -1,6 +1,6 @@
 """`worldstate model show`: the card of a model file.
 
-Say what a model was made of and made for: data, recordings, array, sample rates, band, feature, ego's motion,
+Say what a model was made of and made for: data, recordings, array, band, feature, ego's motion,
 thresholds, limits, licence.
 
 Examples
@@ -91,7 +91,6 @@ def _made_for(model: "adapters.Model") -> dict[str, object]:
         "array": domain.array,
         "microphones": len(domain.positions_m),
         "extent_m": [round(extent, 3) for extent in domain.extent_m],
-        "sample_rate_hz": [round(rate) for rate in domain.sample_rate_hz],
         "band_hz": list(domain.band_hz),
         "feature": domain.feature,
         "ego_motion": domain.ego_motion,
@@ -101,14 +100,14 @@ def _made_for(model: "adapters.Model") -> dict[str, object]:
 def _limits(model: "adapters.Model") -> list[str]:
     """Say what the model was not made for."""
     from worldstate.adapters.files.acoustic_domain import UNFIT
+    from worldstate.frontend.direction.feature import LEAST_RATE_HZ
 
     domain, unfit = model.domain, [] if model.provenance.fit_for_use else [f"{UNFIT}: no budget is stated"]
     if domain is None:
         return [*unfit, UNNAMED]
-    low, high = domain.sample_rate_hz
     limits = [
         "another array: refused; microphones more than 1 mm elsewhere count as another",
-        f"sample rates outside {low:.0f} to {high:.0f} Hz and their halves, quarters and eighths: refused",
+        f"sound of a sample rate below {LEAST_RATE_HZ:.0f} Hz: refused",
         "other sites than those named: thresholds were set on these; see worldstate model threshold",
         "sound of anything but vehicles: the model does not know it",
     ]

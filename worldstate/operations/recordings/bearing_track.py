@@ -48,6 +48,7 @@ def track_bearings(
         sources = (_sources_in(block, front_end),) if count else ()
         rows += [(*_row(frame), *sources) for frame in front_end.process(block)]
         on_second()
+    rows += [(*_row(frame), *sources) for frame in front_end.finish()]
     return HopTable.of_rows(tuple(_FORMS)[: 5 if count else 4], rows)
 
 

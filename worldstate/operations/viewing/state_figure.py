@@ -65,6 +65,7 @@ def sound_power(
     for block in audio.blocks(audio.sample_rate_hz):
         rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.process(block)]
         on_second()
+    rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.finish()]
     return _power([t for t, _ in rows], front_end.settings.azimuths_rad(), [row for _, row in rows])
 
 
