@@ -100,17 +100,19 @@ class DatagramSocket(ReaderThread, Generic[T]):
         """The port that is listened at, where 0 was given the one that was free."""
         return int(self._socket.getsockname()[1])
 
-    def deliver(self, take: Callable[[int, T], None]) -> None:
+    def deliver(self, take: Callable[[int, T], None]) -> int:
         """Pass on what waits, each with the time of its capture on the stream's clock, nanoseconds.
 
-        What cannot be read, or is refused there, is counted.
+        What cannot be read, or is refused there, is counted; return how many were.
         """
+        before = self.refused
         for arrived_s, datagram in self._datagrams.take_all():
             try:
                 age_s, told = self._read_one(datagram)
                 take(self._stamp_ns(arrived_s - age_s), told)
             except WorldstateError as error:
                 self.refused, self.problem = self.refused + 1, str(error)
+        return self.refused - before
 
     def _read_one(self, datagram: bytes) -> tuple[float, T]:
         try:
@@ -194,6 +196,13 @@ class ImageLooks:
         Width and height that the lens was given for.
     rates : MissRates, optional
         Where they hold the camera's scale of health, its degradation is read from the images.
+
+    Attributes
+    ----------
+    refused : int
+        Images of another size, and those whose boxes were refused.
+    problem : str
+        What was wrong with the last of them.
     """
 
     def __init__(
@@ -206,14 +215,23 @@ class ImageLooks:
     ) -> None:
         self._images, self._detector, self._stamp_ns, self._size_px = images, detector, stamp_ns, size_px
         self._health = ImageHealth(rates)
+        self.refused, self.problem = 0, ""
 
-    def deliver(self, take: Callable[[int, DetectionFrame], None]) -> None:
-        """Pass on, such as to `Listener.look`, what is found in the images that wait, each with its stamp."""
+    def deliver(self, take: Callable[[int, DetectionFrame], None]) -> int:
+        """Pass on, such as to `Listener.look`, what is found in the images that wait, each with its stamp.
+
+        Return how many were refused.
+        """
+        before = self.refused
         for captured_s, image in self._images.take_all():
-            self._check_size(image)
-            stamp_ns = self._stamp_ns(captured_s)
-            self._health.read(stamp_ns, image)
-            take(stamp_ns, self._detector.detect(image))
+            try:
+                self._check_size(image)
+                stamp_ns = self._stamp_ns(captured_s)
+                self._health.read(stamp_ns, image)
+                take(stamp_ns, self._detector.detect(image))
+            except WorldstateError as error:
+                self.refused, self.problem = self.refused + 1, str(error)
+        return self.refused - before
 
     def degradation(self, stamp_ns: int) -> float:
         """Return d as last read, 0 where no scale of health is known."""
@@ -235,7 +253,7 @@ class CameraFeed(ReaderThread):
     device : int
         Number of the camera as OpenCV counts them.
     images : StampedImages
-        Where the images go.
+        Where the images go. While the camera gives none, it is asked again, until the end.
 
     Raises
     ------
@@ -247,16 +265,16 @@ class CameraFeed(ReaderThread):
 
     def __init__(self, device: int, images: StampedImages) -> None:
         self._capture: Any = optional("cv2").VideoCapture(device)
-        self._name, self._images = f"camera {device}", images
+        self._images = images
         if not self._capture.isOpened():
             self._capture.release()
-            raise InputFileError(self._name, "expected a camera of this machine, it cannot be opened")
+            raise InputFileError(f"camera {device}", "expected a camera of this machine, it cannot be opened")
         super().__init__(self._capture.release)
 
     def _read(self) -> None:
         while not self._stopped.is_set():
             found, image = self._capture.read()
             if not found:
-                self._images.close(InputFileError(self._name, "expected images, the camera gives no more"))
-                return
+                self._stopped.wait(_POLL_S)
+                continue
             self._images.put((time.monotonic(), image))

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from worldstate.adapters.live.live_sensors import DatagramSocket
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
 
-    HandIn = Callable[[Listener], None]
+    HandIn = Callable[[Listener], int]
     Losses = Callable[[], dict[str, object]]
 
 
@@ -177,9 +177,8 @@ def _with_cameras(
     elif sockets:
         source = replace(source, detections=NO_LOOKS)
 
-    def hand_in(listener: "Listener") -> None:
-        for name, told in sockets.items():
-            told.deliver(partial(listener.look, camera=name))
+    def hand_in(listener: "Listener") -> int:
+        return sum(told.deliver(partial(listener.look, camera=name)) for name, told in sockets.items())
 
     return source, hand_in, _losses(sockets.values(), "detections")
 
@@ -197,7 +196,12 @@ def _with_device(
     looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
     opened.enter_context(CameraFeed(arguments.camera_device, images))
     seen = replace(source, detections=NO_LOOKS, degradation=looks.degradation)
-    return seen, lambda to: looks.deliver(to.look), lambda: {"images_dropped": images.dropped}
+
+    def losses() -> dict[str, object]:
+        refused, last = looks.refused, looks.problem or None
+        return {"images_dropped": images.dropped, "images_refused": refused, "last_refusal": last}
+
+    return seen, lambda to: looks.deliver(to.look), losses
 
 
 def _odometry(
@@ -207,11 +211,11 @@ def _odometry(
     from worldstate.adapters.live.live_sensors import OdometrySocket
 
     if arguments.odometry is None:
-        return lambda to: None, dict
+        return lambda to: 0, dict
     told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns))
 
-    def hand_in(listener: "Listener") -> None:
-        told.deliver(lambda stamp_ns, record: listener.tell(record.at(stamp_ns)))
+    def hand_in(listener: "Listener") -> int:
+        return told.deliver(lambda stamp_ns, record: listener.tell(record.at(stamp_ns)))
 
     return hand_in, _losses([told], "odometry", "odometry_")
 
