@@ -13,7 +13,7 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.audio.sound_file import Audio
-from worldstate.adapters.files.file_io import atomic_path
+from worldstate.adapters.files.file_io import set_aside
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range, nanoseconds
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array
@@ -122,6 +122,8 @@ LARGEST_SAMPLE = 1000.0
 # 24 bits are what converters of such arrays give. WAV ends at 4 GiB, nine minutes of 56 channels; RF64 does
 # not, and readers of the one read the other.
 _FORMAT, _SUBTYPE = "RF64", "PCM_24"
+# SFC_SET_UPDATE_HEADER_AUTO of libsndfile.
+_UPDATE_HEADER = 0x1061
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,17 +314,26 @@ class LiveSound(Audio):
 def kept_sound(
     path: Path | None, sample_rate_hz: int, channels: int
 ) -> Iterator[Callable[[Float32Array], None] | None]:
-    """Lend a function that writes blocks to a file, which takes its name at the end; None without a path."""
+    """Lend a function that writes blocks to a file that reads at any time; None without a path."""
     if path is None:
         yield None
         return
     if path.suffix.lower() not in (".wav", ".rf64"):
         raise InputFileError(path, "expected a name that ends in .wav or .rf64")
-    with (
-        atomic_path(path) as temporary,
-        soundfile.SoundFile(temporary, "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT) as file,
-    ):
-        yield file.write
+    with soundfile.SoundFile(
+        set_aside(path), "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT
+    ) as file:
+        # The length in the header follows every block: soundfile has no function of its own for it.
+        soundfile._snd.sf_command(file._file, _UPDATE_HEADER, soundfile._ffi.NULL, 1)
+
+        def write(samples: Float32Array) -> None:
+            try:
+                file.write(samples)
+            except (soundfile.LibsndfileError, AssertionError) as error:
+                problem = f"expected room to write after {file.tell() / sample_rate_hz:.1f} s"
+                raise InputFileError(path, problem) from error
+
+        yield write
 
 
 # Lost samples are told from the jitter of a callback's time by this share of a block.
