@@ -18,6 +18,9 @@ cameras of --car have an address each: NAME=HOST:PORT, repeated.
 with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. With it, or with the odometry of --car,
 the model of a moving ego is taken where --model names none.
 
+A port takes its first sender until that one is silent for ten seconds, or all of --allow. With --key, the
+file of a secret, a datagram ends in a line with its HMAC-SHA256 and has a "number" that rises.
+
 --save-state keeps belief and site every minute and at the end, --resume goes on from them: from the time at
 which they end, or by --start from a later one.
 
@@ -47,7 +50,7 @@ from worldstate.ground.errors import InvalidArgumentError
 if TYPE_CHECKING:
     from worldstate.adapters.listener import Listener
     from worldstate.adapters.live.live_listening import LiveStep
-    from worldstate.adapters.live.live_sensors import DatagramSocket
+    from worldstate.adapters.live.live_sensors import DatagramSocket, Trust
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
 
     HandIn = Callable[[Listener], int]
@@ -58,6 +61,8 @@ if TYPE_CHECKING:
 SAID_EVERY_NS = 1_000_000_000
 # What a killed run has learned of the site and the belief since is lost.
 SAVED_EVERY_NS = 60_000_000_000
+# Bytes of a secret: fewer are guessed.
+SHORTEST_KEY = 16
 # What a first user needs.
 FIRST_OPTIONS = (
     *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--device", "--play"),
@@ -81,6 +86,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     listening.add_memory_options(parser, "the end of STATE")
     told = "listen there to how the car moves"
     parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
+    add = parser.add_argument_group("ports").add_argument
+    told = "take datagrams of this address only; repeated (default: the first sender)"
+    add("--allow", action="append", default=[], metavar="HOST", help=told)
+    add("--key", type=Path, metavar="FILE", help="take datagrams only that prove to know this secret")
     group = parser.add_argument_group("camera")
     which = group.add_mutually_exclusive_group()
     which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
@@ -174,7 +183,7 @@ def _with_cameras(
     named = given.named()
     addresses = named or dict(zip([SENSOR], given.arguments.detections, strict=False))
     sockets = {
-        name: opened.enter_context(DetectionSocket(address, sound.stamp_ns))
+        name: opened.enter_context(DetectionSocket(address, sound.stamp_ns, _trust(given.arguments)))
         for name, address in addresses.items()
     }
     if named:
@@ -217,12 +226,23 @@ def _odometry(
 
     if arguments.odometry is None:
         return lambda to: 0, dict
-    told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns))
+    told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns, _trust(arguments)))
 
     def hand_in(listener: "Listener") -> int:
         return told.deliver(lambda stamp_ns, record: listener.tell(record.at(stamp_ns)))
 
     return hand_in, _losses([told], "odometry", "odometry_")
+
+
+def _trust(arguments: argparse.Namespace) -> "Trust":
+    from worldstate.adapters.files.file_io import read_bytes
+    from worldstate.adapters.live.live_sensors import Trust
+
+    key = None if arguments.key is None else read_bytes(arguments.key, "a secret", 1 << 12).strip()
+    if key is not None and len(key) < SHORTEST_KEY:
+        problem = f"expected a secret of at least {SHORTEST_KEY} bytes, got {len(key)}"
+        raise ground.InputFileError(arguments.key, problem)
+    return Trust(tuple(arguments.allow), key)
 
 
 def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
