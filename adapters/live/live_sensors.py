@@ -19,6 +19,7 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.files.odometry_file import OdometryRecord
 from worldstate.core.fixed_lag import LAG_NS
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range
+from worldstate.ground.errors import OwnPartError
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import decode, decode_json
 from worldstate.ground.typing import ImageArray
@@ -299,6 +300,8 @@ class ImageLooks:
                 stamp_ns = self._stamp_ns(captured_s)
                 self._health.read(stamp_ns, image)
                 take(stamp_ns, self._detector.detect(image))
+            except OwnPartError:
+                raise
             except WorldstateError as error:
                 self.refused, self.problem = self.refused + 1, str(error)
         return self.refused - before

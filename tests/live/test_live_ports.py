@@ -90,7 +90,7 @@ def test_a_key_is_proved_by_any_sender_and_nothing_is_taken_twice():
 def test_a_short_secret_is_refused(tmp_path, capsys):
     (tmp_path / "key").write_text("short\n")
     (tmp_path / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
-    soundfile.write(tmp_path / "a.wav", np.full((16_000, 4), 0.1), 8_000)
+    soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000)
     play = "--play", str(tmp_path / "a.wav"), "--array", str(tmp_path / "mics.csv"), "--uncalibrated"
     assert main(["live", *play, "--odometry", "127.0.0.1:0", "--key", str(tmp_path / "key")]) == 2
     assert "at least 16 bytes" in capsys.readouterr().err

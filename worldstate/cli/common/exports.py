@@ -145,7 +145,7 @@ def _websocket(port: str, paced: bool) -> "Iterator[LogSink]":
 
 def _stack(name: str, target: str, crossing_m: float) -> "Stack":
     from worldstate.adapters.export import other_stacks
-    from worldstate.adapters.own_parts import ExporterPart, load_part
+    from worldstate.adapters.own_parts import ExporterPart, load_part, own_exporter
     from worldstate.adapters.ros.bag_writer import state_bag
 
     own: dict[str, ExporterPart] = {
@@ -155,9 +155,10 @@ def _stack(name: str, target: str, crossing_m: float) -> "Stack":
         "rosbag": lambda path: state_bag(Path(path), crossing_m),
         "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),
     }
-    export = own.get(name) or load_part("worldstate.exporters", name, "--export", EXPORTERS)
-    opened: Stack = export(target)
-    return opened
+    if name in own:
+        opened: Stack = own[name](target)
+        return opened
+    return own_exporter(name, load_part("worldstate.exporters", name, "--export", EXPORTERS), target)
 
 
 @contextmanager
