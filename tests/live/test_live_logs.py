@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 import soundfile
 
+from worldstate.adapters.export.log_messages import growing_mcap, state_messages
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.file_io import GrowingFile
 from worldstate.adapters.state_log import growing_lines, read_log
 from worldstate.cli import live
 from worldstate.cli.main import main
-from worldstate.ground.errors import InputFileError
+from worldstate.ground.errors import InputFileError, WorldstateError
+from worldstate.state import WorldState
 
 RATE = 8_000
 NAMES = "states.jsonl", "states.mcap", "kept.wav", "belief.json"
@@ -178,3 +180,22 @@ def test_an_mcap_that_was_cut_short_reads_up_to_there(street, tmp_path, share):
         assert share < 0.2
     else:
         assert read == full[: len(read)]
+
+
+def test_a_damaged_mcap_is_read_or_refused(tmp_path):
+    path, rng = tmp_path / "a.mcap", random.Random(0)
+    with growing_mcap(path) as write:
+        for number in range(30):
+            for message in state_messages(WorldState(0, number * 100_000_000)):
+                write(message)
+    whole, refused = path.read_bytes(), 0
+    for _ in range(100):
+        damaged = bytearray(whole)
+        for _ in range(rng.randint(1, 5)):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        path.write_bytes(damaged)
+        try:
+            list(read_log(path))
+        except WorldstateError:
+            refused += 1
+    assert 20 < refused < 100
