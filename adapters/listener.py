@@ -147,6 +147,10 @@ class Listener:
         """Take odometry, positions or measurements of other sensors; each counts from its own stamp on."""
         self._waiting.add(told)
 
+    def refuse(self, inputs: int) -> None:
+        """Count so many inputs that were refused before they reached the belief."""
+        self.world = self.world.refused(inputs)
+
     def look(self, stamp_ns: int, frame: DetectionFrame, camera: str = SENSOR) -> None:
         """Take what a running detector found in an image; of several cameras the one is named.
 

@@ -10,17 +10,21 @@ A package names them in its pyproject.toml, and the command line names one of th
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from worldstate.adapters.camera.detections import Detector
+from worldstate.adapters.camera.detections import DetectionFrame, Detector
 from worldstate.core.fixed_lag import Timed
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError, OwnPartError, WorldstateError
+from worldstate.ground.typing import ImageArray
 from worldstate.state import WorldState
 
+# Exit codes above it are those of signals.
+SIGNALLED = 128
 Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
 # What other modalities say, each time it is asked for anew.
 OtherModality: TypeAlias = Callable[[], Iterable[Timed]]
@@ -71,14 +75,61 @@ def load_part(group: Group, name: str, option: str, built_in: Iterable[str] = ()
         several = f", which {len(found)} packages bring" if found else ""
         raise InvalidArgumentError(f"{option}: expected one of {group} ({known}), got {name!r:.60}{several}")
     try:
-        part = found[0].load()
-    # A module of somebody else's may fail in any way while it is imported.
-    except Exception as error:
+        with of_part(found[0].value):
+            part = found[0].load()
+    except OwnPartError as error:
         where = f"{option}: expected {found[0].value} to be importable"
-        raise InvalidArgumentError(f"{where} ({type(error).__name__}: {error})") from error
+        raise InvalidArgumentError(f"{where} ({type(error.error).__name__}: {error.error})") from error
     if not callable(part):
         raise InvalidArgumentError(f"{option}: expected {found[0].value} to be callable, got {part!r:.60}")
     return part
+
+
+@contextmanager
+def of_part(name: str) -> Iterator[None]:
+    """Turn whatever a part raises inside into an error with its name, `SystemExit` too."""
+    try:
+        yield
+    except (WorldstateError, KeyboardInterrupt, GeneratorExit):
+        raise
+    except BaseException as error:
+        # A signal that ends the program: see `run_program`.
+        if isinstance(error, SystemExit) and isinstance(error.code, int) and error.code > SIGNALLED:
+            raise
+        raise OwnPartError(name, error) from error
+
+
+@dataclass(frozen=True, slots=True)
+class OwnDetector:
+    """A detector that a package brings, whose errors have its name."""
+
+    name: str
+    detector: Detector
+
+    @classmethod
+    def of(cls, name: str, part: DetectorPart) -> "OwnDetector":
+        """Make one that has seen no image."""
+        with of_part(name):
+            return cls(name, part())
+
+    def detect(self, frame: ImageArray) -> DetectionFrame:
+        """Return what it finds in an image."""
+        with of_part(self.name):
+            return self.detector.detect(frame)
+
+
+@contextmanager
+def own_exporter(name: str, part: ExporterPart, target: str) -> Iterator[Callable[[WorldState], object]]:
+    """Open what an exporter of a package lends, whose errors have its name."""
+    with ExitStack() as opened:
+        with of_part(name):
+            export = opened.enter_context(part(target))
+
+        def guarded(state: WorldState) -> object:
+            with of_part(name):
+                return export(state)
+
+        yield guarded
 
 
 def part_and_target(option: str, text: str) -> tuple[str, str]:
@@ -102,7 +153,13 @@ def other_modality(option: str, text: str) -> OtherModality:
 
 
 def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Timed]:
-    for one in part(path):
+    with of_part(name):
+        told = iter(part(path))
+    while True:
+        with of_part(name):
+            one = next(told, None)
+        if one is None:
+            return
         if not isinstance(one, Timed):
             expected = "Measurement, PositionScan or Odometry"
             raise InvalidArgumentError(f"{name}: expected {expected}, got {one!r:.60}")

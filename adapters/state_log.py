@@ -1,12 +1,12 @@
 """Snapshots of a log in any form: JSON lines of `worldstate run --out`, MCAP, or a bag of ROS 2."""
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.export.log_messages import read_snapshot_lines
-from worldstate.adapters.files.file_io import line_writer, refused_as_file
+from worldstate.adapters.files.file_io import GrowingFile, line_writer, refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
 from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
@@ -67,14 +67,40 @@ def states_writer(path: Path | None) -> AbstractContextManager[Callable[[str], N
     return nullcontext(lambda line: None) if path is None else line_writer(path)
 
 
+@contextmanager
+def growing_lines(path: Path | None, most_bytes: int | None = None) -> Iterator[Callable[[str], None]]:
+    """Lend a function that writes a snapshot's line to a `GrowingFile`; without a path it writes nothing."""
+    if path is None:
+        yield lambda line: None
+        return
+    with GrowingFile(path, most_bytes) as log:
+
+        def write(line: str) -> None:
+            if log.full:
+                log.begin()
+            log.write(f"{line}\n".encode())
+
+        yield write
+
+
 def _json_lines(path: str | Path) -> Iterator[str]:
-    """Yield every line of the file, without its end."""
+    """Yield every line of the file, without its end; a last one that was cut short is left out."""
     with Path(path).open("rb") as file:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
+            if number > 1 and len(line) < MOST_CHARACTERS and not line.endswith(b"\n") and _is_cut(line):
+                return
             try:
                 yield line.decode().rstrip("\n")
             except UnicodeDecodeError as error:
                 raise InvalidArgumentError(f"line {number}: expected UTF-8") from error
+
+
+def _is_cut(line: bytes) -> bool:
+    try:
+        decode_json(line.decode(), "")
+    except (UnicodeDecodeError, InvalidArgumentError):
+        return True
+    return False
 
 
 def _records(path: str | Path) -> Iterator[tuple[int, object]]:

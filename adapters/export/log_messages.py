@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.files.file_io import atomic_path
+from worldstate.adapters.files.file_io import GrowingFile, atomic_path
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
@@ -198,30 +198,99 @@ def mcap_file(path: Path) -> Iterator[LogSink]:
     """Lend a function that writes messages to an MCAP file, which takes its name when the block ends."""
     check_extra("mcap")
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        writer = optional("mcap.writer").Writer(file)
-        writer.start()
-        channels: dict[str, int] = {}
+        messages = _McapMessages(file)
+        yield messages.write
+        messages.finish()
+
+
+@contextmanager
+def growing_mcap(path: Path, most_bytes: int | None = None) -> Iterator[LogSink]:
+    """Lend a function that writes messages to a `GrowingFile`, of which a killed run loses half a second."""
+    check_extra("mcap")
+    with GrowingFile(path, most_bytes) as file:
+        messages = _McapMessages(file)
 
         def write(message: LogMessage) -> None:
-            if message.topic not in channels:
-                schema = writer.register_schema(message.schema_name, "jsonschema", message.schema)
-                channels[message.topic] = writer.register_channel(message.topic, "json", schema)
-            writer.add_message(channels[message.topic], message.stamp_ns, message.data, message.stamp_ns)
+            nonlocal messages
+            if file.full and message.topic == SNAPSHOT_TOPIC:  # the scene of a state follows it
+                messages.finish()
+                file.begin()
+                messages = _McapMessages(file)
+            messages.write(message)
 
-        yield write
-        writer.finish()
+        try:
+            yield write
+        finally:
+            # Where there is no room the error that says so is on its way, or is raised here.
+            messages.finish()
+
+
+# In an unfinished file chunks that are whole are read: what a killed run loses is at most so much of its stream.
+_CHUNK_NS = nanoseconds(0.5)
+_CHUNK_BYTES = 1 << 20
+
+
+class _ChunkLimit:
+    """Size of a chunk: the writer compares it after every message, and time may have passed as well."""
+
+    def __init__(self) -> None:
+        self._first_ns: int | None = None
+        self._elapsed = False
+
+    def take(self, stamp_ns: int) -> None:
+        first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        self._elapsed = stamp_ns - first_ns >= _CHUNK_NS
+        self._first_ns = stamp_ns if self._elapsed else min(first_ns, stamp_ns)
+
+    def __lt__(self, size: int) -> bool:
+        return self._elapsed or size > _CHUNK_BYTES
+
+
+class _McapMessages:
+    """Messages of an MCAP file."""
+
+    def __init__(self, file: BinaryIO | GrowingFile) -> None:
+        self._limit, self._channels = _ChunkLimit(), dict[str, int]()
+        self._writer = optional("mcap.writer").Writer(file, chunk_size=self._limit)
+        self._writer.start()
+
+    def write(self, message: LogMessage) -> None:
+        if message.topic not in self._channels:
+            schema = self._writer.register_schema(message.schema_name, "jsonschema", message.schema)
+            self._channels[message.topic] = self._writer.register_channel(message.topic, "json", schema)
+        self._limit.take(message.stamp_ns)
+        channel = self._channels[message.topic]
+        self._writer.add_message(channel, message.stamp_ns, message.data, message.stamp_ns)
+
+    def finish(self) -> None:
+        self._writer.finish()
+
+
+# Half a second of states with an image takes a hundredth of it.
+_LARGEST_RECORD = 1 << 28
 
 
 def read_snapshot_lines(path: Path) -> Iterator[str]:
-    """Yield the snapshots of an MCAP file as the text that was written, in the order of their writing."""
-    make_reader, damaged = optional("mcap.reader").make_reader, optional("mcap.exceptions").McapError
+    """Yield the snapshots of an MCAP file as the text that was written, in the order of their writing.
+
+    Of a file that was not finished those are read whose chunk is whole.
+    """
+    reader, cut_short = optional("mcap.reader").NonSeekingReader, optional("mcap.exceptions").EndOfFile
     with path.open("rb") as file:
+        found = False
         try:
             # By time of writing and not by stamp: a late measurement may have moved a stamp back.
-            for _, _, message in make_reader(file).iter_messages([SNAPSHOT_TOPIC], log_time_order=False):
-                yield message.data.decode()
-        except (damaged, UnicodeDecodeError) as error:
-            raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
+            messages = reader(file, validate_crcs=True, record_size_limit=_LARGEST_RECORD)
+            for _, _, message in messages.iter_messages([SNAPSHOT_TOPIC], log_time_order=False):
+                text, found = message.data.decode(), True
+                yield text
+        except GeneratorExit:
+            raise
+        except (
+            Exception
+        ) as error:  # zstandard, lz4 and struct each have errors of their own for damaged bytes
+            if not (found and isinstance(error, cut_short)):
+                raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Files: text, JSON of one dataclass, CSV rows and arrays, read within bounds; written whole or not at all.
 
-A reader never meets half a file, and a run that fails leaves nothing behind. A link is followed: what it
+A reader never meets half a file, and a run that fails leaves nothing behind; only logs of a run without an
+end grow under their own name. A link is followed: what it
 points to is replaced, and the link stays. Devices, pipes and folders are never replaced.
 """
 
@@ -16,7 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO, Self, TypeVar
 
 import numpy as np
 
@@ -89,6 +90,80 @@ def line_writer(path: str | Path) -> Iterator[Callable[[str], None]]:
     """Lend a function that writes lines of UTF-8 to a file, which takes its name at the end."""
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         yield lambda line: print(line, file=file)
+
+
+class GrowingFile:
+    """File of a run without an end: under its own name from the start, every record in it when written.
+
+    What was there before becomes NAME.1.SUFFIX, and so does a file that is full; one such file is kept.
+
+    Parameters
+    ----------
+    path : str or Path
+        Where to write.
+    most_bytes : int, optional
+        When a file is full. Without it none is.
+
+    Raises
+    ------
+    InputFileError
+        If it cannot be written. What is in the file then ends with a whole record.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     with GrowingFile(Path(folder) / "log.txt") as log:
+    ...         _ = log.write(b"first")
+    ...         log.begin()
+    ...         _ = log.write(b"second")
+    ...     [path.read_text() for path in sorted(Path(folder).iterdir())]
+    ['first', 'second']
+    """
+
+    def __init__(self, path: str | Path, most_bytes: int | None = None) -> None:
+        self.path, self._most = Path(path), most_bytes
+        self._file, self._bytes = set_aside(path).open("wb", buffering=0), 0
+
+    def begin(self) -> None:
+        """Begin a new file."""
+        self._file.close()
+        self._file, self._bytes = set_aside(self.path).open("wb", buffering=0), 0
+
+    @property
+    def full(self) -> bool:
+        """Whether the file has its size."""
+        return self._most is not None and self._bytes >= self._most
+
+    def tell(self) -> int:
+        """Return how long the file is, bytes."""
+        return self._bytes
+
+    def write(self, record: bytes) -> int:
+        """Write a record, whole or not at all."""
+        left = memoryview(record)
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            self._file.truncate(self._bytes)
+            raise InputFileError(self.path, f"expected room to write ({error.strerror})") from error
+        self._bytes += len(record)
+        return len(record)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+def set_aside(path: str | Path) -> Path:
+    """Return where output to `path` goes; what is there becomes NAME.1.SUFFIX."""
+    target = check_target(path)
+    if target.exists() and target.stat().st_size:
+        target.replace(target.with_name(f"{target.stem}.1{target.suffix}"))
+    return target
 
 
 def _remove(path: Path) -> None:

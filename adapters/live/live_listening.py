@@ -30,18 +30,20 @@ class LiveStep:
     lost_s: float  # Seconds of sound that were lost up to now
 
 
-def live_steps(source: Source, *hand_in: Callable[[Listener], None]) -> Iterator[LiveStep]:
+def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[LiveStep]:
     """Yield every hop of a source whose sound is a `LiveSound`, as soon as it is known.
 
-    `hand_in` is called before every block of sound, for what other sensors have given.
+    `hand_in` is called before every block of sound, for what other sensors have given, and returns how much
+    of it was refused.
     """
     sound = source.sound
     if not isinstance(sound, LiveSound):
         got = source.audio_path
         raise InvalidArgumentError(f"source: expected one whose sound is a LiveSound, got {got}")
+    told = 0
     for listener, block in listened(source):
-        for one in hand_in:
-            one(listener)
+        listener.refuse(sum(one(listener) for one in hand_in) + sound.refused - told)
+        told = sound.refused
         for step in listener.steps(block):
             latency_s = sound.age_s(step.frame.sample_index)
             yield LiveStep(step, latency_s, sound.overruns, sound.lost_s)

@@ -4,18 +4,22 @@ UDP datagrams of other programs, detections image by image and odometry, each wi
 machine, and what a detector finds in its images.
 """
 
+import hmac
 import socket
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Generic, Self, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Generic, Self, TypeAlias, TypeVar
 
 from worldstate.adapters.camera.camera_channel import ImageHealth
 from worldstate.adapters.camera.detections import DetectionFrame, Detector, frame_of
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.files.odometry_file import OdometryRecord
+from worldstate.core.fixed_lag import LAG_NS
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range
+from worldstate.ground.errors import OwnPartError
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import decode, decode_json
 from worldstate.ground.typing import ImageArray
@@ -23,14 +27,25 @@ from worldstate.ground.typing import ImageArray
 from .live_sound import BoundedChannel
 
 T = TypeVar("T")
+Sender: TypeAlias = tuple[str, int]
 # A second of images of a fast camera; what a stalled machine finds there beyond is too old to be of use.
 WAITING_DATAGRAMS = 64
 # The largest datagram that IP carries.
 _LARGEST_BYTES = 1 << 16
 # How soon a socket that is no longer listened to is noticed.
 _POLL_S = 0.2
-# Nothing older than this is used: see MAX_IMAGE_AGE_S of the vision query and the lag of the filter.
-_OLDEST_S = 10.0
+# Nothing older than the lag of the filter is used.
+_OLDEST_S = 1e-9 * LAG_NS
+# A sender that has been silent for so long has ended: the next one takes its place.
+PINNED_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """Whose datagrams a port takes: those of its first sender where neither addresses nor a key are given."""
+
+    allow: tuple[str, ...] = ()
+    key: bytes | None = field(default=None, repr=False)
 
 
 class ReaderThread(ABC):
@@ -57,6 +72,9 @@ class ReaderThread(ABC):
 class DatagramSocket(ReaderThread, Generic[T]):
     """Records that arrive as UDP datagrams of one JSON object, with ``"age_s"`` from capture to sending.
 
+    Where it has a ``"number"``, numbers must rise. With a key a line follows: the HMAC-SHA256 of the object
+    in hexadecimal digits, and the number is due, which keeps a datagram from being sent again.
+
     Parameters
     ----------
     address : str
@@ -67,11 +85,13 @@ class DatagramSocket(ReaderThread, Generic[T]):
         From the object without its age to what it stands for.
     option : str
         That named the address, for messages.
+    trust : Trust, optional
+        Whose datagrams are taken.
 
     Attributes
     ----------
     refused : int
-        Datagrams that could not be read.
+        Datagrams that could not be read, came late, again, or from a stranger.
     problem : str
         What was wrong with the last of them.
 
@@ -82,11 +102,18 @@ class DatagramSocket(ReaderThread, Generic[T]):
     """
 
     def __init__(
-        self, address: str, stamp_ns: Callable[[float], int], decode: Callable[[object], T], option: str
+        self,
+        address: str,
+        stamp_ns: Callable[[float], int],
+        decode: Callable[[object], T],
+        option: str,
+        trust: Trust | None = None,
     ) -> None:
         self._socket, self._stamp_ns = _bound_socket(address, option), stamp_ns
-        self._decode = decode
-        self._datagrams: BoundedChannel[tuple[float, bytes]] = BoundedChannel(WAITING_DATAGRAMS)
+        self._decode, self._trust = decode, trust or Trust()
+        self._datagrams: BoundedChannel[tuple[float, bytes, Sender]] = BoundedChannel(WAITING_DATAGRAMS)
+        self._pinned: tuple[float, Sender] | None = None
+        self._last: dict[str, int] = {}  # The number taken last, by host; by a key there is one
         super().__init__(self._socket.close)
         self.refused, self.problem = 0, ""
 
@@ -100,34 +127,75 @@ class DatagramSocket(ReaderThread, Generic[T]):
         """The port that is listened at, where 0 was given the one that was free."""
         return int(self._socket.getsockname()[1])
 
-    def deliver(self, take: Callable[[int, T], None]) -> None:
+    def deliver(self, take: Callable[[int, T], None]) -> int:
         """Pass on what waits, each with the time of its capture on the stream's clock, nanoseconds.
 
-        What cannot be read, or is refused there, is counted.
+        What cannot be read, or is refused there, is counted; return how many were.
         """
-        for arrived_s, datagram in self._datagrams.take_all():
+        before = self.refused
+        for arrived_s, datagram, sender in self._datagrams.take_all():
             try:
-                age_s, told = self._read_one(datagram)
+                age_s, told = self._read_one(arrived_s, datagram, sender)
                 take(self._stamp_ns(arrived_s - age_s), told)
             except WorldstateError as error:
                 self.refused, self.problem = self.refused + 1, str(error)
+        return self.refused - before
 
-    def _read_one(self, datagram: bytes) -> tuple[float, T]:
+    def _read_one(self, arrived_s: float, datagram: bytes, sender: Sender) -> tuple[float, T]:
+        pinned = self._check_sender(arrived_s, sender)
         try:
-            record = decode_json(datagram.decode(), "datagram")
+            record = decode_json(self._checked_text(datagram).decode(), "datagram")
         except UnicodeDecodeError as error:
             raise InvalidArgumentError("datagram: expected UTF-8") from error
-        age_s = record.pop("age_s", 0.0) if isinstance(record, dict) else 0.0
-        return in_range("age_s", age_s, 0.0, _OLDEST_S), self._decode(record)
+        age_s, number = 0.0, None
+        if isinstance(record, dict):
+            age_s, number = record.pop("age_s", 0.0), record.pop("number", None)
+        source = "" if self._trust.key is not None else sender[0]
+        if number is not None or self._trust.key is not None:
+            last = self._last.get(source, -1)
+            number = decode(int, number, "number")
+            if number <= last:
+                raise InvalidArgumentError(f"number: expected one above {last}, taken already, got {number}")
+        read = in_range("age_s", age_s, 0.0, _OLDEST_S), self._decode(record)
+        if number is not None:
+            self._last[source] = number
+        self._pinned = pinned
+        return read
+
+    def _check_sender(self, arrived_s: float, sender: Sender) -> tuple[float, Sender] | None:
+        """Return which sender is pinned from now on; refuse a stranger."""
+        if self._trust.allow:
+            if sender[0] not in self._trust.allow:
+                allowed = ", ".join(self._trust.allow)
+                raise InvalidArgumentError(f"sender: expected one of {allowed}, got {sender[0]}")
+            return None
+        if self._trust.key is not None:
+            return None
+        if self._pinned is not None and self._pinned[1] != sender:
+            heard_s, (host, port) = self._pinned
+            if arrived_s - heard_s <= PINNED_S:
+                problem = f"expected {host}:{port}, the first one, got {sender[0]}:{sender[1]}"
+                raise InvalidArgumentError(f"sender: {problem}")
+            self._last.clear()
+        return arrived_s, sender
+
+    def _checked_text(self, datagram: bytes) -> bytes:
+        """Return the object of a datagram, whose code is right where there is a key."""
+        if self._trust.key is None:
+            return datagram
+        text, _, code = datagram.rpartition(b"\n")
+        if not hmac.compare_digest(hmac.new(self._trust.key, text, "sha256").hexdigest().encode(), code):
+            raise InvalidArgumentError("datagram: expected a line with the HMAC-SHA256 of the key")
+        return text
 
     def _read(self) -> None:
         self._socket.settimeout(_POLL_S)
         while not self._stopped.is_set():
             try:
-                datagram = self._socket.recv(_LARGEST_BYTES)
-            except TimeoutError:
+                datagram, sender = self._socket.recvfrom(_LARGEST_BYTES)
+            except OSError:  # nothing came, or what the system says of a datagram sent before
                 continue
-            self._datagrams.put((time.monotonic(), datagram))
+            self._datagrams.put((time.monotonic(), datagram, sender))
 
 
 class DetectionSocket(DatagramSocket[DetectionFrame]):
@@ -137,8 +205,10 @@ class DetectionSocket(DatagramSocket[DetectionFrame]):
     without detections is sent, too: it was searched. A datagram that is lost is an image not asked.
     """
 
-    def __init__(self, address: str, stamp_ns: Callable[[float], int]) -> None:
-        super().__init__(address, stamp_ns, lambda record: frame_of(record, "datagram"), "--detections")
+    def __init__(self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None) -> None:
+        super().__init__(
+            address, stamp_ns, lambda record: frame_of(record, "datagram"), "--detections", trust
+        )
 
 
 class OdometrySocket(DatagramSocket[OdometryRecord]):
@@ -149,8 +219,11 @@ class OdometrySocket(DatagramSocket[OdometryRecord]):
     it belongs.
     """
 
-    def __init__(self, address: str, stamp_ns: Callable[[float], int]) -> None:
-        super().__init__(address, stamp_ns, lambda one: decode(OdometryRecord, one, "datagram"), "--odometry")
+    def __init__(self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None) -> None:
+        def read(record: object) -> OdometryRecord:
+            return decode(OdometryRecord, record, "datagram")
+
+        super().__init__(address, stamp_ns, read, "--odometry", trust)
 
 
 def _bound_socket(address: str, option: str) -> socket.socket:
@@ -194,6 +267,13 @@ class ImageLooks:
         Width and height that the lens was given for.
     rates : MissRates, optional
         Where they hold the camera's scale of health, its degradation is read from the images.
+
+    Attributes
+    ----------
+    refused : int
+        Images of another size, and those whose boxes were refused.
+    problem : str
+        What was wrong with the last of them.
     """
 
     def __init__(
@@ -206,14 +286,25 @@ class ImageLooks:
     ) -> None:
         self._images, self._detector, self._stamp_ns, self._size_px = images, detector, stamp_ns, size_px
         self._health = ImageHealth(rates)
+        self.refused, self.problem = 0, ""
 
-    def deliver(self, take: Callable[[int, DetectionFrame], None]) -> None:
-        """Pass on, such as to `Listener.look`, what is found in the images that wait, each with its stamp."""
+    def deliver(self, take: Callable[[int, DetectionFrame], None]) -> int:
+        """Pass on, such as to `Listener.look`, what is found in the images that wait, each with its stamp.
+
+        Return how many were refused.
+        """
+        before = self.refused
         for captured_s, image in self._images.take_all():
-            self._check_size(image)
-            stamp_ns = self._stamp_ns(captured_s)
-            self._health.read(stamp_ns, image)
-            take(stamp_ns, self._detector.detect(image))
+            try:
+                self._check_size(image)
+                stamp_ns = self._stamp_ns(captured_s)
+                self._health.read(stamp_ns, image)
+                take(stamp_ns, self._detector.detect(image))
+            except OwnPartError:
+                raise
+            except WorldstateError as error:
+                self.refused, self.problem = self.refused + 1, str(error)
+        return self.refused - before
 
     def degradation(self, stamp_ns: int) -> float:
         """Return d as last read, 0 where no scale of health is known."""
@@ -235,7 +326,7 @@ class CameraFeed(ReaderThread):
     device : int
         Number of the camera as OpenCV counts them.
     images : StampedImages
-        Where the images go.
+        Where the images go. While the camera gives none, it is asked again, until the end.
 
     Raises
     ------
@@ -247,16 +338,16 @@ class CameraFeed(ReaderThread):
 
     def __init__(self, device: int, images: StampedImages) -> None:
         self._capture: Any = optional("cv2").VideoCapture(device)
-        self._name, self._images = f"camera {device}", images
+        self._images = images
         if not self._capture.isOpened():
             self._capture.release()
-            raise InputFileError(self._name, "expected a camera of this machine, it cannot be opened")
+            raise InputFileError(f"camera {device}", "expected a camera of this machine, it cannot be opened")
         super().__init__(self._capture.release)
 
     def _read(self) -> None:
         while not self._stopped.is_set():
             found, image = self._capture.read()
             if not found:
-                self._images.close(InputFileError(self._name, "expected images, the camera gives no more"))
-                return
+                self._stopped.wait(_POLL_S)
+                continue
             self._images.put((time.monotonic(), image))

@@ -13,7 +13,7 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.audio.sound_file import Audio
-from worldstate.adapters.files.file_io import atomic_path
+from worldstate.adapters.files.file_io import set_aside
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range, nanoseconds
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array
@@ -70,10 +70,17 @@ class BoundedChannel(Generic[T]):
             self._items.append(item)
             self._changed.notify()
 
-    def take(self) -> T | None:
-        """Wait for the oldest item and return it; None once the channel is closed and empty."""
+    def take(self, wait_s: float | None = None) -> T | None:
+        """Wait for the oldest item and return it; None once the channel is closed and empty.
+
+        Raises
+        ------
+        TimeoutError
+            If nothing came for so many seconds.
+        """
         with self._changed:
-            self._changed.wait_for(lambda: self._items or self._closed)
+            if not self._changed.wait_for(lambda: self._items or self._closed, wait_s):
+                raise TimeoutError
             if self._items:
                 return self._items.popleft()
             self._raise_failure()
@@ -108,9 +115,15 @@ BLOCKS_PER_SECOND = 40
 LONGEST_WAIT_S = 2.0
 # A longer gap is no lost block but a device that slept: its zeros would take minutes to work off.
 LONGEST_GAP_S = 60.0
+# A device that has given nothing for so long has stalled; with the hop its state is out within a second.
+STALL_S = 0.5
+# Of full scale. A converter gives at most 1, and single precision squares and adds up this without overflow.
+LARGEST_SAMPLE = 1000.0
 # 24 bits are what converters of such arrays give. WAV ends at 4 GiB, nine minutes of 56 channels; RF64 does
 # not, and readers of the one read the other.
 _FORMAT, _SUBTYPE = "RF64", "PCM_24"
+# SFC_SET_UPDATE_HEADER_AUTO of libsndfile.
+_UPDATE_HEADER = 0x1061
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +193,9 @@ class LiveSound(Audio):
         Time of the first sample on the stream's clock: not 0 where a belief is resumed.
     lost_samples : int
         Samples a channel that were lost on the way and are zeros in what `blocks` gave.
+    refused : int
+        Blocks of another shape, repeated, or numbered back or far ahead, and blocks in which samples were no
+        numbers or impossible ones, which are zeros in what `blocks` gave.
     """
 
     def __init__(self, feed: SoundFeed, keep: Callable[[Float32Array], None] | None = None) -> None:
@@ -187,10 +203,12 @@ class LiveSound(Audio):
         self.sample_rate_hz, self.channels = feed.sample_rate_hz, feed.channels
         # Known only after a second; the front-end leaves out a channel that is silent.
         self.silent_channels = ()
-        self.lost_samples, self.start_ns = 0, 0
+        self.lost_samples, self.start_ns, self.refused = 0, 0, 0
         self._feed, self._keep = feed, keep
         self._channel: BoundedChannel[SoundBlock] = BoundedChannel(int(LONGEST_WAIT_S * BLOCKS_PER_SECOND))
         self._captured_s = time.monotonic()
+        # What a block's number is behind that of the stream: grows where a device stalls; None while it does.
+        self._behind: int | None = 0
 
     @property
     def overruns(self) -> int:
@@ -207,16 +225,37 @@ class LiveSound(Audio):
         self.check_channels(expect_channels)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
-        """Yield the sound from now until the source ends or is closed, in blocks of the source's length."""
+        """Yield the sound from now until the source ends or is closed, in blocks of the source's length.
+
+        While a device stalls, zeros take the place of its sound.
+        """
         self._feed.start(self._channel)
+        self._captured_s = accepted_s = time.monotonic()
         try:
-            while (block := self._channel.take()) is not None:
-                for samples in (*self._gap(block.first), block.samples):
+            while True:
+                wait_s = STALL_S if self._behind is not None else 1.0 / BLOCKS_PER_SECOND
+                try:
+                    block = self._channel.take(wait_s)
+                except TimeoutError:
+                    block = SoundBlock(np.zeros((0, 0), np.float32), 0, 0.0)
+                if block is None:
+                    return
+                given: Iterator[Float32Array]
+                if len(block.samples) and self._fits(block):
+                    captured_s, given = block.captured_s, self._sound(block)
+                elif time.monotonic() - accepted_s >= wait_s:
+                    captured_s, self._behind = time.monotonic(), None
+                    stalled_s = (captured_s - self._captured_s) * self._feed.speed
+                    given = self._zeros(round(min(max(stalled_s, 0.0), LONGEST_GAP_S) * self.sample_rate_hz))
+                else:
+                    continue
+                for samples in given:
                     self.frames += len(samples)
-                    self._captured_s = block.captured_s
+                    self._captured_s = captured_s
                     if self._keep is not None:
                         self._keep(samples)
                     yield samples
+                accepted_s = time.monotonic()
         finally:
             self._feed.stop()
 
@@ -238,14 +277,33 @@ class LiveSound(Audio):
         since_s = (captured_s - self._captured_s) * self._feed.speed
         return self.start_ns + nanoseconds(self.frames / self.sample_rate_hz + since_s)
 
-    def _gap(self, first: int) -> Iterator[Float32Array]:
-        """Yield zeros, at most a second at a time, in place of what was lost before a block."""
-        missing = first - self.frames
-        if missing > LONGEST_GAP_S * self.sample_rate_hz:
-            lost_s = missing / self.sample_rate_hz
-            problem = f"expected sound without long gaps, {lost_s:.0f} s are lost: start anew"
-            raise InputFileError(self.path, problem)
-        self.lost_samples += max(missing, 0)
+    def _fits(self, block: SoundBlock) -> bool:
+        """Return whether a block is the next one of the stream; count it where it is not."""
+        behind = self.frames - block.first if self._behind is None else self._behind
+        missing = block.first + behind - self.frames
+        # Zeros already stand for what a device has held back while it stalled.
+        late = self._behind is None and block.captured_s <= self._captured_s
+        if (
+            late
+            or block.samples.shape[1:] != (self.channels,)
+            or not 0 <= missing <= LONGEST_GAP_S * self.sample_rate_hz
+        ):
+            self.refused += 1
+            return False
+        self._behind = behind
+        return True
+
+    def _sound(self, block: SoundBlock) -> Iterator[Float32Array]:
+        """Yield a block that fits, after zeros for what was lost before it."""
+        yield from self._zeros(block.first + (self._behind or 0) - self.frames)
+        usable = np.abs(block.samples) <= LARGEST_SAMPLE
+        self.refused += not usable.all()
+        # Only where it is: a microphone that gives no numbers is one that is silent, and the others hear.
+        yield block.samples if usable.all() else np.where(usable, block.samples, np.float32(0.0))
+
+    def _zeros(self, missing: int) -> Iterator[Float32Array]:
+        """Yield zeros, at most a second at a time, in place of what was lost."""
+        self.lost_samples += missing
         while missing > 0:
             some = min(missing, self.sample_rate_hz)
             yield np.zeros((some, self.channels), np.float32)
@@ -256,17 +314,26 @@ class LiveSound(Audio):
 def kept_sound(
     path: Path | None, sample_rate_hz: int, channels: int
 ) -> Iterator[Callable[[Float32Array], None] | None]:
-    """Lend a function that writes blocks to a file, which takes its name at the end; None without a path."""
+    """Lend a function that writes blocks to a file that reads at any time; None without a path."""
     if path is None:
         yield None
         return
     if path.suffix.lower() not in (".wav", ".rf64"):
         raise InputFileError(path, "expected a name that ends in .wav or .rf64")
-    with (
-        atomic_path(path) as temporary,
-        soundfile.SoundFile(temporary, "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT) as file,
-    ):
-        yield file.write
+    with soundfile.SoundFile(
+        set_aside(path), "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT
+    ) as file:
+        # The length in the header follows every block: soundfile has no function of its own for it.
+        soundfile._snd.sf_command(file._file, _UPDATE_HEADER, soundfile._ffi.NULL, 1)
+
+        def write(samples: Float32Array) -> None:
+            try:
+                file.write(samples)
+            except (soundfile.LibsndfileError, AssertionError) as error:
+                problem = f"expected room to write after {file.tell() / sample_rate_hz:.1f} s"
+                raise InputFileError(path, problem) from error
+
+        yield write
 
 
 # Lost samples are told from the jitter of a callback's time by this share of a block.
@@ -340,7 +407,6 @@ class PortAudioInput:
             channels=self.channels,
             dtype="float32",
             callback=on_block,
-            finished_callback=into.close,
         )
         self._stream.start()
 

@@ -14,8 +14,11 @@ from scripted_states import scripted_states
 
 from worldstate import AcousticAdapter
 from worldstate.adapters import write_array_xml
-from worldstate.adapters.own_parts import installed
+from worldstate.adapters.live.live_sensors import ImageLooks, image_channel
+from worldstate.adapters.own_parts import OwnDetector, installed, of_part
 from worldstate.cli.main import main
+from worldstate.ground.errors import OwnPartError
+from worldstate.ground.values import nanoseconds
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "own_parts"
 
@@ -140,7 +143,10 @@ def test_a_name_that_nobody_brings_is_refused_with_those_that_are_there(
         ([*replay, "--export", "sheet=a.csv"], "rosbag-sqlite3, table), got 'sheet'"),
         ([*replay, "--export", "table"], "--export: expected NAME=TARGET, got 'table'"),
         ([*run, "--measurements", "radar=a"], "worldstate.measurements (v2x), got 'radar'"),
-        ([*run, "--measurements", f"v2x={tmp_path / 'none.jsonl'}"], "none.jsonl: No such file"),
+        (
+            [*run, "--measurements", f"v2x={tmp_path / 'none.jsonl'}"],
+            "v2x: expected a part that works, got FileNotFoundError",
+        ),
         ([*run, "--detector", "yolo"], "worldstate.detectors (motion, knn, FILE.onnx, moving-columns), got"),
     ):
         assert main(options) == 2, options
@@ -158,3 +164,50 @@ def test_a_part_that_cannot_be_used_is_told_from_one_that_is_not_there(log, tmp_
     for name, said in (("broken", "(RuntimeError: no licence)"), ("number", "to be callable, got 7")):
         assert main(["log", "replay", str(log), "--export", f"{name}=x"]) == 2
         assert said in capsys.readouterr().err
+
+
+RAISING = """
+import contextlib
+
+@contextlib.contextmanager
+def at_once(target):
+    raise SystemExit(0)
+    yield
+
+@contextlib.contextmanager
+def at_a_state(target):
+    def export(state):
+        raise SystemExit(3)
+    yield export
+"""
+
+
+@pytest.mark.parametrize("name", ["at_once", "at_a_state"])
+def test_a_part_that_ends_the_program_is_an_error_with_its_name(name, log, tmp_path, monkeypatch, capsys):
+    (tmp_path / "raising.py").write_text(RAISING)
+    info = tmp_path / "raising-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: raising\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[worldstate.exporters]\n{name} = raising:{name}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["log", "replay", str(log), "--export", f"{name}=x"]) == 2
+    said = capsys.readouterr().err
+    assert f"{name}: expected a part that works, got SystemExit" in said
+
+
+@pytest.mark.parametrize("error", [SystemExit(0), BaseException("odd"), RuntimeError("no licence")])
+def test_a_detector_that_raises_anything_ends_the_run_with_its_name(error):
+    class Raising:
+        def detect(self, frame):
+            raise error
+
+    images = image_channel()
+    images.put((0.0, np.zeros((480, 640, 3), np.uint8)))
+    looks = ImageLooks(images, OwnDetector.of("mine", Raising), nanoseconds, (640, 480))
+    with pytest.raises(OwnPartError, match=f"mine: expected a part that works, got {type(error).__name__}"):
+        looks.deliver(lambda *look: None)
+
+
+def test_a_signal_that_comes_while_a_part_works_is_none_of_its_errors():
+    with pytest.raises(SystemExit), of_part("mine"):
+        raise SystemExit(128 + 15)

@@ -1,5 +1,6 @@
 """Sound as it comes: paced, complete, with its losses counted."""
 
+import threading
 import time
 from dataclasses import replace
 
@@ -67,9 +68,90 @@ def test_what_is_lost_is_silence_of_the_same_length():
     assert sound.lost_s == pytest.approx(300 / RATE)
 
 
-def test_a_device_that_slept_ends_the_run():
-    with pytest.raises(InputFileError, match="100 s are lost"):
-        list(LiveSound(Scripted(block(0), block(100 * RATE + 200))).blocks())
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        block(0),  # delivered again
+        block(200 - 1_000_000),
+        block(100 * RATE + 200),  # a device that slept
+        SoundBlock(np.full((200, 3), 0.5, np.float32), 200, 0.0),
+        SoundBlock(np.full(200, 0.5, np.float32), 200, 0.0),
+    ],
+)
+def test_a_block_that_is_not_the_next_is_left_out_and_counted(wrong):
+    sound = LiveSound(Scripted(block(0), wrong, block(200)))
+    heard = np.concatenate(list(sound.blocks()))
+    assert heard.shape == (400, 4)
+    assert heard.all()
+    assert (sound.refused, sound.lost_samples) == (1, 0)
+
+
+@pytest.mark.parametrize("sample", [np.nan, np.inf, -np.inf, 1e30])
+def test_samples_that_are_no_numbers_are_silence_of_their_microphone(sample):
+    wrong = block(200)
+    wrong.samples[7, 2] = sample
+    sound = LiveSound(Scripted(block(0), wrong))
+    heard = np.concatenate(list(sound.blocks()))
+    assert np.argwhere(heard == 0.0).tolist() == [[207, 2]]
+    assert np.isfinite(heard).all()
+    assert sound.refused == 1
+
+
+class Stalling(Scripted):
+    """Blocks in real time, of which a part is left out, held back, or numbered wrongly."""
+
+    def __init__(self, numbers, hold=(), restart=False):
+        self.numbers, self.hold, self.restart, self.stopped = numbers, hold, restart, threading.Event()
+
+    def start(self, into):
+        self._thread = threading.Thread(target=self._give, args=(into,))
+        self._thread.start()
+
+    def stop(self):
+        self.stopped.set()
+        self._thread.join()
+
+    def _give(self, into):
+        begun_s = time.monotonic()
+        for number in range(self.numbers):
+            due_s = begun_s + (number + 1) / 40
+            late_s = max(0.0, begun_s + max(self.hold) / 40 - due_s) if number in self.hold else 0.0
+            self.stopped.wait(max(due_s + late_s - time.monotonic(), 0.0))
+            past = bool(self.hold) and number > max(self.hold)
+            first = 200 * (number - max(self.hold) if past and self.restart else number)
+            into.put(block(first, captured_s=due_s))
+        into.close()
+
+
+def test_a_microphone_that_stalls_gives_states_and_keeps_the_time(source):
+    # Silent from 1.25 s to 2.75 s, when all that was held back comes at once.
+    sound = LiveSound(Stalling(160, hold=range(50, 110)))
+    lives = []
+    for live in live_steps(replace(source, sound=sound)):
+        lives.append((time.monotonic(), live.step.state))
+    stamps_ns = [state.stamp_ns for _, state in lives]
+    assert np.diff(stamps_ns).tolist() == [100_000_000] * (len(stamps_ns) - 1)
+    assert max(np.diff([at for at, _ in lives])) < 1.0
+    assert stamps_ns[-1] == pytest.approx(4e9, abs=2e8)
+    assert lives[-1][1].delivery.refused == sound.refused > 30
+    assert {one.condition for _, state in lives for one in state.sensors} > {"working"}
+
+
+def test_a_device_that_counts_from_zero_again_is_heard_again():
+    sound = LiveSound(Stalling(120, hold=[40], restart=True))
+    heard = np.concatenate(list(sound.blocks()))
+    assert heard[-200:].all()
+    assert len(heard) == pytest.approx(3.0 * RATE, abs=0.2 * RATE)
+    assert 10 < sound.refused < 40
+
+
+def test_what_the_sound_refused_is_told_in_the_snapshot(source):
+    noise = np.random.default_rng(6).normal(0.0, 0.1, (60, 200, 4)).astype(np.float32)
+    noise[49, 3, 1] = np.nan
+    blocks = [SoundBlock(samples, 200 * number, 0.0) for number, samples in enumerate(noise)]
+    sound = LiveSound(Scripted(*blocks[:45], blocks[44], *blocks[45:]))
+    told = [live.step.state.delivery.refused for live in live_steps(replace(source, sound=sound))]
+    assert told == [0, 0, 1, 2, 2, 2]
 
 
 def test_blocks_that_nobody_took_are_overruns():

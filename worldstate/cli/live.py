@@ -5,7 +5,8 @@ world-state; --help-all shows every option.
 
 States are kept where asked for. The sound is not, unless --keep-sound says so: microphones in public hear
 people. What the machine was too slow for is counted as an overrun, said when it happens, and heard as
-silence. Ctrl-C ends the run, and what it wrote is complete.
+silence. Ctrl-C ends the run, and what it wrote is complete. Snapshots, MCAP and sound grow under their own
+name, and read at any time: a killed run loses half a second. What was there before becomes NAME.1.SUFFIX.
 
 --detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
   {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
@@ -17,8 +18,11 @@ cameras of --car have an address each: NAME=HOST:PORT, repeated.
 with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. With it, or with the odometry of --car,
 the model of a moving ego is taken where --model names none.
 
---save-state keeps belief and site at the end, --resume goes on from them: from the time at which they end, or
-by --start from a later one.
+A port takes its first sender until that one is silent for ten seconds, or all of --allow. With --key, the
+file of a secret, a datagram ends in a line with its HMAC-SHA256 and has a "number" that rises.
+
+--save-state keeps belief and site every minute and at the end, --resume goes on from them: from the time at
+which they end, or by --start from a later one.
 
 Examples
 --------
@@ -33,7 +37,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,15 +50,19 @@ from worldstate.ground.errors import InvalidArgumentError
 if TYPE_CHECKING:
     from worldstate.adapters.listener import Listener
     from worldstate.adapters.live.live_listening import LiveStep
-    from worldstate.adapters.live.live_sensors import DatagramSocket
+    from worldstate.adapters.live.live_sensors import DatagramSocket, Trust
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
 
-    HandIn = Callable[[Listener], None]
+    HandIn = Callable[[Listener], int]
     Losses = Callable[[], dict[str, object]]
 
 
 # Lost sound is said at most so often.
 SAID_EVERY_NS = 1_000_000_000
+# What a killed run has learned of the site and the belief since is lost.
+SAVED_EVERY_NS = 60_000_000_000
+# Bytes of a secret: fewer are guessed.
+SHORTEST_KEY = 16
 # What a first user needs.
 FIRST_OPTIONS = (
     *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--device", "--play"),
@@ -78,6 +86,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     listening.add_memory_options(parser, "the end of STATE")
     told = "listen there to how the car moves"
     parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
+    add = parser.add_argument_group("ports").add_argument
+    told = "take datagrams of this address only; repeated (default: the first sender)"
+    add("--allow", action="append", default=[], metavar="HOST", help=told)
+    add("--key", type=Path, metavar="FILE", help="take datagrams only that prove to know this secret")
     group = parser.add_argument_group("camera")
     which = group.add_mutually_exclusive_group()
     which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
@@ -87,6 +99,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     sensors.add_detector_option(parser)
     add = exports.add_output_options(parser).add_argument
     add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
+    told = "begin a new JSONL and MCAP at so many MiB, and keep the one before as NAME.1.SUFFIX"
+    add("--rotate-mib", type=int, metavar="N", help=told)
     view = "show bearing, risk and entities (default: where standard error is a terminal)"
     add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
 
@@ -169,7 +183,7 @@ def _with_cameras(
     named = given.named()
     addresses = named or dict(zip([SENSOR], given.arguments.detections, strict=False))
     sockets = {
-        name: opened.enter_context(DetectionSocket(address, sound.stamp_ns))
+        name: opened.enter_context(DetectionSocket(address, sound.stamp_ns, _trust(given.arguments)))
         for name, address in addresses.items()
     }
     if named:
@@ -177,9 +191,8 @@ def _with_cameras(
     elif sockets:
         source = replace(source, detections=NO_LOOKS)
 
-    def hand_in(listener: "Listener") -> None:
-        for name, told in sockets.items():
-            told.deliver(partial(listener.look, camera=name))
+    def hand_in(listener: "Listener") -> int:
+        return sum(told.deliver(partial(listener.look, camera=name)) for name, told in sockets.items())
 
     return source, hand_in, _losses(sockets.values(), "detections")
 
@@ -197,7 +210,12 @@ def _with_device(
     looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
     opened.enter_context(CameraFeed(arguments.camera_device, images))
     seen = replace(source, detections=NO_LOOKS, degradation=looks.degradation)
-    return seen, lambda to: looks.deliver(to.look), lambda: {"images_dropped": images.dropped}
+
+    def losses() -> dict[str, object]:
+        refused, last = looks.refused, looks.problem or None
+        return {"images_dropped": images.dropped, "images_refused": refused, "last_refusal": last}
+
+    return seen, lambda to: looks.deliver(to.look), losses
 
 
 def _odometry(
@@ -207,13 +225,24 @@ def _odometry(
     from worldstate.adapters.live.live_sensors import OdometrySocket
 
     if arguments.odometry is None:
-        return lambda to: None, dict
-    told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns))
+        return lambda to: 0, dict
+    told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns, _trust(arguments)))
 
-    def hand_in(listener: "Listener") -> None:
-        told.deliver(lambda stamp_ns, record: listener.tell(record.at(stamp_ns)))
+    def hand_in(listener: "Listener") -> int:
+        return told.deliver(lambda stamp_ns, record: listener.tell(record.at(stamp_ns)))
 
     return hand_in, _losses([told], "odometry", "odometry_")
+
+
+def _trust(arguments: argparse.Namespace) -> "Trust":
+    from worldstate.adapters.files.file_io import read_bytes
+    from worldstate.adapters.live.live_sensors import Trust
+
+    key = None if arguments.key is None else read_bytes(arguments.key, "a secret", 1 << 12).strip()
+    if key is not None and len(key) < SHORTEST_KEY:
+        problem = f"expected a secret of at least {SHORTEST_KEY} bytes, got {len(key)}"
+        raise ground.InputFileError(arguments.key, problem)
+    return Trust(tuple(arguments.allow), key)
 
 
 def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
@@ -235,16 +264,17 @@ def _listen(
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
-    from worldstate.adapters.state_log import states_writer
+    from worldstate.adapters.state_log import growing_lines
     from worldstate.operations.recordings.recording_report import WarningMeter
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice = _loss_notices()
-    start_s, last = ground.seconds(source.start_ns), None
+    start_s = ground.seconds(source.start_ns)
     longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
-        states_writer(arguments.out) as write,
-        exports.exported_hops(arguments, source, given.car.crossing_m, paced=False) as export,
+        _kept(arguments) as keep,
+        growing_lines(arguments.out, exports.most_bytes(arguments)) as write,
+        exports.exported_hops(arguments, source, given.car.crossing_m, live=True) as export,
         _view(arguments) as show,
         command.stopped_by_signals(sound.close),
     ):
@@ -255,11 +285,9 @@ def _listen(
             latency.add(live.latency_s)
             show(live)
             notice(live)
-            last = live.step
-            if ground.seconds(last.state.stamp_ns) - start_s >= longest_s:
+            keep(live.step)
+            if ground.seconds(live.step.state.stamp_ns) - start_s >= longest_s:
                 break
-    if arguments.save_state is not None and last is not None:
-        adapters.save_checkpoint(arguments.save_state, last.checkpoint)
     return {
         "states": warnings.states,
         "sound_s": sound.frames / sound.sample_rate_hz,
@@ -272,6 +300,43 @@ def _listen(
         "peak_risk": warnings.peak_risk,
         "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
     }
+
+
+@contextmanager
+def _kept(arguments: argparse.Namespace) -> "Iterator[Callable[[adapters.Step], None]]":
+    """Lend a function that saves --save-state once a minute, and save it at the end, whatever ends the run.
+
+    The error that ends it says what was kept.
+    """
+    path, last, saved_ns = arguments.save_state, None, None
+
+    def save() -> None:
+        nonlocal saved_ns
+        if path is not None and last is not None:
+            adapters.save_checkpoint(path, last.checkpoint)
+            saved_ns = last.state.stamp_ns
+
+    def keep(step: "adapters.Step") -> None:
+        nonlocal last, saved_ns
+        last, stamp_ns = step, step.state.stamp_ns
+        saved_ns = stamp_ns if saved_ns is None else saved_ns
+        if stamp_ns - saved_ns >= SAVED_EVERY_NS:
+            save()
+
+    try:
+        yield keep
+    except (ground.WorldstateError, OSError) as error:
+        if last is None:
+            raise
+        until = f"the states up to {ground.seconds(last.state.stamp_ns):.1f} s"
+        with suppress(ground.WorldstateError, OSError):
+            save()
+            until += "" if path is None else f", and all of the belief in {path}"
+        raise ground.WorldstateError(f"{error}. Kept are {until}") from error
+    except BaseException:
+        save()
+        raise
+    save()
 
 
 @contextmanager

@@ -195,6 +195,10 @@ class WorldFilter:
         world = self._with(lag.latest, lag)
         return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)
 
+    def refused(self, inputs: int) -> "WorldFilter":
+        """Return the filter, whose `WorldState.delivery` counts so many more inputs refused before it."""
+        return self._with(self._memory, self._lag.counted(refused=inputs)) if inputs else self
+
     def _step(self, memory: Memory, measurement: Timed) -> Memory:
         """Return the memory after one more measurement, not earlier than the last one."""
         if memory is self._lag.latest and measurement.stamp_ns == self.stamp_ns:

@@ -63,6 +63,23 @@ class InputFileError(WorldstateError):
         return type(self), (self.path, self.problem)
 
 
+class OwnPartError(WorldstateError):
+    """A part that an installed package brings failed; the message names it and what it raised.
+
+    Examples
+    --------
+    >>> str(OwnPartError("mine:Detector", SystemExit(3)))
+    'mine:Detector: expected a part that works, got SystemExit: 3'
+    """
+
+    def __init__(self, part: str, error: BaseException) -> None:
+        super().__init__(f"{part}: expected a part that works, got {type(error).__name__}: {error}")
+        self.part, self.error = part, error
+
+    def __reduce__(self) -> tuple[type, tuple[str, BaseException]]:
+        return type(self), (self.part, self.error)
+
+
 class SchemaVersionError(InputFileError):
     """A file was written by another major version of its schema.
 

@@ -141,6 +141,8 @@ class Delivery:
         Boxes beyond the 64 of an image that count, of which moving ones and high scores go first.
     tracks_left_out : int
         Entities given up beyond the 128 likeliest.
+    refused : int
+        Inputs of a running source that were unreadable, impossible, late, repeated or of a stranger.
 
     Examples
     --------
@@ -155,3 +157,4 @@ class Delivery:
     held_back: Count = field(default=0, metadata=ADDED)
     boxes_left_out: Count = field(default=0, metadata=ADDED)
     tracks_left_out: Count = field(default=0, metadata=ADDED)
+    refused: Count = field(default=0, metadata=ADDED)

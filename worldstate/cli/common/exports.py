@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate import adapters
+from worldstate.ground import in_range
 from worldstate.ground.errors import InvalidArgumentError
 
 from .inputs import describe
@@ -96,24 +97,38 @@ class Exports:
 
 @contextmanager
 def open_exports(
-    arguments: argparse.Namespace, *, crossing_m: float = CROSSING_M, paced: bool = True
+    arguments: argparse.Namespace, *, crossing_m: float = CROSSING_M, live: bool = False
 ) -> Iterator[Exports]:
-    """Open everything that was asked for; `paced` plays what comes too soon at the speed of its stamps."""
+    """Open everything that was asked for.
+
+    What comes too soon is played at the speed of its stamps, and files take their name at the end; not so of
+    a `live` run, which sets the pace and has no end.
+    """
     with ExitStack() as opened:
         exports = Exports()
         for name, target in _asked(arguments):
             if name in _VIEWERS:
-                exports.viewers.append(opened.enter_context(_viewer(name, target, paced)))
+                exports.viewers.append(
+                    opened.enter_context(_viewer(name, target, live, most_bytes(arguments)))
+                )
             else:
                 exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m)))
         yield exports
 
 
-def _viewer(name: str, target: str, paced: bool) -> "AbstractContextManager[LogSink]":
-    from worldstate.adapters.export.log_messages import mcap_file, rerun_file
+def most_bytes(arguments: argparse.Namespace) -> int | None:
+    """Return when a log is full, by --rotate-mib where the command has it."""
+    most_mib: int | None = getattr(arguments, "rotate_mib", None)
+    return None if most_mib is None else int(in_range("--rotate-mib", most_mib, 1, 1 << 30)) << 20
+
+
+def _viewer(name: str, target: str, live: bool, full: int | None) -> "AbstractContextManager[LogSink]":
+    from worldstate.adapters.export.log_messages import growing_mcap, mcap_file, rerun_file
 
     if name == "foxglove":
-        return _websocket(target, paced)
+        return _websocket(target, paced=not live)
+    if name == "mcap" and live:
+        return growing_mcap(Path(target), full)
     return mcap_file(Path(target)) if name == "mcap" else rerun_file(Path(target))
 
 
@@ -130,7 +145,7 @@ def _websocket(port: str, paced: bool) -> "Iterator[LogSink]":
 
 def _stack(name: str, target: str, crossing_m: float) -> "Stack":
     from worldstate.adapters.export import other_stacks
-    from worldstate.adapters.own_parts import ExporterPart, load_part
+    from worldstate.adapters.own_parts import ExporterPart, load_part, own_exporter
     from worldstate.adapters.ros.bag_writer import state_bag
 
     own: dict[str, ExporterPart] = {
@@ -140,17 +155,18 @@ def _stack(name: str, target: str, crossing_m: float) -> "Stack":
         "rosbag": lambda path: state_bag(Path(path), crossing_m),
         "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),
     }
-    export = own.get(name) or load_part("worldstate.exporters", name, "--export", EXPORTERS)
-    opened: Stack = export(target)
-    return opened
+    if name in own:
+        opened: Stack = own[name](target)
+        return opened
+    return own_exporter(name, load_part("worldstate.exporters", name, "--export", EXPORTERS), target)
 
 
 @contextmanager
 def exported_hops(
-    arguments: argparse.Namespace, source: "adapters.Source", crossing_m: float, *, paced: bool = True
+    arguments: argparse.Namespace, source: "adapters.Source", crossing_m: float, *, live: bool = False
 ) -> "Iterator[Callable[[adapters.Step], None]]":
     """Lend a function that exports a hop of a recording: state, power over azimuth, the camera's image."""
-    with open_exports(arguments, crossing_m=crossing_m, paced=paced) as exports:
+    with open_exports(arguments, crossing_m=crossing_m, live=live) as exports:
         if not exports.viewers:
             yield lambda step: exports.state(step.state)
             return

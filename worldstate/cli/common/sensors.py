@@ -210,7 +210,7 @@ def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetect
     InvalidArgumentError
         If no package brings a detector of that name.
     """
-    from worldstate.adapters.own_parts import DetectorPart, load_part
+    from worldstate.adapters.own_parts import DetectorPart, OwnDetector, load_part
 
     if name.endswith(".onnx"):
         make = partial(_opened, Path(name), labels)
@@ -219,7 +219,7 @@ def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetect
     if name not in MOVING:
         known = (*MOVING, "FILE.onnx")
         make_own: DetectorPart = load_part("worldstate.detectors", name, "--detector", known)
-        return make_own
+        return partial(OwnDetector.of, name, make_own)
     return partial(adapters.MotionDetector, "knn" if name == "knn" else "mog2")
 
 

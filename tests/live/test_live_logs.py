@@ -1,0 +1,201 @@
+"""Logs of a run that does not end: under their own name, and readable whatever ends it."""
+
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.export.log_messages import growing_mcap, state_messages
+from worldstate.adapters.files.checkpoint_file import read_checkpoint
+from worldstate.adapters.files.file_io import GrowingFile
+from worldstate.adapters.state_log import growing_lines, read_log
+from worldstate.cli import live
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError, WorldstateError
+from worldstate.state import WorldState
+
+RATE = 8_000
+NAMES = "states.jsonl", "states.mcap", "kept.wav", "belief.json"
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("street")
+    noise = np.random.default_rng(4).normal(0.0, 0.1, (2 * RATE, 4)).astype(np.float32)
+    soundfile.write(folder / "street.wav", noise, RATE, subtype="PCM_24")
+    (folder / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    return folder
+
+
+def words(street, folder, *more):
+    states, mcap, sound, belief = (str(folder / name) for name in NAMES)
+    play = "--play", str(street / "street.wav"), "--array", str(street / "mics.csv"), "--uncalibrated"
+    out = "--out", states, "--export", f"mcap={mcap}", "--keep-sound", sound, "--save-state", belief
+    return ["live", *play, *out, *map(str, more)]
+
+
+def last_s(path):
+    return [state.stamp_ns / 1e9 for _, state in read_log(path)][-1]
+
+
+def killed(street, folder, after_states, wait_s):
+    """Kill a run some time after it has written so many states; return when the last one was."""
+    script = [sys.executable, "-m", "worldstate", *words(street, folder, "--duration", 600, "--speed", 3)]
+    states = folder / "states.jsonl"
+    with subprocess.Popen(script, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        until_s = time.monotonic() + 60.0
+        while time.monotonic() < until_s and process.poll() is None:
+            if states.exists() and states.read_bytes().count(b"\n") >= after_states:
+                break
+            time.sleep(0.01)
+        time.sleep(wait_s)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL, process.stderr.read()
+    return json.loads(states.read_bytes().split(b"\n")[-2])["stamp_ns"] / 1e9
+
+
+def check_killed(street, folder, seed):
+    folder.mkdir(exist_ok=True)
+    rng = random.Random(seed)
+    written_s = killed(street, folder, rng.randint(15, 60), rng.uniform(0.0, 0.1))
+    assert last_s(folder / "states.jsonl") == written_s
+    assert last_s(folder / "states.mcap") > written_s - 1.0
+    heard, _ = soundfile.read(folder / "kept.wav")
+    assert len(heard) / RATE > written_s - 1.0
+    for name in NAMES[:2]:
+        assert main(["log", "replay", str(folder / name), "--out", str(folder / "again.jsonl")]) == 0
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_a_killed_run_leaves_what_it_wrote(street, tmp_path):
+    for seed in (1, 2):
+        check_killed(street, tmp_path / str(seed), seed)
+
+
+@pytest.mark.slow
+def test_a_run_killed_at_twenty_moments_leaves_what_it_wrote(street, tmp_path):
+    for seed in range(20):
+        check_killed(street, tmp_path / str(seed), seed)
+
+
+@pytest.mark.parametrize("name", NAMES[:3])
+def test_a_full_disk_ends_the_run_and_says_what_was_kept(street, tmp_path, name):
+    # A file may not grow above this, which the kernel says as it says that a disk is full.
+    room = {"states.jsonl": 60_000, "states.mcap": 40_000, "kept.wav": 200_000}
+    alone = {"states.jsonl": "--out", "states.mcap": "--export", "kept.wav": "--keep-sound"}[name]
+    target = f"mcap={tmp_path / name}" if name == "states.mcap" else str(tmp_path / name)
+    command = words(street, tmp_path, "--duration", 60, "--speed", 20)[:6]
+    script = [sys.executable, "-m", "worldstate", *command, alone, target]
+    if name == "kept.wav":
+        script += ["--out", str(tmp_path / "states.jsonl")]
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room[name], room[name]))
+
+    done = subprocess.run(
+        [*script, "--duration", "60", "--speed", "20"],
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        env=os.environ,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    said = done.stderr.splitlines()[-1]
+    assert name in said
+    kept_s = float(said.split("Kept are the states up to ")[1].split(" s")[0])
+    if name == "kept.wav":
+        assert len(soundfile.read(tmp_path / name)[0]) / RATE > kept_s - 1.0
+    else:
+        assert last_s(tmp_path / name) > kept_s - 1.0
+
+
+def test_the_belief_is_kept_every_minute_and_at_an_error(street, tmp_path, monkeypatch):
+    belief = tmp_path / "belief.json"
+    monkeypatch.setattr(live, "SAVED_EVERY_NS", 500_000_000)
+    seen = []
+
+    def show(step):
+        if belief.exists():
+            seen.append((step.step.state.stamp_ns, read_checkpoint(belief).world.stamp_ns))
+        if step.step.state.stamp_ns >= 1_600_000_000:
+            raise InputFileError("viewer", "full")
+
+    monkeypatch.setattr("worldstate.cli.common.live_view.view_of", show)
+    assert main(words(street, tmp_path, "--speed", 10, "--view")) == 2
+    assert seen
+    assert all(0 < now_ns - saved_ns <= 500_000_000 for now_ns, saved_ns in seen)
+    assert read_checkpoint(belief).world.stamp_ns >= 1_500_000_000
+
+
+def test_a_log_that_is_full_goes_on_in_a_new_file(tmp_path):
+    path = tmp_path / "log.jsonl"
+    with growing_lines(path, 100) as write:
+        for number in range(60):
+            write(f'{{"number": {number:>10}}}')
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["log.1.jsonl", "log.jsonl"]
+    assert max(one.stat().st_size for one in tmp_path.iterdir()) < 150
+    lines = [*(tmp_path / "log.1.jsonl").read_text().splitlines(), *path.read_text().splitlines()]
+    assert [json.loads(line)["number"] for line in lines] == list(range(60 - len(lines), 60))
+
+
+def test_a_log_that_was_there_is_kept(tmp_path):
+    path = tmp_path / "log.jsonl"
+    path.write_text("of the run before\n")
+    with GrowingFile(path) as log:
+        log.write(b"now\n")
+    assert (tmp_path / "log.1.jsonl").read_text() == "of the run before\n"
+    assert path.read_text() == "now\n"
+
+
+def test_a_full_mcap_goes_on_in_a_new_file(street, tmp_path, monkeypatch):
+    monkeypatch.setattr("worldstate.cli.common.exports.most_bytes", lambda arguments: 30_000)
+    assert main(words(street, tmp_path, "--speed", 20, "--duration", 8)) == 0
+    for suffix in ("mcap", "jsonl"):
+        before = [state.stamp_ns for _, state in read_log(tmp_path / f"states.1.{suffix}")]
+        after = [state.stamp_ns for _, state in read_log(tmp_path / f"states.{suffix}")]
+        assert after[0] - before[-1] == 100_000_000
+        assert after[-1] == 8_000_000_000
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+def test_an_mcap_that_was_cut_short_reads_up_to_there(street, tmp_path, share):
+    assert main(words(street, tmp_path, "--speed", 50, "--duration", 4)) == 0
+    whole = (tmp_path / "states.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    full = [line for line, _ in read_log(tmp_path / "states.mcap")]
+    try:
+        read = [line for line, _ in read_log(cut)]
+    except InputFileError:
+        assert share < 0.2
+    else:
+        assert read == full[: len(read)]
+
+
+def test_a_damaged_mcap_is_read_or_refused(tmp_path):
+    path, rng = tmp_path / "a.mcap", random.Random(0)
+    with growing_mcap(path) as write:
+        for number in range(30):
+            for message in state_messages(WorldState(0, number * 100_000_000)):
+                write(message)
+    whole, refused = path.read_bytes(), 0
+    for _ in range(100):
+        damaged = bytearray(whole)
+        for _ in range(rng.randint(1, 5)):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        path.write_bytes(damaged)
+        try:
+            list(read_log(path))
+        except WorldstateError:
+            refused += 1
+    assert 20 < refused < 100
