@@ -225,7 +225,7 @@ def growing_mcap(path: Path, most_bytes: int | None = None) -> Iterator[LogSink]
             messages.finish()
 
 
-# In an unfinished file chunks that are whole are read: what a killed run loses is at most so much of its stream.
+# Whole chunks of an unfinished file are read: a killed run loses at most so much of its stream.
 _CHUNK_NS = nanoseconds(0.5)
 _CHUNK_BYTES = 1 << 20
 
