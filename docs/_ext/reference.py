@@ -1,11 +1,13 @@
-"""The API reference, written from what the packages export: a page a package, an entry a name.
+"""The reference: of the packages a page each, of what they export; of the command a page of every help.
 
 A name that several packages export has its entry where it is most at home, and a link elsewhere.
 """
 
+import argparse
 import importlib
 import inspect
 import pkgutil
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from types import UnionType
@@ -109,6 +111,21 @@ def page(package: str, names: list[str], home: dict[str, str]) -> str:
     return "\n".join([*lines, "", *entries]) + "\n"
 
 
+def command_line() -> str:
+    """Return the reST of the command line: every command with its whole help, group by group."""
+    from worldstate.cli.main import PROGRAM
+
+    title = "The command line"
+    lines = [title, "=" * len(title), "", "What every command keeps to is told in :doc:`/commands`.", ""]
+    for group in ("", *PROGRAM.groups):
+        for name in PROGRAM.members(group):
+            words = f"{group} {name}".strip()
+            head = f"worldstate {words}"
+            told = argparse.ArgumentParser.format_help(PROGRAM.parser(words))
+            lines += [head, "-" * len(head), "", "::", "", textwrap.indent(told.rstrip(), "   "), ""]
+    return "\n".join(lines)
+
+
 def write(app: "Sphinx") -> None:
     """Write the pages below reference/, touching none that has not changed."""
     folder = Path(app.srcdir) / "reference"
@@ -117,10 +134,11 @@ def write(app: "Sphinx") -> None:
     home = homes(exported)
     app.reference_homes = home  # type: ignore[attr-defined]
     pages = {f"{package}.rst": page(package, names, home) for package, names in exported.items()}
+    pages["command_line.rst"] = command_line()
     toc = "\n".join(f"   {name.removesuffix('.rst')}" for name in pages)
     total = len(home)
     pages["index.rst"] = (
-        "API reference\n=============\n\n"
+        "Reference\n=========\n\n"
         f"{total} names, each with an example that runs as a test. An embedder needs those of "
         ":py:mod:`worldstate` and little else.\n\n.. toctree::\n   :maxdepth: 1\n\n" + toc + "\n"
     )
