@@ -98,7 +98,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     road_users : RoadUserModel, optional
         Tells which kind of road user is heard; the camera is asked for such.
     sequence : SequenceReader or NotUsable, optional
-        Reads from seconds of the model's evidence who comes into view, and when; or why nothing does.
+        Reads from seconds of evidence which sides a vehicle comes from, and when; or why nothing does.
     uncalibrated : bool
         Go on with another array, rate or band than the model was made for. Give the filter a policy of
         alpha 0 then, which states no budget.

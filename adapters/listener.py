@@ -336,7 +336,7 @@ def listened(source: Source) -> Iterator[tuple[Listener, Float32Array | None]]:
 
 
 def learn_passes(street: StreetListener | None, state: WorldState) -> None:
-    """Tell a street who has just come into view out of which of its arms."""
+    """Tell a street out of which of its arms a vehicle has just come into view."""
     if street is None:
         return
     arms = {one.id: one.direction for one in state.entities}

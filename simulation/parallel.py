@@ -47,7 +47,7 @@ def in_processes(
         except BrokenProcessPool as error:
             raise WorldstateError("a process ended before its work was done: out of memory?") from error
         except BaseException:
-            # An error, Ctrl-C or SIGTERM: nobody waits for what the workers are at.
+            # An error, Ctrl-C or SIGTERM: nothing waits for what the workers are at.
             for worker in set(multiprocessing.active_children()) - others:
                 worker.terminate()
             raise
@@ -65,7 +65,7 @@ def _terminate(number: int, frame: object) -> None:
 
 
 def _end_with_parent() -> None:
-    # After a SIGKILL nobody tells the workers: they would wait for work until the machine is switched off.
+    # After a SIGKILL nothing tells the workers: they would wait for work until the machine is switched off.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

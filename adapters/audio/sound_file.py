@@ -332,7 +332,7 @@ class SoundStream(ABC):
 
     @property
     def start_ns(self) -> int:
-        """Time of the first sample on the clock of whoever recorded it; 0 where nothing tells."""
+        """Time of the first sample on the clock of the recorder; 0 where nothing tells."""
         return 0
 
     @abstractmethod

@@ -69,7 +69,7 @@ def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[
     moving = (part for one in state.entities if one.moving for part in one.on_each_side())
     for entity in moving:
         hidden, within = entity.status == "hidden", coming.get(entity.direction or "")
-        # That somebody comes into view is said given all that was heard, so of one that exists it is more.
+        # That a vehicle comes into view is said given all that was heard, so of one that exists it is more.
         given = within / max(entity.existence_probability, 1e-6) if hidden and within is not None else 1.0
         if entity.position_m is None:
             yield _assumed(entity, crossing_m, paces.get(entity.direction or "", 0.0), min(given, 1.0))
@@ -111,7 +111,7 @@ SIZES_M = {
     7: (0.5, 0.5, 1.8),
 }
 CAR_M = (4.5, 1.8, 1.5)
-# Of what the message asks for and nobody measured: "unknown" as Autoware's trackers state it.
+# Of what the message asks for and was not measured: "unknown" as Autoware's trackers state it.
 _UNKNOWN_VARIANCE = 1e4
 
 
@@ -279,7 +279,7 @@ class OdasTracks:
     """
 
     def __init__(self) -> None:
-        # Of who is there now: a long run has more entities than memory should hold.
+        # Of what is there now: a long run has more entities than memory should hold.
         self._numbers: dict[str, int] = {}
         self._next = count(1)
 

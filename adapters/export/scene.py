@@ -254,7 +254,7 @@ def sector_of(
 
 
 def hidden_sector(occluder: Occluder) -> tuple[float, float]:
-    """Return where behind an occluder's edge somebody is in nine of ten cases, from right to left."""
+    """Return where behind an occluder's edge a vehicle is in nine of ten cases, from right to left."""
     edge_rad, hidden_rad = occluder.edge_azimuth_rad, occluder.hidden_azimuth_rad
     far_rad = hidden_rad + math.copysign(NINE_OF_TEN * occluder.hidden_std_rad, hidden_rad - edge_rad)
     return min(edge_rad, far_rad), max(edge_rad, far_rad)

@@ -70,7 +70,7 @@ def read_context(path: str | Path) -> Context:
     ``{"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}``: the corner that
     hides an arm (x ahead, y to the left of the ego, metres) and the distance ahead of the lane in which
     vehicles come from there; optional ``"speed_mps"`` of these and ``"corner_std_m"``. An arm with
-    ``"open": true`` in their place hides nobody. Beside the arms ``"rates"`` and ``"priors"`` as `Rates` and
+    ``"open": true`` in their place hides nothing. Beside the arms ``"rates"`` and ``"priors"`` as `Rates` and
     `Priors` name them, ``"ego_speed_mps"``, ``"site"`` and ``"view_half_angle_deg"``.
 
     Parameters

@@ -73,7 +73,7 @@ class Model:
     provenance : Provenance
         Where it comes from.
     sequence : SequenceModel, optional
-        From seconds of the signature's evidence to who comes into view, and when.
+        From seconds of the signature's evidence to the sides a vehicle comes from, and when.
 
     Examples
     --------

@@ -24,7 +24,7 @@ T = TypeVar("T")
 class BoundedChannel(Generic[T]):
     """Queue of limited length between two threads.
 
-    A sensor cannot wait: when nobody takes what it gives, the oldest item makes room for the newest, because
+    A sensor cannot wait: when what it gives is not taken, the oldest item makes room for the newest, because
     the state is about now. Every item lost is counted.
 
     Parameters
@@ -35,7 +35,7 @@ class BoundedChannel(Generic[T]):
     Attributes
     ----------
     dropped : int
-        Items that were lost because nobody took them in time.
+        Items that were lost because they were not taken in time.
 
     Raises
     ------
@@ -96,7 +96,7 @@ class BoundedChannel(Generic[T]):
             return taken
 
     def close(self, error: BaseException | None = None) -> None:
-        """Say that nothing more comes; an error is raised at whoever takes, once nothing waits."""
+        """Say that nothing more comes; an error is raised where it is taken, once nothing waits."""
         with self._changed:
             self._closed = True
             self._error = self._error or error

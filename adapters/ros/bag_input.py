@@ -364,7 +364,7 @@ def read_bag(path: Path, topics: BagTopics | None = None) -> BagInput:
 
 
 def needed_array(path: Path, array: MicrophoneArray | None) -> MicrophoneArray:
-    """Return the array; refuse a bag of which nobody says where its microphones are."""
+    """Return the array; refuse a bag that does not say where its microphones are."""
     if array is None:
         raise InputFileError(path, f"expected --array, or a message of {ARRAY} in the bag")
     return array

@@ -85,7 +85,7 @@ class RadioSignature:
     """Likelihood of a beacon under every explanation.
 
     The excess loss over free space is Gaussian: about `corner_loss_db` behind a corner, about zero in plain
-    view. Where nobody is, the beacon is a ghost, replayed or forged: its power goes with its claim only by
+    view. Without a vehicle the beacon is a ghost, replayed or forged: its power goes with its claim only by
     chance and spreads over `ghost_range_db`, its azimuth over the half-plane ahead. The claimed azimuth of a
     vehicle is that of an occluded approach, or of the view. How rare ghosts are is a matter of the context's
     rates and not of any one beacon.

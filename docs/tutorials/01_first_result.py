@@ -13,13 +13,13 @@ COLOURS = {"left": BLUE, "right": RED}
 
 
 def chance(state: WorldState, side: str) -> float:
-    """Return the probability that somebody comes into view from a side within three seconds."""
+    """Return the probability that a vehicle comes into view from a side within three seconds."""
     (cue,) = (one for one in state.cues if one.direction == side)
     return float("nan") if cue.within is None else cue.within["3"]
 
 
 def main(out: Path, size: str = "full") -> None:
-    """Draw two approaches and two recordings in which nobody comes; one of each kind if size == "small"."""
+    """Draw two approaches and two recordings without a vehicle; one of each kind if size == "small"."""
     # Sound up to 2 kHz is all that the front-end reads, at an eighth of the samples.
     settings = DatasetSettings(n_static=2 if size == "small" else 4, seed=1, bandwidth_hz=2000.0)
     with TemporaryDirectory() as root, figure_file(out / "01_first_result.png", 8.0, 4.2) as figure:
@@ -35,7 +35,7 @@ def main(out: Path, size: str = "full") -> None:
                 on = [any(c.advisory and c.direction == side for c in state.cues) for state in states]
                 warned += [f"{side} at {time_s[on.index(True)]:.1f} s"] if any(on) else []
                 axes.fill_between(time_s, 0.0, 1.0, where=on, color=colour, alpha=0.12, linewidth=0)
-            came = f"from the {row.approach}" if row.approach != "none" else "nobody comes"
+            came = f"from the {row.approach}" if row.approach != "none" else "no vehicle comes"
             if row.approach != "none" and t0_s is not None:
                 axes.axvline(t0_s, color="black", linestyle=":")
                 came += f", in view at {t0_s:.1f} s"

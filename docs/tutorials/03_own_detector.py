@@ -50,7 +50,7 @@ def main(out: Path, size: str = "full") -> None:
             beta.plot(LEVELS, missed, label=f"{degrees:.0f} degrees off the axis")
             worth.plot(LEVELS, [abduce(EVEN, HEARD, Absent(one)).hidden_total for one in missed])
             print(f"{degrees:.0f} degrees: misses {missed[0]:.2f} of clear looks, {missed[-1]:.2f} at d = 1")
-        worth.axhline(abduce(EVEN, HEARD, Unqueried("")).hidden_total, color="k", label="nobody looked")
+        worth.axhline(abduce(EVEN, HEARD, Unqueried("")).hidden_total, color="k", label="no look")
         beta.set(ylim=(0, 1), xlabel="degradation d (noise)", ylabel="miss rate")
         worth.set(ylim=(0, 1), xlabel="degradation d (noise)", ylabel="P(hidden) after an empty look")
         _ = beta.legend(), worth.legend()

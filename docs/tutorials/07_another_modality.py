@@ -37,7 +37,7 @@ def follow(light: bool, radio: bool, way_m: np.ndarray, glow: np.ndarray) -> lis
 
 
 def main(out: Path, size: str = "full") -> None:
-    """Draw who is believed hidden on the left, and when they are said to come into view."""
+    """Draw which vehicles are believed hidden on the left, and when they are said to come into view."""
     time_s = np.arange(1, 31 if size == "small" else 51) / 10.0
     way_m = EDGE_M + SPEED_MPS * (time_s[-1] - 0.5 - time_s)
     glow = np.random.default_rng(1).normal(size=time_s.size) + 3.0 * (way_m > EDGE_M) * np.exp(-way_m / 40.0)

@@ -20,7 +20,7 @@ def deliveries(measured: list[Measurement], rng: np.random.Generator) -> list[tu
 
 
 def chance(state: WorldState) -> float:
-    """Return the larger chance of both sides that somebody comes into view within three seconds."""
+    """Return the larger chance of both sides that a vehicle comes into view within three seconds."""
     return max(np.nan if cue.within is None else cue.within["3"] for cue in state.cues)
 
 

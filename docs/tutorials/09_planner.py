@@ -1,4 +1,4 @@
-"""Read the state in a planner: brake at a blind corner only while the state says that somebody may come."""
+"""Read the state in a planner: brake at a blind corner only while the state says that a vehicle may come."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -48,7 +48,7 @@ RAISED = """\
 time  1.00 s
 left: advisory raised: not below the threshold now
   since 0.70 s, valid until 2.00 s, rests on acoustic (working), camera (working)
-  log-odds that somebody comes into view within 3 s, nats:
+  log-odds that a vehicle comes into view within 3 s, nats:
     at, s                     0.70          1.00
     prior                    -0.41         -0.41
     sequence                 +2.79         +2.79
@@ -61,13 +61,13 @@ left: advisory raised: not below the threshold now
   entity: f8eadf57 hidden at +56 deg (std 7), exists with 0.97, by acoustic; the last look did not find it
 sensor acoustic: working
 sensor camera: working
-look of camera at 1.00 s: nobody from -34 to 34 deg, misses 0.10
+look of camera at 1.00 s: nothing from -34 to 34 deg, misses 0.10
 """
 HELD = """\
 time  1.40 s
 left: advisory held: below the threshold now, it ends without news
   since 0.70 s, valid until 2.10 s, rests on acoustic (impaired), camera (working)
-  log-odds that somebody comes into view within 3 s, nats:
+  log-odds that a vehicle comes into view within 3 s, nats:
     at, s                     0.70          1.40
     prior                    -0.41         -0.41
     sequence                 +2.79         -1.24
@@ -81,7 +81,7 @@ left: advisory held: below the threshold now, it ends without news
 sound: sounds like speech: the evidence of this hop counts little
 sensor acoustic: impaired (sounds like speech)
 sensor camera: working
-look of camera at 1.40 s: nobody from -34 to 34 deg, misses 0.10
+look of camera at 1.40 s: nothing from -34 to 34 deg, misses 0.10
 """
 
 

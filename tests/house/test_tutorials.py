@@ -12,7 +12,7 @@ SCRIPTS = sorted(FOLDER.glob("[0-9]*.py"))
 LONGEST = 60
 # What each prints where it says what it is for, small and in full.
 SAYS = {
-    "01_first_result": r"SA1, from the left.*advisory left.*\n.*nobody comes; advisory none",
+    "01_first_result": r"SA1, from the left.*advisory left.*\n.*no vehicle comes; advisory none",
     "02_own_array": r"line of 8 across: cannot tell cone",
     "03_own_detector": r"30 degrees: misses 0\.[1-9]",
     "04_commission": r"fit for use: False.*onsets_per_hour=20\.0",

@@ -17,9 +17,9 @@ _SAID = {
     "below": "none: below the threshold",
 }
 _OF = {
-    "coming": "somebody comes into view within 3 s",
-    "hidden": "somebody is hidden on any side, by this window alone",
-    "announced": "somebody is hidden, by messages alone",
+    "coming": "a vehicle comes into view within 3 s",
+    "hidden": "a vehicle is hidden on any side, by this window alone",
+    "announced": "a vehicle is hidden, by messages alone",
 }
 
 
@@ -159,7 +159,7 @@ def common_lines(state: WorldState) -> Iterator[str]:
         yield f"sensor {one.sensor}: {one.condition}{f' ({one.reason})' if one.reason else ''}"
     for view in state.searched:
         right, left = (f"{math.degrees(end_rad):.0f}" for end_rad in view.sector_rad)
-        found = f"{'somebody' if view.found else 'nobody'} from {right} to {left} deg"
+        found = f"{'something' if view.found else 'nothing'} from {right} to {left} deg"
         yield f"look of {view.sensor} at {seconds(view.stamp_ns):.2f} s: {found}, misses {view.miss_rate:.2f}"
     for event in state.events:
         yield f"event: {event.entity_id[:8]} {event.kind.replace('_', ' ')}"

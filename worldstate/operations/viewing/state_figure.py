@@ -202,7 +202,7 @@ def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
     rows = [(seconds(state.stamp_ns), *_existence(state, _sides(states))) for state in states]
     time_s, *columns = style.with_gaps(np.array(rows)).T
     for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
-        axes.plot(time_s, column, color=color, label=f"somebody hidden, {side}")
+        axes.plot(time_s, column, color=color, label=f"vehicle hidden, {side}")
     axes.plot(time_s, columns[-1], color=style.BLUE, ls=":", label="the likeliest in view")
     axes.set(ylabel="existence\nprobability", ylim=(-0.02, 1.02))
 
