@@ -37,6 +37,22 @@ def test_all_names_together_can_be_learned():
     assert sum(map(len, reference.exports().values())) <= 250
 
 
+def test_a_vehicle_is_not_who():
+    folders = ("abduction", "adapters", "frontend", "simulation", "worldstate", "lab/worldstate_lab", "docs")
+    texts = [path for name in folders for path in (ROOT / name).rglob("*") if path.suffix in (".py", ".md")]
+    words = re.compile(r"\b(who|whoever|whom|somebody|nobody|anybody)\b", re.IGNORECASE)
+    # What is left speaks of people: children who call, engineers who build.
+    counted = [f"{path.name}: {word}" for path in texts for word in words.findall(path.read_text("utf-8"))]
+    assert len(counted) <= 20, counted
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_lines_of_a_page_can_be_read_as_text(page):
+    """Prose within 140 characters; tables and commands are as long as they are."""
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if len(line) > 140 and not line.startswith(("|", "    "))] == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_objects_that_a_page_links_are_exported(page):
     linked = re.findall(r"\{py:obj\}`([\w.]+)`", page.read_text(encoding="utf-8"))

@@ -2,7 +2,7 @@
 
 A simulated car nears blind corners in a closed loop while the states of recorded streams are replayed; their
 vehicles cross as they did and do not mind it. Three planners drive the same car under the same stopping law:
-one knows nothing and brakes for whom it sees, one assumes a vehicle behind both corners at every time, and
+one knows nothing and brakes for what it sees, one assumes a vehicle behind both corners at every time, and
 one assumes it only from a chance of the state on, which is set on streams of other seeds (`--set-on`).
 Printed are collisions, braking that no vehicle made necessary, and time.
 
