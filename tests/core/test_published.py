@@ -152,6 +152,7 @@ def states() -> Iterator[WorldState]:
             world = world.update(one)
             yield world.state
         yield world.predict(2.0).state
+        yield world.refused(3).state
     # A camera watches the budget, finds it broken, and one that comes is no longer warned of.
     world = WorldFilter(start_ns=WATCHED_NS)
     for one in (*false_alarms(), *arrival(500, level=2.0)):
