@@ -2,10 +2,14 @@
 
 import heapq
 from bisect import insort
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import copy, deepcopy
+from dataclasses import dataclass, replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Unpack
+
+import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
@@ -13,10 +17,12 @@ from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
-from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras
+from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras, VisionQuery
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.fixed_lag import Timed
-from worldstate.frontend.stream import AcousticFrame
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.ground import InvalidArgumentError
 from worldstate.ground.checks import one_of
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.measurement import Measurement
@@ -24,8 +30,10 @@ from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
 from .own_parts import OtherModality
-from .source import Source, SourceParts, open_source
+from .source import ListenerParts, Source, SourceParts, open_source
 
+# Stands for the file where sound is pushed.
+PUSHED = "pushed sound"
 # Half a hop.
 PARTS_PER_SECOND = 20
 
@@ -69,15 +77,40 @@ class Step:
         return self.checkpoint.world.state
 
 
+@dataclass(frozen=True, slots=True)
+class Senses:
+    """What ears and eyes remember between two samples.
+
+    Parameters
+    ----------
+    ears : FrontEnd
+        The sound of the last window, and what the channels' health is judged by.
+    eyes : mapping of str to VisionQuery
+        The last images of each camera, by its name.
+    """
+
+    ears: FrontEnd
+    eyes: Mapping[str, VisionQuery]
+
+
 class Listener:
     """Blocks of sound in, one world-state a hop (0.1 s) out; the same to the bit for blocks of any length.
 
     Parameters
     ----------
-    source : Source
-        From `open_source`: array, model, camera, context, and what is gone on from. Its sound is not opened.
+    array : MicrophoneArray, path or Source
+        What hears: positions, or a file of them as `read_array` takes it. A `Source` from `open_source` has
+        all of the parts below; its sound is not opened.
     sample_rate_hz : float
         Of the blocks.
+    start_s : float, optional
+        Time of the first sample on the clock of the states; 0 where not given, or with a checkpoint of
+        another listener its last sample.
+    **parts
+        As `open_source` takes them: `model`, `camera`, `miss_rates`, `context`, `sides`, `moving_ego`,
+        `settings`, and `resume`, a `Checkpoint` or a file of one. The checkpoint of a listener goes on at the
+        next sample. One of a file holds no sound: begin a second or more before it with `start_s`; what is
+        heard up to its time fills the windows.
 
     Attributes
     ----------
@@ -87,19 +120,33 @@ class Listener:
     Raises
     ------
     InvalidArgumentError, OutOfDomainError
-        As `AcousticAdapter`.
+        As `open_source`; or if the checkpoint is that of a listener with another array, rate or search.
 
     Examples
     --------
     >>> from worldstate.frontend.array.microphone_array import ovad_array
     >>> import numpy as np
     >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
-    >>> listener = Listener(open_source("microphones", array=ovad_array()), 48_000)
+    >>> listener = Listener(ovad_array(), 48_000)
     >>> [state.stamp_ns / 1e9 for block in np.split(noise, 100) for state in listener.push(block)]
     [1.0, 1.1, 1.2]
     """
 
-    def __init__(self, source: Source, sample_rate_hz: float) -> None:
+    def __init__(
+        self,
+        array: MicrophoneArray | Path | str | Source,
+        sample_rate_hz: float,
+        *,
+        start_s: float | None = None,
+        **parts: Unpack[ListenerParts],
+    ) -> None:
+        if not isinstance(array, Source):
+            source = open_source(PUSHED, array=array, start_s=start_s or 0.0, **parts)
+        elif parts or start_s is not None:
+            given = ", ".join(parts) or "start_s"
+            raise InvalidArgumentError(f"{given}: expected nothing beside a source, which has all of it")
+        else:
+            source = array
         self.world = source.world()
         self._source, self._rate_hz = source, sample_rate_hz
         self._signature, self._reader = source.signature(), source.reader()
@@ -121,6 +168,25 @@ class Listener:
         self._since_ns = source.start_ns - 1 if source.before is None else self.world.stamp_ns
         self._waiting = _Waiting(source.others, self._since_ns)
         self._part = max(int(sample_rate_hz / PARTS_PER_SECOND), 1)
+        senses = None if source.before is None else source.before.senses
+        if isinstance(senses, Senses) and start_s is None:
+            self._go_on(senses)
+
+    def _go_on(self, senses: Senses) -> None:
+        """Hear and see on with the windows of another listener."""
+        hear, before = self._adapter.front_end, senses.ears
+        one, other = ((of.sample_rate_hz, of.settings) for of in (hear, before))
+        if one != other or not np.array_equal(hear.array.positions_m, before.array.positions_m):
+            raise InvalidArgumentError("resume: expected the array, rate, bands and azimuths of its listener")
+        self._adapter.front_end = deepcopy(before)
+        for name, query in self._cameras.items():
+            if name in senses.eyes:
+                query.go_on(senses.eyes[name])
+
+    @property
+    def _cameras(self) -> dict[str, VisionQuery]:
+        vision = self._vision
+        return vision.cameras if isinstance(vision, SeveralCameras) else {SENSOR: vision}
 
     def push(self, block: Float32Array | None) -> list[WorldState]:
         """Take the next samples; return the state after each hop that ends in them.
@@ -143,7 +209,7 @@ class Listener:
         """
         return [step.state for step in self.steps(block)]
 
-    def tell(self, *told: Timed) -> None:
+    def add(self, *told: Timed) -> None:
         """Take odometry, positions or measurements of other sensors; each counts from its own stamp on."""
         self._waiting.add(told)
 
@@ -170,13 +236,30 @@ class Listener:
         InputFileError
             If a box lies outside the image.
         """
-        vision = self._vision
-        cameras = vision.cameras if isinstance(vision, SeveralCameras) else {SENSOR: vision}
-        cameras[one_of("camera", camera, cameras)].see(stamp_ns, frame)
+        self._cameras[one_of("camera", camera, self._cameras)].see(stamp_ns, frame)
 
-    @property
     def checkpoint(self) -> Checkpoint:
-        """What another listener goes on from."""
+        """Return what another listener goes on from at the next sample, to the bit.
+
+        What was told and waits for its time, at most 0.1 s of it, is told again to the other.
+
+        Examples
+        --------
+        >>> from worldstate.frontend.array.microphone_array import ovad_array
+        >>> import numpy as np
+        >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+        >>> listener = Listener(ovad_array(), 48_000)
+        >>> earlier = listener.push(noise[:50_000])
+        >>> other = Listener(ovad_array(), 48_000, resume=listener.checkpoint())
+        >>> other.push(noise[50_000:]) == listener.push(noise[50_000:])
+        True
+        """
+        # Ears are changed by what they hear, a camera's memory is replaced.
+        eyes = {name: copy(query) for name, query in self._cameras.items()}
+        return replace(self._learned(), senses=Senses(deepcopy(self._adapter.front_end), eyes))
+
+    def _learned(self) -> Checkpoint:
+        """Return the belief and what was learned of site and street."""
         signature, reader = self._signature, self._reader
         site = signature.estimate if isinstance(signature, SiteSignature) else None
         if not isinstance(reader, SequenceReader):
@@ -194,7 +277,7 @@ class Listener:
             self._adapter.set_no_source_probability(self.world.belief.hypotheses[2])
             if isinstance(reader, SequenceReader):
                 learn_passes(reader.street, self.world.state)
-            yield Step(frame, measurement, self.checkpoint)
+            yield Step(frame, measurement, self._learned())
 
     def measured(self, block: Float32Array | None) -> Iterator[tuple[AcousticFrame, Measurement]]:
         """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""

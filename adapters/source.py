@@ -265,17 +265,28 @@ def street_listener(
     return StreetListener(before or StreetHearing(replace(known or SidePatterns(), heard_by=heard_by)))
 
 
-class SourceParts(TypedDict, total=False):
-    """What `open_source` takes of a recording beside its sound: files, or the objects that they hold."""
-
-    array: Path | str | MicrophoneArray | None
-    detections: Path | str | DetectionLog | None
-    detector: Detector | None
+class _Parts(TypedDict, total=False):
     camera: Path | str | PinholeCamera | None
     miss_rates: Path | str | MissRates | None
     model: Path | str | Model | None
     context: Context | None
     settings: ListenSettings | None
+
+
+class SourceParts(_Parts, total=False):
+    """What `open_source` takes of a recording beside its sound: files, or the objects that they hold."""
+
+    array: Path | str | MicrophoneArray | None
+    detections: Path | str | DetectionLog | None
+    detector: Detector | None
+
+
+class ListenerParts(_Parts, total=False):
+    """What `open_source` takes where sound is pushed."""
+
+    sides: SidePatterns | None
+    resume: Path | str | Checkpoint | None
+    moving_ego: bool
 
 
 def open_source(

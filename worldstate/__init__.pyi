@@ -6,11 +6,10 @@ from .abduction.evidence import SignatureEvidence as SignatureEvidence
 from .adapters.acoustic import AcousticAdapter as AcousticAdapter
 from .adapters.camera.detections import DetectionFrame as DetectionFrame
 from .adapters.camera.pinhole import PinholeCamera as PinholeCamera
-from .adapters.files.model_file import read_model as read_model
+from .adapters.files.checkpoint_file import Checkpoint as Checkpoint
+from .adapters.listener import Listener as Listener
 from .adapters.listener import listen as listen
-from .adapters.listener import listen_steps as listen_steps
 from .adapters.source import ListenSettings as ListenSettings
-from .adapters.source import open_source as open_source
 from .belief.settings import FilterSettings as FilterSettings
 from .core.filter import WorldFilter as WorldFilter
 from .frontend.array.microphone_array import MicrophoneArray as MicrophoneArray
@@ -21,12 +20,13 @@ from .measurement.measurement import Approach as Approach
 from .measurement.measurement import Bearing as Bearing
 from .measurement.measurement import CoEvidenceChannel as CoEvidenceChannel
 from .measurement.measurement import Measurement as Measurement
-from .measurement.measurement import MeasurementAdapter as MeasurementAdapter
 from .measurement.measurement import Sighting as Sighting
+from .measurement.odometry import Odometry as Odometry
+from .measurement.position import Position as Position
+from .measurement.position import PositionScan as PositionScan
 from .state.context import Context as Context
-from .state.cue import RiskCue as RiskCue
+from .state.context import corner_at as corner_at
 from .state.entity import Entity as Entity
-from .state.entity import Relation as Relation
 from .state.world_state import WorldState as WorldState
 
 __version__: str

@@ -120,13 +120,23 @@ class VisionQuery:
         self._asked = detections is not None
         log = NO_LOOKS if detections is None else detections
         _check_size(camera, log)
+        self._other_ns: int | None = None
         self._take(log)
 
     def _take(self, log: DetectionLog) -> None:
         self.detections = log
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
-        # As background subtraction does: asked for a truck it would never find one.
-        self._calls_all_cars = set().union(*(frame.labels for frame in log.frames)) == {"car"}
+        # When it first called something else than a car. Background subtraction never does: asked for a truck
+        # it would not find one.
+        if self._other_ns is None:
+            stamped = zip(log.stamps_ns, log.frames, strict=True)
+            others = (int(stamp_ns) for stamp_ns, frame in stamped if set(frame.labels) - {"car"})
+            self._other_ns = next(others, None)
+
+    def go_on(self, before: "VisionQuery") -> None:
+        """Take over what another query of the same camera remembers: its last images and its labels."""
+        self._asked, self._other_ns = before._asked, before._other_ns
+        self._take(before.detections)
 
     def see(self, stamp_ns: int, frame: DetectionFrame) -> None:
         """Take what a running detector found in an image; one that is no later than the last is left out.
@@ -176,8 +186,8 @@ class VisionQuery:
         bearing : Bearing or NotUsable
             Centre of the sector, unless `side` is given; without either everything ahead is searched.
         expected_labels : collection of str, optional
-            Classes that the signature predicts; all that the filter keeps if not given, or if the detector
-            calls every box a car.
+            Classes that the signature predicts; all that the filter keeps if not given, or as long as the
+            detector has called every box a car.
         side : {"left", "right"}, optional
             Search that whole side, 0 to 90 deg, for a source whose bearing is coarse.
 
@@ -196,7 +206,7 @@ class VisionQuery:
             return Unqueried("no detections file")
         if self._frame(stamp_ns) is None:
             return Unqueried(f"no frame at {seconds(stamp_ns):.3f} s")
-        labels = self._asked_for(expected_labels)
+        labels = self._asked_for(expected_labels, stamp_ns)
         if not any(label in self.keep.labels for label in labels):
             return Unqueried("the signature predicts no class that a camera would see")
         sector = self.sector(bearing, side)
@@ -273,11 +283,13 @@ class VisionQuery:
 
     def miss_rate_over(self, sector: Sector, stamp_ns: int, labels: Collection[str] | None) -> float:
         """Return the expected miss rate in a sector, 1 where nothing of it is in view."""
-        beta = self._expected_miss_rate(sector, self._degradation(stamp_ns), self._asked_for(labels))
+        asked = self._asked_for(labels, stamp_ns)
+        beta = self._expected_miss_rate(sector, self._degradation(stamp_ns), asked)
         return 1.0 if beta is None else beta
 
-    def _asked_for(self, expected: Collection[str] | None) -> Collection[str]:
-        if expected is None or (expected and self._calls_all_cars):
+    def _asked_for(self, expected: Collection[str] | None, stamp_ns: int) -> Collection[str]:
+        calls_all_cars = self._other_ns is None or stamp_ns < self._other_ns
+        if expected is None or (expected and calls_all_cars):
             return self.keep.labels
         return expected
 

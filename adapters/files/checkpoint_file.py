@@ -1,6 +1,6 @@
 """Checkpoints on disk: the filter's memory, site estimate, a sequence's history, the sound of the arms."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,9 @@ class Checkpoint:
         `SequenceReader.history`; None without a sequence model.
     street : StreetHearing or None
         `StreetListener.hearing`; likewise.
+    senses : object or None
+        What a `Listener` goes on with at the very next sample: the sound and images of its windows. No file
+        holds it.
 
     Examples
     --------
@@ -43,6 +46,7 @@ class Checkpoint:
     site: SiteEstimate | None = None
     history: SequenceHistory | None = None
     street: StreetHearing | None = None
+    senses: object = field(default=None, compare=False, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values: the filter's checkpoint with the other parts beside its memory."""

@@ -5,7 +5,8 @@ from tempfile import TemporaryDirectory
 
 from tutorial_options import tutorial_options
 
-from worldstate import WorldState, listen, open_source
+from worldstate import WorldState, listen
+from worldstate.adapters import open_source
 from worldstate.operations.figure_style import BLUE, RED, figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 

@@ -6,8 +6,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from tutorial_options import tutorial_options
 
-from worldstate import Measurement, WorldState, open_source
-from worldstate.adapters import Checkpoint, measure_steps, read_checkpoint, save_checkpoint
+from worldstate import Measurement, WorldState
+from worldstate.adapters import Checkpoint, measure_steps, open_source, read_checkpoint, save_checkpoint
 from worldstate.operations.figure_style import figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 

@@ -7,7 +7,8 @@ import numpy as np
 from tutorial_options import tutorial_options
 from worldstate_lab.planner.encounters import EgoVehicle
 
-from worldstate import WorldState, listen, open_source
+from worldstate import WorldState, listen
+from worldstate.adapters import open_source
 from worldstate.operations.figure_style import BLUE, GREEN, RED, figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 

@@ -95,11 +95,11 @@ def test_what_is_told_counts_from_its_stamp_on_and_a_checkpoint_is_gone_on_from(
     recorded = [step.state.to_json() for step in listen_steps(source)]
     plain = replace(source, others=())
     running = Listener(plain, RATE_HZ)
-    running.tell(*reversed(told))
+    running.add(*reversed(told))
     states = running.push(sound[: 2 * RATE_HZ])
-    later = Listener(replace(plain, before=running.checkpoint), RATE_HZ)
-    later.tell(*told)
-    states += later.push(sound)
+    later = Listener(replace(plain, before=running.checkpoint()), RATE_HZ)
+    later.add(*told)
+    states += later.push(sound[2 * RATE_HZ :])
     assert [state.to_json() for state in states] == recorded
     speeds = [state.context.ego_speed_mps for state in states]
     assert speeds == [2.0] * len(states)

@@ -229,7 +229,7 @@ def _odometry(
     told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns, _trust(arguments)))
 
     def hand_in(listener: "Listener") -> int:
-        return told.deliver(lambda stamp_ns, record: listener.tell(record.at(stamp_ns)))
+        return told.deliver(lambda stamp_ns, record: listener.add(record.at(stamp_ns)))
 
     return hand_in, _losses([told], "odometry", "odometry_")
 

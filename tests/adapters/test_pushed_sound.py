@@ -1,0 +1,127 @@
+"""Sound that is pushed is heard as `run` hears it, whatever the blocks, and gone on with at any sample."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import DetectionFrame, Listener, MicrophoneArray, Odometry, PinholeCamera
+from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
+from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.adapters.source import ListenSettings
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import ovad_array
+from worldstate.ground import InvalidArgumentError, nanoseconds
+from worldstate.ground.typing import Float32Array
+
+RATE_HZ = 16_000
+ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
+RNG = np.random.default_rng(5)
+SOUND = (0.1 * RNG.standard_normal((3 * RATE_HZ, 3))).astype(np.float32)
+CAR = DetectionFrame(np.array([[300.0, 200.0, 380.0, 260.0]]), np.array([0.9]), ("car",))
+TRUCK = DetectionFrame(np.array([[300.0, 200.0, 380.0, 260.0]]), np.array([0.9]), ("truck",))
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    """The one that ships, as if made of three microphones: any windows will do."""
+    shipped = read_model()
+    return replace(shipped, signature=replace(shipped.signature, domain=domain_of(ARRAY, [6000], ["SA1"])))
+
+
+def looked(listener: Listener, start: int, end: int) -> None:
+    """Show the images that are taken in these samples; at 0.5 s the camera calls something a truck."""
+    for number in range(30):
+        if start <= number * RATE_HZ // 10 < end:
+            listener.look(nanoseconds(number / 10), TRUCK if number == 5 else CAR)
+
+
+def pushed(listener: Listener, start: int, end: int) -> list[str]:
+    looked(listener, start, end)
+    return [state.to_json() for state in listener.push(SOUND[start:end])]
+
+
+@pytest.fixture(scope="module")
+def in_one(model: Model) -> list[str]:
+    listener = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera())
+    return pushed(listener, 0, len(SOUND)) + [state.to_json() for state in listener.push(None)]
+
+
+@settings(max_examples=15)
+@given(cut=st.integers(0, len(SOUND)))
+def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Model, in_one: list[str]) -> None:
+    first = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera())
+    states = pushed(first, 0, cut)
+    kept = first.checkpoint()
+    first.push(SOUND[cut:])  # a checkpoint stays what it was
+    for _ in range(2):  # and is gone on from more than once
+        second = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera(), resume=kept)
+        rest = pushed(second, cut, len(SOUND)) + [state.to_json() for state in second.push(None)]
+        assert states + rest == in_one
+
+
+@pytest.mark.parametrize("size", [1, 37, 480, 48_000])
+def test_states_are_those_of_run_for_blocks_of_any_size(
+    size: int, tmp_path: Path, model: Model, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from worldstate.adapters.files.array_file import write_array_xml
+    from worldstate.adapters.files.model_file import save_model
+
+    save_model(tmp_path / "model.json", model)
+    write_array_xml(tmp_path / "three.xml", ARRAY)
+    soundfile.write(tmp_path / "sound.wav", SOUND, RATE_HZ, subtype="FLOAT")
+    options = ["--array", str(tmp_path / "three.xml"), "--model", str(tmp_path / "model.json")]
+    out = tmp_path / "states.jsonl"
+    assert main(["run", str(tmp_path / "sound.wav"), *options, "--out", str(out)]) == 0
+    listener = Listener(tmp_path / "three.xml", RATE_HZ, model=tmp_path / "model.json")
+    blocks = [*np.split(SOUND, range(size, len(SOUND), size)), None]
+    assert [one.to_json() for block in blocks for one in listener.push(block)] == out.read_text().splitlines()
+
+
+def test_the_demo_s_recording_is_pushed_as_run_hears_it(approach, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    out = tmp_path / "states.jsonl"
+    assert main(["run", str(approach.audio_path), "--out", str(out)]) == 0
+    with soundfile.SoundFile(approach.audio_path) as sound:
+        listener = Listener(ovad_array(), sound.samplerate)
+        states = [state for block in sound.blocks(480, dtype="float32") for state in listener.push(block)]
+    assert [state.to_json() for state in [*states, *listener.push(None)]] == out.read_text().splitlines()
+
+
+def test_a_checkpoint_of_a_file_goes_on_from_a_second_before_it(
+    tmp_path: Path, model: Model
+) -> None:
+    told = [Odometry("wheels", nanoseconds(at), 0.0) for at in (0.4, 1.4, 2.4)]
+    whole = Listener(ARRAY, RATE_HZ, model=model)
+    whole.add(*told)
+    first, rest = whole.push(SOUND[: 2 * RATE_HZ]), None
+    save_checkpoint(tmp_path / "now.json", whole.checkpoint())
+    second = Listener(ARRAY, RATE_HZ, model=model, resume=tmp_path / "now.json", start_s=0.0)
+    second.add(*told)
+    rest = second.push(SOUND)
+    assert rest == whole.push(SOUND[2 * RATE_HZ :])
+    assert [one.stamp_ns for one in first + rest] == [10**8 * tenth for tenth in range(10, 30)]
+    assert read_checkpoint(tmp_path / "now.json").senses is None
+
+
+def test_a_checkpoint_is_refused_by_other_ears(model: Model) -> None:
+    kept: Checkpoint = Listener(ARRAY, RATE_HZ, model=model).checkpoint()
+    moved = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.2, 0.0]])
+    for array, rate, free in ((moved, RATE_HZ, ListenSettings(uncalibrated=True)), (ARRAY, 48_000, ListenSettings())):
+        with pytest.raises(InvalidArgumentError, match="resume: expected the array, rate"):
+            Listener(array, rate, model=model, resume=kept, settings=free)
+    with pytest.raises(InvalidArgumentError, match="model: expected nothing beside a source"):
+        Listener(Listener(ARRAY, RATE_HZ, model=model)._source, RATE_HZ, model=model)
+
+
+def test_samples_of_another_shape_are_refused_and_nothing_is_lost(model: Model) -> None:
+    listener, other = (Listener(ARRAY, RATE_HZ, model=model) for _ in range(2))
+    wrong: Float32Array
+    for wrong in (SOUND[:100, :2], np.full((5, 3), np.nan, np.float32)):
+        with pytest.raises(InvalidArgumentError, match="block"):
+            listener.push(wrong)
+    assert listener.push(SOUND) == other.push(SOUND)
