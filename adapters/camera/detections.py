@@ -205,8 +205,8 @@ def kept_and_parked(log: DetectionLog, frame: int, keep: DetectionFilter) -> tup
 
 
 COUNTS_TOLD = (
-    "{counted} of {boxes} boxes in {frames} frames count; {other_class} of another class, "
-    "{low_score} below the score, {too_small} too small, {parked} parked"
+    "{frames} images were looked at, {empty} of them without a box; {counted} of {boxes} boxes count; "
+    "{other_class} of another class, {low_score} below the score, {too_small} too small, {parked} parked"
 )
 
 
@@ -217,7 +217,8 @@ def count_boxes(log: DetectionLog, keep: DetectionFilter) -> dict[str, int]:
     boxes = sum(map(len, log.frames))
     still = sum(int(kept_and_parked(log, i, keep)[1].sum()) for i in range(len(log)))
     apart = {"other_class": boxes - named, "low_score": named - scored, "too_small": scored - high}
-    return {"frames": len(log), "boxes": boxes, "counted": high - still, **apart, "parked": still}
+    looks = {"frames": len(log), "empty": sum(not len(frame) for frame in log.frames)}
+    return looks | {"boxes": boxes, "counted": high - still, **apart, "parked": still}
 
 
 class Detector(Protocol):
@@ -343,12 +344,40 @@ class _CocoResult:
     score: Probability
 
 
+@dataclass(frozen=True, slots=True)
+class _CocoId:
+    """An image, or a category with its name."""
+
+    id: int
+    name: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _CocoFile:
+    """Results, and the images that were looked at."""
+
+    annotations: tuple[_CocoResult, ...]
+    images: tuple[_CocoId, ...] | None = None
+    categories: tuple[_CocoId, ...] | None = None
+
+    def __post_init__(self) -> None:
+        boxes, images = len(self.annotations), len(self.images or ())
+        if boxes > MAX_FRAMES * 10 or images > MAX_FRAMES:
+            problem = f"expected at most {MAX_FRAMES * 10} boxes and {MAX_FRAMES} images"
+            raise InvalidArgumentError(f"{problem}, got {boxes} and {images}")
+
+
 def read_any_detections(
-    path: str | Path, frame_rate_hz: float = 10.0, size_px: tuple[int, int] | None = None
+    path: str | Path,
+    frame_rate_hz: float = 10.0,
+    size_px: tuple[int, int] | None = None,
+    n_images: int | None = None,
 ) -> DetectionLog:
     """Read detections of whichever form stands at `path`.
 
-    A folder holds YOLO text, a JSON list COCO results, a JSON object OVAD's detections per frame.
+    A folder holds YOLO text, a JSON list COCO results, a JSON object with ``"images"`` such results beside
+    the images that were looked at, another one OVAD's detections per frame. An image without a box was
+    searched, and nothing was there: COCO results alone do not tell those after the last box.
 
     Parameters
     ----------
@@ -358,6 +387,8 @@ def read_any_detections(
         Frames a second, where the frames carry no stamp.
     size_px : tuple of int, optional
         Width and height of the image, which YOLO text is relative to.
+    n_images : int, optional
+        The detector looked at the images 0 to `n_images` - 1, where COCO results or YOLO text do not tell.
 
     Returns
     -------
@@ -367,7 +398,8 @@ def read_any_detections(
     Raises
     ------
     InputFileError
-        As the reader of that form, or if YOLO text is read without a size.
+        As the reader of that form; if YOLO text is read without a size, or `n_images` is given where the file
+        lists its images.
 
     Examples
     --------
@@ -382,34 +414,45 @@ def read_any_detections(
     if name.is_dir():
         if size_px is None:
             raise InputFileError(name, "expected the size of the image beside YOLO text")
-        return read_yolo_text(name, size_px, frame_rate_hz)
-    try:
-        with name.open("rb") as file:
-            first = file.read(64).lstrip()[:1]
-    except OSError as error:
-        raise InputFileError(name, f"expected a detections file ({error.strerror})") from error
-    reader = read_coco_results if first == b"[" else read_detections
-    return reader(name, frame_rate_hz)
+        return read_yolo_text(name, size_px, frame_rate_hz, n_images)
+    document = read_json(name, "a detections file", MAX_BYTES)
+    if isinstance(document, list) or (isinstance(document, dict) and "images" in document):
+        return coco_log(name, document, frame_rate_hz, n_images)
+    if n_images is not None:
+        raise InputFileError(name, "expected no number of images (--images): the file has every image")
+    return read_detections(name, frame_rate_hz)
 
 
-def read_coco_results(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionLog:
-    """Read a COCO results file: ``[{"image_id", "category_id", "bbox": [x, y, w, h], "score"}, ...]``."""
-    name = Path(path)
-    found = read_json(name, "a detections file", MAX_BYTES)
-    if not isinstance(found, list) or len(found) > MAX_FRAMES * 10:
-        raise InputFileError(name, "expected a list of COCO results")
-    rows: dict[int, list[Row]] = {}
-    with refused_as_file(name):
-        for i, item in enumerate(found):
-            result = decode(_CocoResult, item, f"result {i}")
+def coco_log(
+    path: Path, document: object, frame_rate_hz: float = 10.0, n_images: int | None = None
+) -> DetectionLog:
+    """Return the log of COCO results, or of an object of ``"images"`` and results as ``"annotations"``.
+
+    A result is ``{"image_id", "category_id", "bbox": [x, y, w, h], "score"}``; image i is taken i / rate
+    after the start.
+    """
+    with refused_as_file(path):
+        listed = isinstance(document, dict)
+        read = decode(_CocoFile, document if listed else {"annotations": document}, "COCO")
+        named = {one.id: one.name for one in read.categories or () if one.name is not None}
+        names = {**COCO_CATEGORIES, **named}
+        rows: dict[int, list[Row]] = {one.id: [] for one in read.images or ()}
+        for result in read.annotations:
+            if listed and result.image_id not in rows:
+                problem = f"expected the images of all boxes listed, {result.image_id} is not"
+                raise InvalidArgumentError(problem)
             left, top, width, height = result.bbox
-            label = COCO_CATEGORIES.get(result.category_id, str(result.category_id))
+            label = names.get(result.category_id, str(result.category_id))
             row = (left, top, left + width, top + height), result.score, label
             rows.setdefault(result.image_id, []).append(row)
-    return _log(name, rows, frame_rate_hz)
+    if listed and n_images is not None:
+        raise InputFileError(path, "expected no number of images (--images): the file lists its images")
+    return _log(path, rows, frame_rate_hz, sorted(rows) if listed else n_images)
 
 
-def read_yolo_text(path: str | Path, size_px: tuple[int, int], frame_rate_hz: float = 10.0) -> DetectionLog:
+def read_yolo_text(
+    path: str | Path, size_px: tuple[int, int], frame_rate_hz: float = 10.0, n_images: int | None = None
+) -> DetectionLog:
     """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image."""
     folder = Path(path)
     numbered = [(file, match) for file in folder.glob("*.txt") if (match := _FRAME_NUMBER.search(file.name))]
@@ -424,7 +467,7 @@ def read_yolo_text(path: str | Path, size_px: tuple[int, int], frame_rate_hz: fl
         with refused_as_file(file):
             lines = read_text(file, "a text file", MAX_TEXT_BYTES).splitlines()
             rows[number] = [_yolo_row(line, size_px) for line in lines if line.strip()]
-    return _log(folder, rows, frame_rate_hz)
+    return _log(folder, rows, frame_rate_hz, n_images)
 
 
 def _yolo_row(line: str, size_px: tuple[int, int]) -> Row:
@@ -443,14 +486,22 @@ def _yolo_row(line: str, size_px: tuple[int, int]) -> Row:
     return box, score, YOLO_CLASSES.get(int(name), name)
 
 
-def _log(path: Path, rows: Mapping[int, list[Row]], frame_rate_hz: float) -> DetectionLog:
+def _log(
+    path: Path, rows: Mapping[int, list[Row]], frame_rate_hz: float, looked: Sequence[int] | int | None
+) -> DetectionLog:
+    """Stamp the images that were looked at: those of these numbers, so many, or up to the last with a box."""
+    in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
     count = max(rows, default=-1) + 1
-    if count > MAX_FRAMES or any(not 0 <= number < count for number in rows):
+    if count > MAX_FRAMES or min(rows, default=0) < 0:
         raise InputFileError(path, f"expected frame numbers from 0 to {min(count, MAX_FRAMES) - 1}")
+    if isinstance(looked, int) and not count <= looked <= MAX_FRAMES:
+        raise InputFileError(path, f"expected {count} to {MAX_FRAMES} images by its boxes, got {looked}")
+    numbers = looked if isinstance(looked, Sequence) else range(count if looked is None else looked)
     if max(map(len, rows.values()), default=0) > MAX_BOXES_A_FRAME:
         raise InputFileError(path, f"expected at most {MAX_BOXES_A_FRAME} boxes a frame")
-    found = [frame_of_rows(rows.get(number, [])) for number in range(count)]
-    return DetectionLog.at_rate(found, frame_rate_hz, source=str(path))
+    found = tuple(frame_of_rows(rows.get(number, [])) for number in numbers)
+    stamps = [nanoseconds(number / frame_rate_hz) for number in numbers]
+    return DetectionLog(found, np.array(stamps, dtype=np.int64), str(path))
 
 
 def frame_of_rows(rows: Sequence[Row]) -> DetectionFrame:

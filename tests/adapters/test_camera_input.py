@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, count_boxes
+from worldstate.adapters.camera.detections import (
+    DetectionFilter,
+    DetectionFrame,
+    DetectionLog,
+    count_boxes,
+    read_any_detections,
+)
 from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
@@ -58,7 +64,7 @@ def test_every_box_is_put_down_to_one_reason():
     frame = DetectionFrame(boxes, np.array([row[1] for row in rows]), tuple(row[0] for row in rows))
     counts = count_boxes(DetectionLog.at_rate([frame] * 20, 10.0), DetectionFilter())
     apart = {"other_class": 20, "low_score": 20, "too_small": 20, "parked": 10}
-    assert counts == {"frames": 20, "boxes": 80, "counted": 10} | apart
+    assert counts == {"frames": 20, "empty": 0, "boxes": 80, "counted": 10} | apart
 
 
 @pytest.fixture
@@ -107,10 +113,9 @@ def test_run_says_how_many_boxes_count(watched, tmp_path, capsys):
     (tmp_path / "d.json").write_text(json.dumps({"detections_per_frame": [frame] * 20}))
     words = ["run", str(watched), "--detections", str(tmp_path / "d.json")]
     assert main(words) == 0
-    said = (
-        "10 of 60 boxes in 20 frames count; 20 of another class, 0 below the score, 20 too small, 10 parked"
-    )
-    assert said in capsys.readouterr().out
+    said = "20 images were looked at, 0 of them without a box; 10 of 60 boxes count; 20 of another class"
+    told = capsys.readouterr()
+    assert said in told.out and "no image is without a box" in told.err
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["detections"]["counted"] == 10
 
@@ -132,3 +137,36 @@ def test_images_that_carry_no_stamp_come_at_the_rate_that_is_said(tmp_path, caps
     (tmp_path / "camera.json").write_text(json.dumps(lens | {"image_rate_hz": 0}))
     assert main(["run", *words, "--camera", str(tmp_path / "camera.json")]) == 2
     assert "camera.image_rate_hz" in capsys.readouterr().err
+
+
+def test_images_that_a_detector_found_empty_are_looks(tmp_path, capsys):
+    boxes = [{"image_id": 2, "category_id": 3, "bbox": [10, 20, 200, 150], "score": 0.9}]
+    images = [{"id": number, "file_name": f"{number}.jpg"} for number in (0, 2, 3)]
+    (tmp_path / "results.json").write_text(json.dumps(boxes))
+    (tmp_path / "coco.json").write_text(json.dumps({"images": images, "annotations": boxes}))
+    words = ["a.wav", "--detections", str(tmp_path / "results.json")]
+
+    def reported(*more: str) -> DetectionLog:
+        given = given_sensors(PROGRAM.parser("run").parse_args([*words, *more])).detections()
+        return given if isinstance(given, DetectionLog) else read_any_detections(given)
+
+    # Image 3 was not asked as far as the results tell.
+    assert [len(frame) for frame in reported().frames] == [0, 0, 1]
+    assert [len(frame) for frame in reported("--images", "5").frames] == [0, 0, 1, 0, 0]
+    listed = read_any_detections(tmp_path / "coco.json")
+    assert ([len(frame) for frame in listed.frames], listed.stamps_ns.tolist()) == (
+        [0, 1, 0],
+        [0, 200_000_000, 300_000_000],
+    )
+    for path, more in ((tmp_path / "results.json", 2), (tmp_path / "coco.json", 5)):
+        with pytest.raises(InputFileError, match="images"):
+            read_any_detections(path, n_images=more)
+    (tmp_path / "coco.json").write_text(json.dumps({"images": images[:1], "annotations": boxes}))
+    with pytest.raises(InputFileError, match="images of all boxes listed, 2 is not"):
+        read_any_detections(tmp_path / "coco.json")
+
+
+def test_an_empty_list_of_results_is_looks_where_the_images_are_told(tmp_path):
+    (tmp_path / "none.json").write_text("[]")
+    assert len(read_any_detections(tmp_path / "none.json", n_images=30)) == 30
+    assert len(read_any_detections(tmp_path / "none.json")) == 0

@@ -13,7 +13,6 @@ from worldstate.adapters.camera import detectors
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.detections import (
     read_any_detections,
-    read_coco_results,
     read_yolo_text,
 )
 from worldstate.adapters.camera.detectors import (
@@ -254,7 +253,7 @@ def test_damaged_coco_results_are_a_typed_error(text, tmp_path):
     path = tmp_path / "results.json"
     path.write_text(text)
     with pytest.raises(InputFileError, match=r"results\.json"):
-        read_coco_results(path)
+        read_any_detections(path)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,8 @@ def test_a_checkpoint_of_a_file_goes_on_from_a_second_before_it(
 def test_a_checkpoint_is_refused_by_other_ears(model: Model) -> None:
     kept: Checkpoint = Listener(ARRAY, RATE_HZ, model=model).checkpoint()
     moved = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.2, 0.0]])
-    for array, rate, free in ((moved, RATE_HZ, ListenSettings(uncalibrated=True)), (ARRAY, 48_000, ListenSettings())):
+    anything = ListenSettings(uncalibrated=True)
+    for array, rate, free in ((moved, RATE_HZ, anything), (ARRAY, 48_000, ListenSettings())):
         with pytest.raises(InvalidArgumentError, match="resume: expected the array, rate"):
             Listener(array, rate, model=model, resume=kept, settings=free)
     with pytest.raises(InvalidArgumentError, match="model: expected nothing beside a source"):

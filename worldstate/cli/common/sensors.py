@@ -1,6 +1,7 @@
 """The sensors of a vehicle: --car, or --array with a camera, its detector and the boxes that count."""
 
 import argparse
+import sys
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -26,7 +27,8 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     --detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the
     number of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the
     first sample of the sound, ten a second; classes have COCO's numbers (car is 3) and YOLO's (car is 2). Up
-    to the last image with a box, one that lists nothing was searched in vain; later ones were not asked.
+    to the last image with a box, one that lists nothing was searched in vain; of later ones --images tells,
+    or the "images" of a COCO object {"images": [{"id": 0}, ...], "annotations": [results]}.
     """
     add_array_options(parser)
     add_car_option(parser)
@@ -34,6 +36,8 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("camera")
     told = "what its detector reported; NAME=PATH of a camera of --car, repeated: all these are asked"
     group.add_argument("--detections", type=Path, action="append", default=[], metavar="PATH", help=told)
+    told = "the detector looked at so many images, those without a box included (COCO results, YOLO text)"
+    group.add_argument("--images", type=int, metavar="N", help=told)
     add_lens_options(parser, group)
 
 
@@ -138,12 +142,12 @@ class GivenSensors:
 
     def detections(self) -> "Path | adapters.DetectionLog | None":
         """Return what the one camera that is asked reported, read where its images do not come at 10 Hz."""
-        given = self.arguments.detections
+        given, n_images = self.arguments.detections, self.arguments.images
         path = given[0] if given else self.setup.detections
-        if path is None or self.setup.image_rate_hz is None:
+        if path is None or (n_images or self.setup.image_rate_hz) is None:
             return path
-        lens = self.camera or adapters.PinholeCamera()
-        return adapters.read_any_detections(path, self.setup.image_rate_hz, (lens.width_px, lens.height_px))
+        lens, rate_hz = self.camera or adapters.PinholeCamera(), self.setup.image_rate_hz or 10.0
+        return adapters.read_any_detections(path, rate_hz, (lens.width_px, lens.height_px), n_images)
 
 
 def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
@@ -199,6 +203,9 @@ def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
     if source.detections is None:
         return None
     counts = count_boxes(source.detections, source.settings.boxes)
+    if counts["frames"] and not counts["empty"]:
+        problem = "no image is without a box: are those missing in which nothing was found (--images N)?"
+        print(f"worldstate: {problem}", file=sys.stderr)
     return counts if as_json else COUNTS_TOLD.format(**counts)
 
 
