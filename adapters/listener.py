@@ -30,7 +30,7 @@ from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
 from .own_parts import OtherModality
-from .source import ListenerParts, Source, SourceParts, open_source
+from .source import ListenerParts, Source, SourceParts, check_mounting, open_source
 
 # Stands for the file where sound is pushed.
 PUSHED = "pushed sound"
@@ -140,6 +140,7 @@ class Listener:
         start_s: float | None = None,
         **parts: Unpack[ListenerParts],
     ) -> None:
+        self._blind = not isinstance(array, Source) and parts.get("camera") is None
         if not isinstance(array, Source):
             source = open_source(PUSHED, array=array, start_s=start_s or 0.0, **parts)
         elif parts or start_s is not None:
@@ -232,10 +233,13 @@ class Listener:
         Raises
         ------
         InvalidArgumentError
-            If there is no such camera.
+            If there is no such camera, or none was given, where the array is not OVAD's.
         InputFileError
             If a box lies outside the image.
         """
+        if self._blind:
+            check_mounting(self._source.array)
+            self._blind = False
         self._cameras[one_of("camera", camera, self._cameras)].see(stamp_ns, frame)
 
     def checkpoint(self) -> Checkpoint:

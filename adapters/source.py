@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypedDict, TypeVar
 
+import numpy as np
+
 from worldstate.abduction.co_evidence import Sector
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.road_users import DomainGuard, RoadUserModel
@@ -29,7 +31,7 @@ from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoin
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
-from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
 from worldstate.state import Context
@@ -189,7 +191,7 @@ class Source:
     settings: ListenSettings = field(default_factory=ListenSettings)
     t0_s: float | None = None
     hazard_free: bool = False
-    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    camera: PinholeCamera = field(default_factory=PinholeCamera.ovad)
     miss_rates: MissRates | None = None
     degradation: float | Callable[[int], float] = 0.0
     before: Checkpoint | None = None
@@ -323,7 +325,7 @@ def open_source(
     detector : Detector, optional
         Looks at the video of the recording folder, in place of `detections`.
     camera : path or PinholeCamera, optional
-        What took the images, as `read_camera` reads it; OVAD's camera where not given.
+        What took the images, as `read_camera` reads it; OVAD's camera with OVAD's array.
     miss_rates : path or MissRates, optional
         What `worldstate model detector` wrote. Where it holds the camera's scale of health and the recording
         folder has a video, the degradation is read from that.
@@ -361,7 +363,8 @@ def open_source(
     InputFileError
         If a file is missing or damaged; the message names it.
     InvalidArgumentError
-        If the model holds no threshold for the budget, or both detections and a detector are given.
+        If the model holds no threshold for the budget, both detections and a detector are given, or
+        either without the camera that took the images, where the array is not OVAD's.
     OutOfDomainError
         If the array is not that of the data set, or not the model's.
 
@@ -385,6 +388,8 @@ def open_source(
     moves = bool(told or (recording and recording.moving_ego) or context.ego_speed_mps)
     known = model if isinstance(model, Model) else read_model(model, moving_ego=moves)
     heard_by, policy = _array_and_policy(sound, known, _read(array, read_array), settings, moves)
+    if camera is None and (detections, detector) != (None, None):
+        check_mounting(heard_by)
     first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
     source = Source(
         sound=sound if recording is None else recording.audio_path,
@@ -396,7 +401,7 @@ def open_source(
         settings=settings,
         t0_s=None if recording is None else recording.t0_s,
         hazard_free=recording is not None and recording.label == "none",
-        camera=_read(camera, read_camera) or PinholeCamera(),
+        camera=_read(camera, read_camera) or PinholeCamera.ovad(),
         miss_rates=_read(miss_rates, load_miss_rates),
         before=_read(resume, read_checkpoint),
         start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns,
@@ -407,6 +412,14 @@ def open_source(
         others=tuple(others) if ego is None else (*others, ego.told.__iter__),
     )
     return _with_camera(source, recording, detections, detector)
+
+
+def check_mounting(array: MicrophoneArray) -> None:
+    """Refuse images of a camera that nobody described: the one of OVAD is known, beside OVAD's array."""
+    positions_m = ovad_array().positions_m
+    if array.n_microphones != len(positions_m) or not np.allclose(array.positions_m, positions_m, atol=1e-3):
+        problem = "expected the camera that took the images: its lens, and where it stands beside the array"
+        raise InvalidArgumentError(f"camera: {problem} (--camera JSON)")
 
 
 def _read(given: Path | str | T | None, reader: Callable[[Path | str], T]) -> T | None:

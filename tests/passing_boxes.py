@@ -7,7 +7,7 @@ import numpy as np
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 
-CAMERA = PinholeCamera(position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
+CAMERA = PinholeCamera.ovad(position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
 FOCAL_PX = 0.5 * CAMERA.width_px / math.tan(CAMERA.half_angle_rad)
 LANE_M, EDGE_RAD, WIDTH_M, HEIGHT_M, LENGTH_M = 9.0, math.radians(28.0), 1.8, 1.55, 4.5
 

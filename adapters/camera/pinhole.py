@@ -1,8 +1,9 @@
 """From image columns to azimuth in `base_link` and back."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,11 +25,7 @@ class PinholeCamera:
     and roll r. The camera is not at the origin of `base_link`, where the array is: the azimuth there depends
     on the range. It is computed at `nominal_range_m` from the camera, and what it would be wrong by at
     another range is part of the standard deviation of a sighting. For OVAD's offset the shift is 1.5 to
-    1.8 deg at 30 deg and 10 m.
-
-    The defaults are the published facts of OVAD: half angle of view 0.6 rad, aspect 0.628, the camera 0.567 m
-    behind, 0.485 m below and 0.0316 m right of the array, pitched up by 0.11979 rad. The height only matters
-    to the elevation, which is not used.
+    1.8 deg at 30 deg and 10 m. The height only matters to the elevation, which is not used.
 
     Parameters
     ----------
@@ -58,7 +55,7 @@ class PinholeCamera:
 
     Examples
     --------
-    >>> camera = PinholeCamera()
+    >>> camera = PinholeCamera.ovad()
     >>> right, left = camera.view_rad
     >>> round(math.degrees(left), 1), round(math.degrees(right), 1)
     (35.9, -36.3)
@@ -66,12 +63,12 @@ class PinholeCamera:
     True
     """
 
-    width_px: int = 1936
-    height_px: int = 1216
-    half_angle_rad: float = 0.6
-    position_m: tuple[float, float, float] = (-0.567, -0.0316, -0.485)
+    width_px: int
+    height_px: int
+    half_angle_rad: float
+    position_m: tuple[float, float, float]
     yaw_rad: float = 0.0
-    pitch_rad: float = 0.11979
+    pitch_rad: float = 0.0
     nominal_range_m: float = 10.0
     range_spread: float = 0.5
     principal_px: float | None = None
@@ -91,6 +88,20 @@ class PinholeCamera:
             in_range("principal_px", self.principal_px, 0.0, self.width_px)
         x, y, _ = finite_array("position_m", self.position_m, (3,))
         in_range("nominal_range_m", self.nominal_range_m, float(np.hypot(x, y)), math.inf, open_low=True)
+
+    @classmethod
+    def ovad(cls, **changes: Any) -> "PinholeCamera":
+        """Return the camera of OVAD by its published facts, but for what is given.
+
+        Half angle of view 0.6 rad, aspect 0.628, 0.567 m behind, 0.485 m below and 0.0316 m right of the
+        array, pitched up by 0.11979 rad.
+
+        Examples
+        --------
+        >>> PinholeCamera.ovad(width_px=640, height_px=402).position_m
+        (-0.567, -0.0316, -0.485)
+        """
+        return replace(cls(1936, 1216, 0.6, (-0.567, -0.0316, -0.485), pitch_rad=0.11979), **changes)
 
     @property
     def view_rad(self) -> tuple[float, float]:
@@ -181,7 +192,7 @@ class PinholeCamera:
 
         Examples
         --------
-        >>> seen = PinholeCamera().sighting((0, 500, 400, 800), "car", 0.9)
+        >>> seen = PinholeCamera.ovad().sighting((0, 500, 400, 800), "car", 0.9)
         >>> round(math.degrees(seen.azimuth_rad)), round(math.degrees(seen.width_rad))
         (30, 13)
         """
@@ -219,10 +230,10 @@ class PinholeCamera:
 def read_camera(path: str | Path) -> PinholeCamera:
     """Read a camera from JSON.
 
-    ``{"width_px", "height_px", "horizontal_fov_deg"}`` or, in place of the field of view, ``{"fx", "cx"}`` of
-    a calibration without distortion, pixels; optional are ``"yaw_deg"`` (left positive), ``"pitch_deg"`` (up
-    positive), ``"roll_deg"`` (left side up), ``"position_m": [x, y, z]`` in `base_link`, and
-    ``"stamp_offset_s"``, which brings the stamps of its images to the clock of the sound; all 0 where not
+    ``{"width_px", "height_px", "horizontal_fov_deg", "position_m": [x, y, z]}``, the position in `base_link`,
+    metres, or, in place of the field of view, ``{"fx", "cx"}`` of a calibration without distortion, pixels;
+    optional are ``"yaw_deg"`` (left positive), ``"pitch_deg"`` (up positive), ``"roll_deg"`` (left side up)
+    and ``"stamp_offset_s"``, which brings the stamps of its images to the clock of the sound; all 0 where not
     given.
 
     Parameters
@@ -245,7 +256,8 @@ def read_camera(path: str | Path) -> PinholeCamera:
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     name = Path(folder) / "camera.json"
-    ...     _ = name.write_text('{"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}')
+    ...     lens = '{"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "position_m": [0, 0, 0]}'
+    ...     _ = name.write_text(lens)
     ...     camera = read_camera(name)
     >>> [round(math.degrees(edge), 1) for edge in camera.view_rad]
     [-45.0, 45.0]
@@ -278,11 +290,14 @@ class CameraRecord:
         if self.fx is not None:
             fx = in_range("camera.fx", self.fx, 0.0, math.inf, open_low=True)
             half_angle = math.atan2(0.5 * self.width_px, fx)
+        if self.position_m is None:
+            problem = "expected where it stands in base_link, metres; [0, 0, 0] for one at the array"
+            raise InvalidArgumentError(f"camera.position_m: {problem}")
         return PinholeCamera(
             width_px=self.width_px,
             height_px=self.height_px,
             half_angle_rad=half_angle,
-            position_m=self.position_m or (0.0, 0.0, 0.0),
+            position_m=self.position_m,
             yaw_rad=math.radians(self.yaw_deg or 0.0),
             pitch_rad=math.radians(self.pitch_deg or 0.0),
             principal_px=self.cx,

@@ -92,7 +92,7 @@ class VisionQuery:
     --------
     >>> from worldstate.adapters.camera.detections import DetectionFrame
     >>> empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
-    >>> query = VisionQuery(PinholeCamera(), DetectionLog.at_rate([empty] * 30, frame_rate_hz=10.0))
+    >>> query = VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate([empty] * 30, frame_rate_hz=10.0))
     >>> answer = query.ask(nanoseconds(1.0), Bearing(0.0, 0.05))
     >>> type(answer).__name__, round(answer.miss_rate, 2)
     ('Absent', 0.06)
@@ -156,7 +156,7 @@ class VisionQuery:
         Examples
         --------
         >>> from worldstate.adapters.camera.detections import DetectionFrame
-        >>> query = VisionQuery(PinholeCamera(), None)
+        >>> query = VisionQuery(PinholeCamera.ovad(), None)
         >>> query.see(nanoseconds(0.9), DetectionFrame(np.empty((0, 4)), np.empty(0), ()))
         >>> type(query.ask(nanoseconds(1.0), Bearing(0.0, 0.05))).__name__
         'Absent'
@@ -198,7 +198,7 @@ class VisionQuery:
 
         Examples
         --------
-        >>> nothing = VisionQuery(PinholeCamera(), detections=None)
+        >>> nothing = VisionQuery(PinholeCamera.ovad(), detections=None)
         >>> nothing.ask(0, Bearing(0.0, 0.05))
         Unqueried(reason='no detections file')
         """
@@ -234,7 +234,7 @@ class VisionQuery:
 
         Examples
         --------
-        >>> VisionQuery(PinholeCamera(), detections=None).sightings(0)
+        >>> VisionQuery(PinholeCamera.ovad(), detections=None).sightings(0)
         ()
         """
         frame = self._frame(stamp_ns)
@@ -259,7 +259,7 @@ class VisionQuery:
 
         Examples
         --------
-        >>> VisionQuery(PinholeCamera(), detections=None).last_look(0) is None
+        >>> VisionQuery(PinholeCamera.ovad(), detections=None).last_look(0) is None
         True
         """
         frame = self._frame(stamp_ns)
@@ -359,8 +359,8 @@ class SeveralCameras:
     >>> from worldstate.adapters.camera.pinhole import PinholeCamera
     >>> empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     >>> log = DetectionLog.at_rate([empty] * 30, frame_rate_hz=10.0)
-    >>> front = VisionQuery(PinholeCamera(), log)
-    >>> again = SeveralCameras({"front": front, "spare": VisionQuery(PinholeCamera(), log)})
+    >>> front = VisionQuery(PinholeCamera.ovad(), log)
+    >>> again = SeveralCameras({"front": front, "spare": VisionQuery(PinholeCamera.ovad(), log)})
     >>> heard = Bearing(0.0, 0.05)
     >>> [round(one.ask(10**9, heard).miss_rate, 4) for one in (front, again)]
     [0.0589, 0.0035]

@@ -69,7 +69,7 @@ class LiveCamera:
 
     def __init__(self, detector: BrightBlocks, miss_rate: float = 0.05) -> None:
         width_px, height_px = IMAGE_PX
-        self._camera = PinholeCamera(width_px, height_px, position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
+        self._camera = PinholeCamera(width_px, height_px, 0.6, (0.0, 0.0, 0.0))
         self._detector, self._miss_rate = detector, miss_rate
         self._seen: tuple[Sighting, ...] | None = None
 
@@ -144,7 +144,7 @@ def image(time_s: float) -> np.ndarray:
     width_px, height_px = IMAGE_PX
     frame = np.zeros((height_px, width_px, 3), dtype=np.uint8)
     if time_s >= IN_VIEW_S:
-        camera = PinholeCamera(width_px, height_px, position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
+        camera = PinholeCamera(width_px, height_px, 0.6, (0.0, 0.0, 0.0))
         column = int(camera.column(azimuth_at(time_s)))
         frame[:, max(column - 30, 0) : column + 30] = 255
     return frame

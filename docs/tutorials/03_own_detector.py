@@ -40,7 +40,7 @@ def main(out: Path, size: str = "full") -> None:
     boxes = [np.array([[left, 90.0, left + 40.0, 150.0]]) for left in lefts]
     truth = DetectionLog.at_rate([DetectionFrame(box, np.ones(1), ("car",)) for box in boxes], 10.0)
     images = SimpleNamespace(frames=lambda: (street(left, rng) for left in lefts), count=len(lefts))
-    scene = LabelledVideo(images, truth, PinholeCamera(width_px=320, height_px=200))
+    scene = LabelledVideo(images, truth, PinholeCamera.ovad(width_px=320, height_px=200))
     rates = measure_absence([scene], BrightColumns, rng, AbsenceSettings(families=("noise",)))
     save_miss_rates(out / "my_detector.json", rates)  # for `worldstate run --miss-rates my_detector.json`
     with figure_file(out / "03_own_detector.png", 8.0, 3.6) as figure:

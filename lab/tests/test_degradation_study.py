@@ -68,7 +68,7 @@ from worldstate.operations.detectors.miss_rate_measurement import (
 )
 from worldstate.operations.recordings.hop_table import HopTable, joined
 
-WHOLE = PinholeCamera()
+WHOLE = PinholeCamera.ovad()
 WIDTH, HEIGHT = 484, 304
 MOTION = motion_detectors()[:1]
 STAGED = (Condition(CLEAN), Condition("noise", 1), Condition("noise", 4), Condition("lens", 4))
@@ -192,7 +192,7 @@ def test_counts_are_those_of_measure_absence(approach, video):
     reference = DetectionLog(whole.frames[first:last], whole.stamps_ns[first:last])
     small = np.array([WIDTH / WHOLE.width_px, HEIGHT / WHOLE.height_px] * 2)
     frames = [DetectionFrame(one.boxes_px * small, one.scores, one.labels) for one in reference.frames]
-    camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
+    camera = PinholeCamera.ovad(width_px=WIDTH, height_px=HEIGHT)
     scene = LabelledVideo(part(video, first, last), replace(reference, frames=tuple(frames)), camera)
     # The height below which a reference box does not count is one in the pixels of the video.
     keep = replace(AbsenceSettings().keep, min_height_px=40.0 * HEIGHT / WHOLE.height_px)

@@ -102,7 +102,7 @@ def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
     share = np.full(len(GROUPS), 0.02)
     share[GROUPS.index("none")] = 1.0 - 0.02 * (len(GROUPS) - 1)
     detections = stream_detections(made_up, np.random.default_rng(1))
-    vision = VisionQuery(PinholeCamera(), detections, keep=EVERYBODY)
+    vision = VisionQuery(PinholeCamera.ovad(), detections, keep=EVERYBODY)
     silent, unasked = NotUsable("not scripted"), Unqueried("no camera")
     measured = []
     for time_s, sides in zip(made_up.hops.time_s.tolist(), said, strict=True):

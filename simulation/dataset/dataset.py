@@ -124,7 +124,7 @@ class DatasetSettings:
     kind: str = "light"
     duration_s: float = 10.0
     video: bool = False
-    video_width_px: int = PinholeCamera().width_px
+    video_width_px: int = PinholeCamera.ovad().width_px
     preset: str = DEFAULT_PRESET
     sounds: tuple[str, ...] = ()
     bandwidth_hz: float | None = None
@@ -136,7 +136,7 @@ class DatasetSettings:
         in_range("n_static + n_dynamic", self.n_static + self.n_dynamic, 1, MAX_RECORDINGS)
         in_range("seed", self.seed, 0, 2**63)
         in_range("duration_s", self.duration_s, 0.5, 60.0)
-        in_range("video_width_px", self.video_width_px, 64, PinholeCamera().width_px)
+        in_range("video_width_px", self.video_width_px, 64, PinholeCamera.ovad().width_px)
         vehicle_kind(self.kind)
         if self.bandwidth_hz is not None:
             in_range("bandwidth_hz", self.bandwidth_hz, *BANDWIDTHS_HZ)
@@ -155,10 +155,10 @@ class DatasetSettings:
 
     def camera(self) -> PinholeCamera:
         """Return the camera of the video: OVAD's, with images of the width that is wanted."""
-        whole = PinholeCamera()
+        whole = PinholeCamera.ovad()
         # An even height: the codec takes no other.
         height_px = 2 * round(0.5 * whole.height_px * self.video_width_px / whole.width_px)
-        return PinholeCamera(width_px=self.video_width_px, height_px=height_px)
+        return PinholeCamera.ovad(width_px=self.video_width_px, height_px=height_px)
 
     def plans(self) -> list[Plan]:
         """Return what every recording is: site after site, the standing ego first.
@@ -432,7 +432,7 @@ def camera_frames(
     >>> from worldstate.simulation import simulate_recording, site
     >>> settings = SimulationSettings(site("SA1"), "left", duration_s=0.6, entry_s=0.3, sample_rate_hz=8e3)
     >>> recording = simulate_recording(settings, np.random.default_rng(1))
-    >>> small = PinholeCamera(width_px=96, height_px=60)
+    >>> small = PinholeCamera.ovad(width_px=96, height_px=60)
     >>> frames = list(camera_frames(settings, recording, np.random.default_rng(1), small))
     >>> len(frames), frames[0].shape, frames[0].dtype
     (6, (60, 96, 3), dtype('uint8'))
@@ -440,7 +440,7 @@ def camera_frames(
     # The street is the site's own; buildings hide the vehicle until its front passes the line of sight past
     # their corner, which is the recording's T0. Light is even and the camera stands still, so that all that
     # changes is the vehicle, its shadow and the sensor's noise.
-    view = View(camera or PinholeCamera())
+    view = View(camera or PinholeCamera.ovad())
     paint, parked_paint = (PAINTS[i] for i in rng.integers(len(PAINTS), size=2))
     street = paint_street(settings.site, view)
     if settings.parked_car:
@@ -493,7 +493,7 @@ def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
     still = boxes[(np.abs(boxes - boxes[:1]) < STILL_PX).all(axis=1)] if len(boxes) else boxes
     if not len(still):
         return None
-    camera, faces = PinholeCamera(), parked_lane_m(site) + WIDTH_M * np.array([-0.5, 0.5])
+    camera, faces = PinholeCamera.ovad(), parked_lane_m(site) + WIDTH_M * np.array([-0.5, 0.5])
     right, left = site.sights_m(faces, camera.position_m[:2])
     middles = np.arange(right[0], left[0], STEP_M)
     ends = np.clip(middles[:, None, None] + LENGTH_M * np.array([[-0.5], [0.5]]), right, left)

@@ -229,7 +229,7 @@ def simulate_recording(
     array = ovad_array() if array is None else array
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
         audio = _record(settings, array, to_sound)
-    camera, frames = PinholeCamera(), _frame_times(settings)
+    camera, frames = PinholeCamera.ovad(), _frame_times(settings)
     seen = [path.at(frames) for path in trajectories(settings, _knots(settings))]
     ego_x = settings.ego.x_m(frames)
     sights = [line_of_sight(path, settings.site, camera, ego_x) for path in seen]

@@ -19,7 +19,7 @@ def image_edges_rad(camera: PinholeCamera) -> tuple[float, float]:
 
     Examples
     --------
-    >>> [round(float(edge), 3) for edge in image_edges_rad(PinholeCamera())]
+    >>> [round(float(edge), 3) for edge in image_edges_rad(PinholeCamera.ovad())]
     [-0.597, 0.597]
     """
     right, left = camera.off_axis(camera.azimuth([camera.width_px, 0.0])) + camera.yaw_rad
@@ -35,7 +35,7 @@ def camera_sees(
     --------
     >>> from worldstate.simulation.scene.junction import site
     >>> x, y = np.array([8.0, 8.0, 2.0, -8.0]), np.array([3.0, 8.0, 2.5, 0.0])
-    >>> camera_sees(site("SA1"), PinholeCamera(), x, y)
+    >>> camera_sees(site("SA1"), PinholeCamera.ovad(), x, y)
     array([ True, False, False, False])
     """
     eye = (ego_x_m + camera.position_m[0], camera.position_m[1])
@@ -91,10 +91,10 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
 
 def entry_y_m(site: Site, lane_m: float, approach: str, ego_x_m: float = 0.0) -> float:
     """Return where in its lane the camera first sees a vehicle that comes from the left or the right."""
-    eye_x, eye_y, _ = PinholeCamera().position_m
+    eye_x, eye_y, _ = PinholeCamera.ovad().position_m
     right, left = site.sight_m(lane_m, (ego_x_m + eye_x, eye_y))
     ahead = lane_m - ego_x_m - eye_x
-    right_edge, left_edge = (eye_y + ahead * np.tan(edge) for edge in image_edges_rad(PinholeCamera()))
+    right_edge, left_edge = (eye_y + ahead * np.tan(edge) for edge in image_edges_rad(PinholeCamera.ovad()))
     return float(min(left, left_edge) if approach == "left" else max(right, right_edge))
 
 
@@ -115,7 +115,7 @@ def _first_sight(site: Site, vehicle: VehicleSettings) -> tuple[float, str]:
     length = float(np.hypot(*np.diff(np.array(vehicle.route_m), axis=0).T).sum())
     driven = np.arange(0.0, length, SEARCH_STEP_M)
     x, y = route.at(driven)
-    seen = camera_sees(site, PinholeCamera(), x, y)
+    seen = camera_sees(site, PinholeCamera.ovad(), x, y)
     if seen.any() and not seen[0]:
         return float(driven[_longest_begins(seen)]), "hidden at first"
     return float(driven[np.hypot(x, y).argmin()]), "in view at first" if seen.any() else "never"

@@ -43,7 +43,7 @@ def visible_s(event: VehicleEvent, site: Site, ego: EgoMotion = STANDING) -> flo
     """Time of the stream at which a vehicle first comes into view; None where it never does."""
     clock = np.arange(0.0, event.manoeuvre.motion.duration_s, CLOCK_S)
     path, ego_x = event.manoeuvre.motion.trajectory(clock), ego.x_m(event.start_s + clock)
-    seen = line_of_sight(path, site, PinholeCamera(), ego_x)
+    seen = line_of_sight(path, site, PinholeCamera.ovad(), ego_x)
     return round(event.start_s + float(clock[seen.argmax()]), 6) if seen.any() else None
 
 
@@ -54,7 +54,7 @@ def detected_frames(
     rng: np.random.Generator,
 ) -> list[Frame]:
     """Boxes of a whole stream: vehicles with misses, a parked car in some, clutter; rain takes some."""
-    camera, to_park, to_clutter, to_vehicles, to_rain = PinholeCamera(), *rng.spawn(4)
+    camera, to_park, to_clutter, to_vehicles, to_rain = PinholeCamera.ovad(), *rng.spawn(4)
     count = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
     frames: list[Frame] = [()] * count
     if to_park.random() < PARKED_SHARE:
@@ -71,7 +71,7 @@ def _add_boxes(frames: list[Frame], event: VehicleEvent, site: Site, rng: np.ran
     path = event.manoeuvre.motion.trajectory(numbers / FRAME_RATE_HZ - event.start_s)
     # What is beside or behind the camera has no picture in it.
     ahead = path.behind(0.0)[0] > NEAREST_BOX_M
-    boxes = detect(path.at(path.time_s[ahead]), site, PinholeCamera(), rng)
+    boxes = detect(path.at(path.time_s[ahead]), site, PinholeCamera.ovad(), rng)
     for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
         frames[number] += seen
 
@@ -87,7 +87,7 @@ def _soiled(sounds: Sequence[SoundEvent], count: int) -> FloatArray:
 
 
 def _add_clutter(frames: list[Frame], rng: np.random.Generator) -> None:
-    camera = PinholeCamera()
+    camera = PinholeCamera.ovad()
     for _ in range(rng.poisson(CLUTTER_PER_HOUR * len(frames) / FRAME_RATE_HZ / 3600.0)):
         first = int(rng.integers(len(frames)))
         width = rng.uniform(*CLUTTER_WIDTH_PX)
@@ -153,7 +153,7 @@ def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) ->
         axle_rad=np.arctan2(axle_y, axle_x - ego_x),
         axle_m=np.hypot(axle_x - ego_x, axle_y),
         speed_mps=path.speed_mps,
-        in_view=line_of_sight(path, settings.site, PinholeCamera(), ego_x),
+        in_view=line_of_sight(path, settings.site, PinholeCamera.ovad(), ego_x),
     )
 
 

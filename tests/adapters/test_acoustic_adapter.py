@@ -56,7 +56,7 @@ def plane_wave(azimuth_rad: float, seconds: float, gain_per_s: float = 0.0, seed
 def camera_log(azimuth_rad: float | None) -> DetectionLog:
     """A car that shakes enough not to be parked, centred on an azimuth, or empty frames."""
     frames = []
-    columns = [] if azimuth_rad is None else [float(PinholeCamera().column(azimuth_rad))]
+    columns = [] if azimuth_rad is None else [float(PinholeCamera.ovad().column(azimuth_rad))]
     for i in range(40):
         boxes = [[c + 8.0 * (i % 3) - 60, 500, c + 8.0 * (i % 3) + 60, 650] for c in columns]
         labels = ("car",) * len(boxes)
@@ -102,9 +102,9 @@ def test_a_measurement_every_hop_after_the_first_second(start_ns: int) -> None:
 @pytest.mark.parametrize("azimuth_rad", [-0.5, 0.0, 0.5])
 def test_hears_where_the_sound_is_and_asks_there(azimuth_rad: float) -> None:
     sound = plane_wave(azimuth_rad, 1.5)
-    seen = VisionQuery(PinholeCamera(), camera_log(azimuth_rad))
-    empty = VisionQuery(PinholeCamera(), camera_log(None))
-    elsewhere = VisionQuery(PinholeCamera(), camera_log(-0.5 if azimuth_rad >= 0 else 0.5))
+    seen = VisionQuery(PinholeCamera.ovad(), camera_log(azimuth_rad))
+    empty = VisionQuery(PinholeCamera.ovad(), camera_log(None))
+    elsewhere = VisionQuery(PinholeCamera.ovad(), camera_log(-0.5 if azimuth_rad >= 0 else 0.5))
     for vision, answer in ((seen, Present), (empty, Absent), (elsewhere, Absent)):
         measured = AcousticAdapter(ARRAY, RATE_HZ, Level(), vision).measure(sound)
         assert [type(m.co_evidence) for m in measured] == [answer] * 6
@@ -115,13 +115,13 @@ def test_hears_where_the_sound_is_and_asks_there(azimuth_rad: float) -> None:
 
 
 def test_a_sound_beside_the_view_is_not_asked_about() -> None:
-    vision = VisionQuery(PinholeCamera(), camera_log(None))
+    vision = VisionQuery(PinholeCamera.ovad(), camera_log(None))
     answers = AcousticAdapter(ARRAY, RATE_HZ, Level(), vision).measure(plane_wave(1.1, 1.2))
     assert {m.co_evidence for m in answers} == {Unqueried("sector outside the field of view")}
 
 
 def test_a_coarse_bearing_takes_its_side_from_the_signature(monkeypatch: pytest.MonkeyPatch) -> None:
-    vision = VisionQuery(PinholeCamera(), camera_log(0.4))
+    vision = VisionQuery(PinholeCamera.ovad(), camera_log(0.4))
     monkeypatch.setattr(acoustic, "_COARSE_STD_RAD", 0.0)
     # Two waves as strong: reflected sound, whose bearing does not vote.
     sound = plane_wave(-0.3, 1.0) + plane_wave(-1.1, 1.0, seed=4)

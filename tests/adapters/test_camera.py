@@ -14,7 +14,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import wrap_angle
 
 CAMERAS = st.builds(
-    PinholeCamera,
+    PinholeCamera.ovad,
     half_angle_rad=st.floats(0.1, 1.3),
     position_m=st.tuples(st.floats(-3, 3), st.floats(-1, 1), st.floats(-1, 1)),
     yaw_rad=st.floats(-math.pi, math.pi),
@@ -75,12 +75,12 @@ def test_agrees_with_opencv(camera: PinholeCamera, off_axis: float) -> None:
 
 
 def test_the_middle_of_a_camera_at_the_origin_is_straight_ahead() -> None:
-    camera = PinholeCamera(position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
+    camera = PinholeCamera.ovad(position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
     np.testing.assert_allclose(camera.azimuth([0, 968, 1936]), [0.6, 0.0, -0.6], atol=1e-12)
 
 
 def test_the_parallax_shift_is_what_it_says() -> None:
-    camera = PinholeCamera()
+    camera = PinholeCamera.ovad()
     for side, degrees in ((1, 1.5), (-1, 1.8)):
         azimuth = side * math.radians(30.0)
         shift = abs(azimuth - float(camera.off_axis(azimuth)))
@@ -88,14 +88,14 @@ def test_the_parallax_shift_is_what_it_says() -> None:
 
 
 def test_behind_the_camera_is_in_no_column() -> None:
-    assert np.isnan(PinholeCamera().column([math.pi, 2.0, -2.0])).all()
-    rear = PinholeCamera(yaw_rad=math.pi, position_m=(0.0, 0.0, 0.0))
+    assert np.isnan(PinholeCamera.ovad().column([math.pi, 2.0, -2.0])).all()
+    rear = PinholeCamera.ovad(yaw_rad=math.pi, position_m=(0.0, 0.0, 0.0))
     assert float(rear.column(math.pi)) == pytest.approx(968)
 
 
 @given(left=st.floats(0.0, 1800.0), width=st.floats(1.0, 130.0))
 def test_a_sighting_lies_between_the_edges_of_its_box(left: float, width: float) -> None:
-    camera = PinholeCamera()
+    camera = PinholeCamera.ovad()
     seen = camera.sighting((left, 400, left + width, 700), "car", 0.9)
     assert camera.azimuth(left + width) < seen.azimuth_rad < camera.azimuth(left)
     assert seen.width_rad == pytest.approx(float(camera.azimuth(left) - camera.azimuth(left + width)))
@@ -104,9 +104,9 @@ def test_a_sighting_lies_between_the_edges_of_its_box(left: float, width: float)
 
 def test_an_unknown_range_widens_a_sighting() -> None:
     box = (100, 400, 200, 700)
-    known, unknown = (PinholeCamera(range_spread=s).sighting(box, "car", 0.9) for s in (0.0, 1.0))
+    known, unknown = (PinholeCamera.ovad(range_spread=s).sighting(box, "car", 0.9) for s in (0.0, 1.0))
     assert known.std_rad == pytest.approx(known.width_rad / math.sqrt(12))
-    shift = unknown.azimuth_rad - float(PinholeCamera().off_axis(unknown.azimuth_rad))
+    shift = unknown.azimuth_rad - float(PinholeCamera.ovad().off_axis(unknown.azimuth_rad))
     assert unknown.std_rad == pytest.approx(math.hypot(known.std_rad, shift))
 
 
@@ -124,9 +124,9 @@ def test_an_unknown_range_widens_a_sighting() -> None:
 )
 def test_refuses_a_camera_without_meaning(setting: dict[str, Any]) -> None:
     with pytest.raises(InvalidArgumentError, match=next(iter(setting))):
-        PinholeCamera(**setting)
+        PinholeCamera.ovad(**setting)
 
 
 def test_refuses_a_box_of_another_camera() -> None:
     with pytest.raises(InvalidArgumentError, match="1936"):
-        PinholeCamera().sighting((2000, 0, 2100, 200), "car", 0.9)
+        PinholeCamera.ovad().sighting((2000, 0, 2100, 200), "car", 0.9)

@@ -16,15 +16,16 @@ from worldstate.adapters.camera.detections import (
     read_any_detections,
 )
 from worldstate.adapters.camera.detectors import MotionDetector
-from worldstate.adapters.camera.pinhole import read_camera
+from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
-from worldstate.adapters.listener import listen
-from worldstate.adapters.source import open_source
+from worldstate.adapters.listener import Listener, listen
+from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.common.sensors import given_sensors
 from worldstate.cli.main import PROGRAM, main
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
-SIZE = {"width_px": 1000, "height_px": 600}
+SIZE = {"width_px": 1000, "height_px": 600, "position_m": [0, 0, 0]}
 
 
 def test_field_of_view_and_intrinsics_say_the_same(tmp_path):
@@ -50,7 +51,8 @@ def test_an_axis_beside_the_middle_and_a_turned_camera(tmp_path):
     "text",
     ["", "[]", "{}", json.dumps(SIZE), json.dumps(SIZE | {"fx": 1.0, "horizontal_fov_deg": 9.0}),
      json.dumps(SIZE | {"fx": 0.0}), json.dumps(SIZE | {"horizontal_fov_deg": 180.0}),
-     json.dumps(SIZE | {"fx": 500.0, "cx": -1.0}), json.dumps(SIZE | {"fx": "500"})],
+     json.dumps(SIZE | {"fx": 500.0, "cx": -1.0}), json.dumps(SIZE | {"fx": "500"}),
+     json.dumps({"width_px": 1000, "height_px": 600, "fx": 500.0})],
 )  # fmt: skip
 def test_bad_lenses(tmp_path, text):
     (tmp_path / "camera.json").write_text(text)
@@ -125,7 +127,7 @@ def test_images_that_carry_no_stamp_come_at_the_rate_that_is_said(tmp_path, caps
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps(rows))
     words = ["a.wav", "--detections", str(boxes)]
-    lens = {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}
+    lens = {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "position_m": [0, 0, 0]}
 
     def reported(camera: dict) -> object:
         (tmp_path / "camera.json").write_text(json.dumps(lens | camera))
@@ -170,3 +172,20 @@ def test_an_empty_list_of_results_is_looks_where_the_images_are_told(tmp_path):
     (tmp_path / "none.json").write_text("[]")
     assert len(read_any_detections(tmp_path / "none.json", n_images=30)) == 30
     assert len(read_any_detections(tmp_path / "none.json")) == 0
+
+
+def test_images_of_a_camera_that_is_not_described_are_refused_beside_another_array(tmp_path):
+    array = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
+    anything, empty = ListenSettings(uncalibrated=True), DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    seen = DetectionLog.at_rate([empty] * 3, 10.0)
+    soundfile.write(tmp_path / "a.wav", np.zeros((48_000, 3)), 48_000)
+    for given in ({"detections": seen}, {"detections": seen, "camera": PinholeCamera.ovad()}):
+        try:
+            open_source(tmp_path / "a.wav", array=array, settings=anything, **given)
+            refused = False
+        except InvalidArgumentError as error:
+            refused = "where it stands" in str(error)
+        assert refused == ("camera" not in given)
+    with pytest.raises(InvalidArgumentError, match="where it stands beside the array"):
+        Listener(array, 48_000, settings=anything).look(0, empty)
+    Listener(ovad_array(), 48_000).look(0, empty)

@@ -126,7 +126,7 @@ def query(*boxes: str, keep: frozenset[str] = frozenset({"car", "truck"})) -> Vi
     frames = [DetectionFrame(box, np.array([0.9]), (name,)) for name in boxes]
     empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     log = DetectionLog.at_rate([*frames, empty], frame_rate_hz=10.0)
-    return VisionQuery(PinholeCamera(), log, keep=DetectionFilter(keep))
+    return VisionQuery(PinholeCamera.ovad(), log, keep=DetectionFilter(keep))
 
 
 def test_a_class_that_the_filter_drops_is_always_missed_and_alone_was_not_asked_for() -> None:

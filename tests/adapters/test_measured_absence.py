@@ -231,7 +231,7 @@ def test_vision_follows_the_camera_without_being_told(health):
     d = video_degradation(video, rates)
     empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     box = DetectionFrame(np.array([[300.0, 100.0, 340.0, 300.0]]), np.array([0.9]), ("car",))
-    camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
+    camera = PinholeCamera.ovad(width_px=WIDTH, height_px=HEIGHT)
     answers = []
     for shown in (empty, box):
         log = DetectionLog.at_rate([shown] * 20, 10.0)
@@ -259,7 +259,7 @@ def test_present_and_absent_share_one_model_of_miss_and_clutter(beta, clutter):
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("video")
     video = open_video(write_video(folder / "street.mp4", street(26, speed_px=16.0)))
-    camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
+    camera = PinholeCamera.ovad(width_px=WIDTH, height_px=HEIGHT)
     return LabelledVideo(video, reference(26, 16.0), camera)
 
 

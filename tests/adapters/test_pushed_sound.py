@@ -48,19 +48,19 @@ def pushed(listener: Listener, start: int, end: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def in_one(model: Model) -> list[str]:
-    listener = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera())
+    listener = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad())
     return pushed(listener, 0, len(SOUND)) + [state.to_json() for state in listener.push(None)]
 
 
 @settings(max_examples=15)
 @given(cut=st.integers(0, len(SOUND)))
 def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Model, in_one: list[str]) -> None:
-    first = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera())
+    first = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad())
     states = pushed(first, 0, cut)
     kept = first.checkpoint()
     first.push(SOUND[cut:])  # a checkpoint stays what it was
     for _ in range(2):  # and is gone on from more than once
-        second = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera(), resume=kept)
+        second = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad(), resume=kept)
         rest = pushed(second, cut, len(SOUND)) + [state.to_json() for state in second.push(None)]
         assert states + rest == in_one
 

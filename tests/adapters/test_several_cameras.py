@@ -65,7 +65,7 @@ def test_what_one_of_them_finds_is_present_and_named():
 
 
 def test_a_camera_without_an_image_leaves_the_others_to_look():
-    blind = VisionQuery(PinholeCamera(), DetectionLog((EMPTY,), np.array([0])))
+    blind = VisionQuery(PinholeCamera.ovad(), DetectionLog((EMPTY,), np.array([0])))
     both = SeveralCameras({"front": blind, "left": camera(60.0, frame=CAR)})
     assert both.last_look(NOW).sensor == "left" and len(both.sightings(NOW)) == 1
     assert isinstance(SeveralCameras({"front": blind}).ask(NOW, COARSE), Unqueried)

@@ -16,7 +16,7 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.values import NotUsable, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CoEvidenceChannel
 
-CENTRED = PinholeCamera(position_m=(-0.567, 0.0, -0.485))
+CENTRED = PinholeCamera.ovad(position_m=(-0.567, 0.0, -0.485))
 TABLE = MissRateTable((0.0, 20.0, 40.0), (0.0, 1.0), ((0.04, 0.9), (0.1, 0.95), (0.3, 1.0)))
 AZIMUTHS = st.floats(-math.pi, math.pi)
 DEGREE = math.pi / 180

@@ -52,7 +52,7 @@ def desk(approach, tmp_path_factory):
     positions = "\n".join(",".join(map(str, row)) for row in ovad_array().positions_m.tolist())
     (folder / "mics.csv").write_text("x,y,z\n" + positions + "\n")
     save_model(folder / "my_model.json", read_model())
-    lens = {"width_px": SIZE[0], "height_px": SIZE[1], "horizontal_fov_deg": 60}
+    lens = {"width_px": SIZE[0], "height_px": SIZE[1], "horizontal_fov_deg": 60, "position_m": [0, 0, 0]}
     (folder / "camera.json").write_text(json.dumps(lens))
     boxes = [
         {"image_id": k, "category_id": 3, "bbox": [100 + 3 * k, 150, 150, 120], "score": 0.9}

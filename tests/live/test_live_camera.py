@@ -22,7 +22,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 
-CAMERA = PinholeCamera(width_px=640, height_px=480, position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
+CAMERA = PinholeCamera.ovad(width_px=640, height_px=480, position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
 AHEAD = Bearing(0.0, 0.05)
 EMPTY = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
 

@@ -116,7 +116,7 @@ def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch)
     page = Path(__file__).resolve().parents[2] / "docs" / "live.md"
     (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     (tmp_path / "mics.csv").write_text((street / "mics.csv").read_text())
-    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}
+    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
     (tmp_path / "camera.json").write_text(json.dumps(lens))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
@@ -164,7 +164,8 @@ def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys)
         "worldstate.adapters.live.live_sensors.optional", lambda module: SimpleNamespace(VideoCapture=Capture)
     )
     lens, states = tmp_path / "lens.json", tmp_path / "states.jsonl"
-    lens.write_text(json.dumps({"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}))
+    camera = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
+    lens.write_text(json.dumps(camera))
     asked = "--camera-device", 0, "--camera", lens, "--out", states, "--json"
     assert main(command(street, *asked)) == 0
     # Every image is looked at before the next block of sound is taken.
@@ -211,7 +212,7 @@ def test_a_detector_of_ones_own_is_asked(street, tmp_path, capsys):
 
 
 def test_several_cameras_are_asked_and_a_box_outside_an_image_is_refused(street, tmp_path, capsys):
-    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}
+    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
     cameras = [{"name": name, **lens, "yaw_deg": yaw} for name, yaw in (("front", 0.0), ("aside", 60.0))]
     car, states = tmp_path / "car.json", tmp_path / "states.jsonl"
     positions_m = np.loadtxt(street / "mics.csv", delimiter=",").tolist()

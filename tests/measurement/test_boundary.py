@@ -60,7 +60,7 @@ def street(rng, seconds):
 
 def test_a_hop_of_the_whole_chain_makes_at_most_forty_checks():
     boxes = DetectionFrame(np.array([[900.0, 500.0, 1100.0, 650.0]]), np.array([0.9]), ("car",))
-    vision = VisionQuery(PinholeCamera(), DetectionLog.at_rate([boxes] * 60, frame_rate_hz=10.0))
+    vision = VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate([boxes] * 60, frame_rate_hz=10.0))
     signature = SiteSignature(read_model().signature)
     adapter = AcousticAdapter(ovad_array(), RATE_HZ, signature, vision=vision)
     calls, hops, world = 0, 0, WorldFilter()

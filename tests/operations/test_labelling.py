@@ -192,7 +192,8 @@ def recording(tmp_path):
     ]
     boxes, camera, sound = tmp_path / "boxes.json", tmp_path / "camera.json", folder / "street.wav"
     boxes.write_text(json.dumps({"detections_per_frame": rows}))
-    camera.write_text(json.dumps({"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68.75}))
+    lens = {"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68.75, "position_m": [0, 0, 0]}
+    camera.write_text(json.dumps(lens))
     soundfile.write(sound, rng.uniform(-0.01, 0.01, (4000 * 25, 56)), 4000)
     return ["street", "label", str(sound), "--detections", str(boxes), "--camera", str(camera)]
 

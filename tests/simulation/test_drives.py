@@ -46,7 +46,7 @@ def test_every_drive_has_one_approach_which_is_seen_shortly_before_the_ego_stops
             at = np.array([one.t0_s + late_s])
             path = one.event.manoeuvre.motion.trajectory(at - one.event.start_s)
             (x,), (y,) = path.behind(0.0)
-            eye_x, eye_y = PinholeCamera().position_m[:2] + np.array([drawn.ego.x_m(at)[0], 0.0])
+            eye_x, eye_y = PinholeCamera.ovad().position_m[:2] + np.array([drawn.ego.x_m(at)[0], 0.0])
             mouth = eye_y + (y - eye_y) * (drawn.site.corner_ahead_m - eye_x) / (x - eye_x)
             passes = -drawn.site.corner_right_m < mouth < drawn.site.corner_left_m
             pictured = abs(np.arctan2(y - eye_y, x - eye_x)) < HALF_IMAGE_RAD

@@ -29,7 +29,7 @@ from worldstate.simulation.dataset.recording import describe
 from worldstate.simulation.scene.driving import trajectories
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
-CAMERA = PinholeCamera()
+CAMERA = PinholeCamera.ovad()
 TIME_S = np.arange(-2.0, 12.0, 0.05)
 FRAMES_S = np.arange(0.0, 10.0, 0.1)
 

@@ -45,8 +45,8 @@ from worldstate.simulation.dataset.dataset import (
 from worldstate.simulation.scene.vehicle import HEIGHT_M, LENGTH_M, WIDTH_M
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
-SMALL = PinholeCamera(width_px=320, height_px=201)
-MIDDLE = PinholeCamera(width_px=640, height_px=402)
+SMALL = PinholeCamera.ovad(width_px=320, height_px=201)
+MIDDLE = PinholeCamera.ovad(width_px=640, height_px=402)
 RED = (180.0, 20.0, 20.0)
 
 
@@ -110,7 +110,7 @@ def test_a_solid_is_met_where_sampling_says(seed):
 
 
 def test_the_nearer_panel_hides_the_farther_in_any_order():
-    view = View(PinholeCamera(width_px=8, height_px=6, pitch_rad=0.0))
+    view = View(PinholeCamera.ovad(width_px=8, height_px=6, pitch_rad=0.0))
 
     def plain(colour):
         return lambda a, b: np.full((*a.shape, 3), colour, np.float32)
@@ -215,9 +215,9 @@ def test_the_parked_car_is_read_back_from_its_boxes(seed, name):
 
     rng = np.random.default_rng(seed)
     plan = site(name)
-    right, left = plan.sight_m(parked_lane_m(plan), PinholeCamera().position_m[:2])
+    right, left = plan.sight_m(parked_lane_m(plan), PinholeCamera.ovad().position_m[:2])
     middle = np.random.default_rng(seed).uniform(0.6 * right, 0.6 * left)
-    found = parked_middle_m(park(plan, PinholeCamera(), 20, rng), plan)
+    found = parked_middle_m(park(plan, PinholeCamera.ovad(), 20, rng), plan)
     # Where the line of sight cuts the car off, its box tells one end only; that end is in the picture.
     assert found == pytest.approx(middle, abs=0.25)
 
@@ -242,7 +242,7 @@ def test_the_parked_car_stands_in_its_box():
 @pytest.fixture(scope="module")
 def passing():
     """A car through the picture in a second and a half, as large as the camera takes it."""
-    return filmed(scene("SB2", "right", duration_s=2.0, entry_s=1.0), camera=PinholeCamera())
+    return filmed(scene("SB2", "right", duration_s=2.0, entry_s=1.0), camera=PinholeCamera.ovad())
 
 
 def missed(frames, recording, camera, family, d, seed=0):
@@ -262,14 +262,14 @@ def missed(frames, recording, camera, family, d, seed=0):
 def test_a_motion_detector_finds_the_vehicle_and_loses_it_in_each_family(family, passing):
     """Levels are those of the camera's own size, and blur is in pixels: the picture must be that large."""
     recording, frames = passing
-    rates = [missed(frames, recording, PinholeCamera(), family, d) for d in (0.25, 1.0)]
+    rates = [missed(frames, recording, PinholeCamera.ovad(), family, d) for d in (0.25, 1.0)]
     assert rates[0] <= 0.2
     assert rates[1] >= 0.9
 
 
 def test_a_motion_detector_finds_the_vehicle_in_clean_frames(passing):
     recording, frames = passing
-    assert missed(frames, recording, PinholeCamera(), "blur", 0.0) <= 0.1
+    assert missed(frames, recording, PinholeCamera.ovad(), "blur", 0.0) <= 0.1
 
 
 def test_video_comes_back_as_written(tmp_path):

@@ -181,7 +181,7 @@ def test_boxes_lie_where_the_camera_adapter_looks_for_them():
     scene = quickly(draw_settings("SB1", "left", np.random.default_rng(4), 10.0))
     scene = replace(scene, parked_car=False, braking_mps2=0.0, speed_mps=6.0)
     recording = simulate_recording(scene, np.random.default_rng(4), PAIR)
-    camera, compared = PinholeCamera(), 0
+    camera, compared = PinholeCamera.ovad(), 0
     for frame, seen in zip(recording.truth["frames"], recording.detections, strict=True):
         x, front = frame["position_m"]
         whole_in_view = abs(front) < 2.5 and abs(front + 4.3) < 2.5
@@ -194,7 +194,7 @@ def test_boxes_lie_where_the_camera_adapter_looks_for_them():
 
 
 def test_line_of_sight_is_the_straight_line_past_the_corner():
-    plan, camera = site("SA1"), PinholeCamera()
+    plan, camera = site("SA1"), PinholeCamera.ovad()
     path = drive(np.linspace(0, 4, 4001), entry_s=2, entry_y_m=3.9, lane_x_m=6.0, speed_mps=5.0)
     first = int(np.flatnonzero(line_of_sight(path, plan, camera))[0])
     eye_x, eye_y = camera.position_m[:2]

@@ -126,7 +126,7 @@ def test_at_constant_speed_the_time_to_visible_is_the_way_over_the_speed(
     settings = StreamSettings(plan, 2.0)
     truth = vehicle_truth(0, event, settings)
     # The line from the eye past the corner, by similar triangles.
-    eye_x, eye_y, _ = PinholeCamera().position_m
+    eye_x, eye_y, _ = PinholeCamera.ovad().position_m
     corner = plan.corner_left_m if arm == "left" else -plan.corner_right_m
     lane = truth.x_m[0]
     entry = eye_y + (corner - eye_y) * (lane - eye_x) / (plan.corner_ahead_m - eye_x)

@@ -77,7 +77,7 @@ def test_too_few_and_too_far():
 
 
 RINGS = [[0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [-0.1, -0.1, 0.1]]
-LENS = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 60.0}
+LENS = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 60.0, "position_m": [0, 0, 0]}
 CAMERAS = [LENS | {"name": "front"}, LENS | {"name": "left", "yaw_deg": 60.0, "stamp_offset_s": 0.5}]
 
 

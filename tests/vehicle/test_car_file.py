@@ -46,7 +46,7 @@ def test_a_mounting_turns_as_scipy_does(angles):
 def test_a_camera_that_looks_up_and_an_array_that_does_turn_alike(tmp_path):
     # What lies ahead of a sensor that is pitched up lies above the vehicle.
     assert Mounting(pitch_deg=20.0).applied([[1.0, 0.0, 0.0]])[0, 2] > 0.0
-    lens = written(tmp_path, LENS | {"pitch_deg": 20.0})
+    lens = written(tmp_path, LENS | {"pitch_deg": 20.0, "position_m": [0, 0, 0]})
     assert read_camera(lens).pitch_rad > 0.0
 
 

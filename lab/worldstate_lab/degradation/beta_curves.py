@@ -78,7 +78,7 @@ class BetaCurves:
 
 def absence_counts(reference: DetectionLog, boxes: HopTable) -> dict[str, FamilyCounts]:
     """Count what a detector missed of the reference of one recording, in every condition."""
-    tally = AbsenceTally(PinholeCamera(), SETTINGS)
+    tally = AbsenceTally(PinholeCamera.ovad(), SETTINGS)
     for family in FAMILIES:
         for level in range(len(LEVELS)):
             # The clean camera belongs to every family and is counted once.
@@ -119,13 +119,13 @@ def pooled_rates(
         raise InvalidArgumentError(
             "recordings: expected moving objects in view, found none to measure beta on"
         )
-    edges = SETTINGS.edges_deg(PinholeCamera())
+    edges = SETTINGS.edges_deg(PinholeCamera.ovad())
     return MissRates(edges, families, provenance, health_of(readings), REPEATS)
 
 
 def beta_curves(counts: Sequence[Counts], draws: IndexArray) -> BetaCurves:
     """Return the curves of all recordings; `draws` (draws, recordings) says which make each draw."""
-    edges = SETTINGS.edges_deg(PinholeCamera())
+    edges = SETTINGS.edges_deg(PinholeCamera.ovad())
     looks, misses = (
         np.array([[getattr(one[family], name) for family in FAMILIES] for one in counts])
         for name in ("looks", "misses")

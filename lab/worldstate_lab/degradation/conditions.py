@@ -282,7 +282,7 @@ def look(
 def _reported(found: DetectionFrame, image: ImageArray) -> Iterator[tuple[FloatArray, float, str]]:
     """Yield the boxes in pixels of OVAD's camera, whatever the size of the image."""
     height, width = image.shape[:2]
-    whole = PinholeCamera()
+    whole = PinholeCamera.ovad()
     scale = np.array([whole.width_px / width, whole.height_px / height] * 2)
     return zip(found.boxes_px * scale, found.scores.tolist(), found.labels, strict=True)
 

@@ -188,7 +188,7 @@ class OcSortRecovery:
     """
 
     reading: Reading
-    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    camera: PinholeCamera = field(default_factory=PinholeCamera.ovad)
 
     @property
     def name(self) -> str:

@@ -50,7 +50,7 @@ _STILL_M = 1e-3  # Of a tenth of a second: slower ones keep their heading
 
 def stream_detections(heard: HeardStream, rng: np.random.Generator) -> DetectionLog:
     """Return the boxes of everybody in view, missed as often as the paper's detector misses them."""
-    camera, site = PinholeCamera(), junction_named(heard.site)
+    camera, site = PinholeCamera.ovad(), junction_named(heard.site)
     frames: dict[int, list[Row]] = {}
     kinds = dict(zip(heard.vehicles.vehicle.tolist(), heard.vehicles.kind.tolist(), strict=True))
     for number, name in kinds.items():
@@ -243,6 +243,6 @@ def stream_measurements(
         detections = stream_detections(heard, np.random.default_rng(seed))
         if camera == "dies":
             detections = without_passes(detections, heard)
-        vision = VisionQuery(PinholeCamera(), detections, keep=boxes)
+        vision = VisionQuery(PinholeCamera.ovad(), detections, keep=boxes)
     evidence = stream_evidence(windows, heard)
     return heard, measurements(heard, windows, sequence, evidence, vision, street)

@@ -61,16 +61,16 @@ def add_lens_options(parser: argparse.ArgumentParser, group: "argparse._Argument
     """Declare --camera and --miss-rates.
 
     --camera takes JSON:
-    {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place
-    of the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "roll_deg" (left side up),
-    "position_m": [x, y, z] in base_link, "stamp_offset_s" (added to the stamps of its images: the clock of
-    the sound); of its images "image_rate_hz" (10); of its boxes "classes" (["car", "motorcycle"]),
-    "min_score" (0.75) and "min_box_px" (100: boxes must be higher); "miss_rates", a file that
+    {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "position_m": [0, 0, 0]}, the position in
+    base_link, metres, or "fx" and "cx" of a calibration in place of the field of view; optional "yaw_deg"
+    (left), "pitch_deg" (up), "roll_deg" (left side up), "stamp_offset_s" (added to the stamps of its images:
+    the clock of the sound); of its images "image_rate_hz" (10); of its boxes "classes" (["car",
+    "motorcycle"]), "min_score" (0.75) and "min_box_px" (100: boxes must be higher); "miss_rates", a file that
     `worldstate model detector` wrote; "labels" (["car"]), the classes of an ONNX model. "cameras" of --car
     have the same keys.
     """
     describe(parser, add_lens_options)
-    lens = "its lens (default: OVAD's camera), or the name of one of --car (default: the first)"
+    lens = "its lens and place (default: OVAD's, with OVAD's array), or the name of one of --car (the first)"
     group.add_argument("--camera", type=Path, metavar="JSON", help=lens)
     told = "how often it misses, as `model detector` wrote it"
     group.add_argument("--miss-rates", type=Path, metavar="JSON", help=told)
@@ -146,7 +146,7 @@ class GivenSensors:
         path = given[0] if given else self.setup.detections
         if path is None or (n_images or self.setup.image_rate_hz) is None:
             return path
-        lens, rate_hz = self.camera or adapters.PinholeCamera(), self.setup.image_rate_hz or 10.0
+        lens, rate_hz = self.camera or adapters.PinholeCamera.ovad(), self.setup.image_rate_hz or 10.0
         return adapters.read_any_detections(path, rate_hz, (lens.width_px, lens.height_px), n_images)
 
 

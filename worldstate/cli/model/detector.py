@@ -70,7 +70,7 @@ def _scene(
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, reference_by
 
     video = adapters.open_video(path)
-    camera = adapters.PinholeCamera(width_px=video.width_px, height_px=video.height_px)
+    camera = adapters.PinholeCamera.ovad(width_px=video.width_px, height_px=video.height_px)
     if arguments.half_angle is not None:
         camera = replace(camera, half_angle_rad=radians(arguments.half_angle))
     boxes = arguments.reference or reference

@@ -66,7 +66,7 @@ class AbsenceSettings:
 
     Examples
     --------
-    >>> AbsenceSettings().edges_deg(PinholeCamera())[:4]
+    >>> AbsenceSettings().edges_deg(PinholeCamera.ovad())[:4]
     (0.0, 10.0, 20.0, 30.0)
     """
 
@@ -153,7 +153,7 @@ def measure_absence(
     ...         return boxes[row.argmax() - 46] if row.max() > 100 else nothing
     >>> video = SimpleNamespace(frames=lambda: iter(images), n_frames=20, frame_rate_hz=10.0)
     >>> truth = DetectionLog.at_rate(boxes, 10.0)
-    >>> scene = LabelledVideo(video, truth, PinholeCamera(width_px=160, height_px=120))
+    >>> scene = LabelledVideo(video, truth, PinholeCamera.ovad(width_px=160, height_px=120))
     >>> settings = AbsenceSettings(families=("darkness",))
     >>> rates = measure_absence([scene], Bright, np.random.default_rng(0), settings)
     >>> rates.families["darkness"].misses[0]

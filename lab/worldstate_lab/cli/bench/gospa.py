@@ -106,7 +106,7 @@ def _by_place(azimuths: Sequence[float], view: tuple[float, float]) -> tuple[lis
 
 def _oc_sort(heard: HeardStream) -> list[list[float]]:
     """Return the azimuths of the tracks that OC-SORT emits, image by image."""
-    sort, camera = OcSort(), PinholeCamera()
+    sort, camera = OcSort(), PinholeCamera.ovad()
     emitted = []
     for frame in stream_detections(heard, np.random.default_rng(0)).frames:
         tracks = [one for one in sort.step(frame.boxes_px, frame.scores) if one.certain]
@@ -116,7 +116,7 @@ def _oc_sort(heard: HeardStream) -> list[list[float]]:
 
 def true_azimuths(heard: HeardStream) -> dict[int, tuple[list[float], list[float]]]:
     """Return the azimuths of the hidden and of the visible vehicles, by the number of the hop."""
-    rows, right_left = heard.rows, PinholeCamera().view_rad
+    rows, right_left = heard.rows, PinholeCamera.ovad().view_rad
     hazards = heard.vehicles.vehicle[heard.vehicles.hazard]
     entry_s = dict(zip(hazards.tolist(), heard.vehicles.entry_s[heard.vehicles.hazard].tolist(), strict=True))
     lead_s = np.array([entry_s.get(one, np.inf) for one in rows.vehicle.tolist()]) - rows.time_s

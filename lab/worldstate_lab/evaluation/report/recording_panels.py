@@ -365,7 +365,7 @@ def _image(image: ImageArray, time_s: float, what: str, boxes: HopTable, truth: 
     column = (
         None
         if box is not None
-        else _column_at(truth, time_s, PinholeCamera(width_px=width, height_px=height))
+        else _column_at(truth, time_s, PinholeCamera.ovad(width_px=width, height_px=height))
     )
     return ApproachImage(
         f"{time_s:.1f} s, {what}",
