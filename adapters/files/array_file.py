@@ -13,7 +13,12 @@ import defusedxml.ElementTree as SafeElementTree
 import numpy as np
 from defusedxml.common import DefusedXmlException
 
-from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, MicrophoneArray, nearest_spacings_m
+from worldstate.frontend.array.microphone_array import (
+    LEAST_SPACING_M,
+    MAX_MICROPHONES,
+    MicrophoneArray,
+    nearest_spacings_m,
+)
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 
 from .file_io import read_bytes, write_text
@@ -135,12 +140,14 @@ def checked_array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> 
 def _check_size(path: Path, positions_m: FloatArray) -> None:
     extent_m, spacings_m = np.ptp(positions_m, axis=0), nearest_spacings_m(positions_m)
     wide_m, mean_m, least_m = float(extent_m.max()), spacings_m.mean(), spacings_m.min()
-    upright = extent_m[:2].max() < MIN_SPACING_M and least_m > 0.0
+    upright = extent_m[:2].max() < MIN_SPACING_M and least_m >= LEAST_SPACING_M
+    # Two at one place in an array of another size are no fault of the unit: the array refuses and names them.
+    small = LEAST_SPACING_M <= least_m < MIN_SPACING_M or 0.0 < mean_m < MIN_SPACING_M
     metres = "expected positions in metres, got"
     for wrong, problem in (
         (wide_m > MAX_APERTURE_M, f"{metres} an array {wide_m:g} wide: millimetres?"),
         (mean_m > MAX_SPACING_M, f"{metres} microphones {mean_m:g} apart: centimetres?"),
-        (0.0 < least_m < MIN_SPACING_M, f"{metres} microphones {least_m:g} apart: divided by 1000?"),
+        (small, f"{metres} microphones {least_m:g} apart: divided by 1000?"),
         (upright, "expected a horizontal extent, got a vertical line, which hears every azimuth alike"),
     ):
         if wrong:
