@@ -1,10 +1,12 @@
-"""Microphone positions in files: Acoular XML, CSV and JSON."""
+"""Microphone positions: files of Acoular XML, CSV and JSON, and boards that are known by name."""
 
 import csv
 import json
 import math
 import re
 from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 from xml.sax.saxutils import quoteattr
@@ -13,7 +15,12 @@ import defusedxml.ElementTree as SafeElementTree
 import numpy as np
 from defusedxml.common import DefusedXmlException
 
-from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, MicrophoneArray, nearest_spacings_m
+from worldstate.frontend.array.microphone_array import (
+    LEAST_SPACING_M,
+    MAX_MICROPHONES,
+    MicrophoneArray,
+    nearest_spacings_m,
+)
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 
 from .file_io import read_bytes, write_text
@@ -43,12 +50,14 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     - JSON, ``[[x, y, z], ...]`` or ``{"positions_m": [[x, y, z], ...], "axes": "base_link"}``, in `base_link`
       axes unless ``"axes"`` is ``"acoular"``.
 
+    Where no such file is, its name may be one of `named_arrays`: a board that lies flat, x forward.
+
     Parameters
     ----------
     path : str or Path
-        The file; at most 1 MiB and 1024 microphones.
+        The file, at most 1 MiB and 1024 microphones, or the name of an array.
     axes : {"acoular", "base_link"}, optional
-        The axes that the numbers are in, where they are not those of the form.
+        The axes that the numbers are in, where they are not those of the form; none with a name.
 
     Returns
     -------
@@ -70,15 +79,37 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     ...     _ = name.write_text("name,x,y,z\nleft,0,0.2,1.4\nright,0,-0.2,1.4\n")
     ...     read_array(name).positions_m.tolist()
     [[0.0, 0.2, 1.4], [0.0, -0.2, 1.4]]
+    >>> read_array("respeaker-6").n_microphones
+    6
     """
     name = Path(path)
-    data = read_bytes(name, "an array file", MAX_BYTES)
+    known = named_arrays()
+    if name.name in known and not name.exists():  # also beside a car file, which names files so
+        if axes is not None:
+            # Acoular's axes are left-handed: a flat board in them would be its mirror image.
+            raise InputFileError(name, f"expected no axes with the name of an array, got {axes}")
+        return MicrophoneArray(known[name.name]["positions_m"], name.name)
+    data = read_bytes(name, f"an array file or one of {', '.join(known)}", MAX_BYTES)
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
     if start == b"<":
         rows, said = _xml_rows(name, data), "acoular"
     else:
         rows, said = _json_rows(name, data) if start in (b"[", b"{") else (_csv_rows(name, data), "base_link")
     return checked_array(name, _numbers(name, rows), axes or said)
+
+
+@cache
+def named_arrays() -> dict[str, dict[str, Any]]:
+    """Return the boards that are known by name: ``"positions_m"`` in `base_link` axes, and ``"source"``.
+
+    Examples
+    --------
+    >>> ", ".join(named_arrays())
+    'respeaker-4, respeaker-6, uma-8, xmos'
+    """
+    text = (files("worldstate") / "data" / "arrays.json").read_text("utf-8")
+    known: dict[str, dict[str, Any]] = json.loads(text)
+    return known
 
 
 def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array") -> None:
@@ -135,12 +166,14 @@ def checked_array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> 
 def _check_size(path: Path, positions_m: FloatArray) -> None:
     extent_m, spacings_m = np.ptp(positions_m, axis=0), nearest_spacings_m(positions_m)
     wide_m, mean_m, least_m = float(extent_m.max()), spacings_m.mean(), spacings_m.min()
-    upright = extent_m[:2].max() < MIN_SPACING_M and least_m > 0.0
+    upright = extent_m[:2].max() < MIN_SPACING_M and least_m >= LEAST_SPACING_M
+    # Two at one place in an array of another size are no fault of the unit: the array refuses and names them.
+    small = LEAST_SPACING_M <= least_m < MIN_SPACING_M or 0.0 < mean_m < MIN_SPACING_M
     metres = "expected positions in metres, got"
     for wrong, problem in (
         (wide_m > MAX_APERTURE_M, f"{metres} an array {wide_m:g} wide: millimetres?"),
         (mean_m > MAX_SPACING_M, f"{metres} microphones {mean_m:g} apart: centimetres?"),
-        (0.0 < least_m < MIN_SPACING_M, f"{metres} microphones {least_m:g} apart: divided by 1000?"),
+        (small, f"{metres} microphones {least_m:g} apart: divided by 1000?"),
         (upright, "expected a horizontal extent, got a vertical line, which hears every azimuth alike"),
     ):
         if wrong:

@@ -19,7 +19,20 @@ from worldstate.ground import InputFileError, WorldstateError, seconds
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.odometry import Odometry
 
-from .message_types import ARRAY, AUDIO, DETECTIONS, ODOMETRY, PCM, PCM_INFO, STAMPED_PCM, stamp_of, typestore
+from .message_types import (
+    ARRAY,
+    AUDIO,
+    AUDIO_FRAME,
+    DETECTIONS,
+    ODOMETRY,
+    PCM,
+    PCM_INFO,
+    RAW_AUDIO,
+    STAMPED_PCM,
+    nanoseconds,
+    stamp_of,
+    typestore,
+)
 
 METADATA_NAME, STORAGE_SUFFIXES = "metadata.yaml", (".mcap", ".db3")
 # Half a second of a thousand microphones; an image of detections is far below it.
@@ -138,9 +151,13 @@ def _either(kinds: tuple[str, ...]) -> str:
 
 _LOG = logging.getLogger(__name__)
 
-AUDIO_KINDS = AUDIO, STAMPED_PCM, PCM
-# Formats that audio_common names; a compressed one has lost the phase between microphones.
-ENCODINGS: dict[str, sound_file.Encoding] = {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"}
+AUDIO_KINDS = AUDIO, STAMPED_PCM, PCM, AUDIO_FRAME, RAW_AUDIO
+# Formats by the message that names them; a compressed one has lost the phase between microphones.
+ENCODINGS: dict[str, dict[str, sound_file.Encoding]] = {
+    PCM_INFO: {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"},
+    AUDIO_FRAME: {"signed_16": "s16", "signed_24": "s24", "signed_32": "s32", "float": "f32"},
+    RAW_AUDIO: {"pcm-s16": "s16"},
+}
 MAX_RATE_HZ = 10_000_000
 # Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
 LONGEST_GAP_S = 2.0
@@ -228,9 +245,12 @@ def first_stamp(bag: BagReader, topic: str) -> int:
 def audio_blocks(bag: BagReader, topic: str) -> Iterator[AudioBlock]:
     """Yield what each message of a topic holds, checked against the first."""
     kind, first, taken = bag.kind_of(topic), None, 0
-    info = None if kind == AUDIO else _pcm_info(bag, topic)
+    info = _pcm_info(bag, topic) if kind in (STAMPED_PCM, PCM) else None
     for recorded_ns, message in bag.messages(topic):
-        block = _own_block(bag.path, message) if info is None else _pcm_block(info, message, recorded_ns)
+        if kind == AUDIO:
+            block = _own_block(bag.path, message)
+        else:
+            block = _pcm_block(info or _described(bag, topic, kind, message), message, recorded_ns)
         first = first or block
         got = block.sample_rate_hz, block.samples.shape[1]
         if got != (wanted := (first.sample_rate_hz, first.samples.shape[1])):
@@ -264,25 +284,51 @@ def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
         problem = f"expected {PCM_INFO} beside {topic}: rate, channels and format of its bytes"
         raise InputFileError(bag.path, problem)
     info = said[1]
-    if info.sample_format not in ENCODINGS or info.coding_format.lower() not in ("wave", "raw", ""):
-        got = f"{info.sample_format!r:.20} as {info.coding_format!r:.20}"
-        problem = f"{where}: expected one of {', '.join(ENCODINGS)}, uncompressed (wave), got {got}"
+    if info.coding_format.lower() not in ("wave", "raw", ""):
+        problem = f"{where}: expected uncompressed samples (wave), got {info.coding_format!r:.20}"
         raise InputFileError(bag.path, problem)
-    encoding = ENCODINGS[info.sample_format]
-    return sound_file.RawPcm(io.BytesIO(), int(info.sample_rate), int(info.channels), encoding, str(bag.path))
+    return _pcm(bag, str(where), PCM_INFO, info.sample_format, info.sample_rate, info.channels)
+
+
+def _described(bag: BagReader, topic: str, kind: str, message: Any) -> sound_file.RawPcm:
+    """Return how the bytes of a message that describes itself are to be read."""
+    if kind == AUDIO_FRAME:
+        return _pcm(bag, topic, kind, message.format, message.sampling_frequency, message.channel_count)
+    return _pcm(bag, topic, kind, message.format, message.sample_rate, message.number_of_channels)
+
+
+def _pcm(
+    bag: BagReader, topic: str, kind: str, sample_format: str, rate_hz: int, channels: int
+) -> sound_file.RawPcm:
+    encoding = ENCODINGS[kind].get(sample_format)
+    if encoding is None:
+        problem = f"{topic}: expected one of {', '.join(ENCODINGS[kind])}, got {sample_format!r:.20}"
+        raise InputFileError(bag.path, problem)
+    with refused_as_file(bag.path):
+        return sound_file.RawPcm(io.BytesIO(), int(rate_hz), int(channels), encoding, str(bag.path))
 
 
 def _pcm_block(info: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioBlock:
-    stamped = hasattr(message, "header")
-    data = bytes(message.audio.data if stamped else message.data)
-    if not data or len(data) % info.frame_bytes:
+    data = bytes(getattr(message, "audio", message).data)
+    frames = getattr(message, "frame_sample_count", len(data) // info.frame_bytes)
+    if not data or len(data) != frames * info.frame_bytes:
         expected = f"expected whole samples of {info.channels} channels"
-        raise InputFileError(info.name, f"{expected}, got {len(data)} bytes")
+        counted = f", {frames} as frame_sample_count says" if hasattr(message, "frame_sample_count") else ""
+        raise InputFileError(info.name, f"{expected}{counted}, got {len(data)} bytes")
     samples = info.to_samples(data)
-    # Without a stamp it was recorded when its last sample was there.
-    early_ns = round(len(samples) * 1_000_000_000 / info.sample_rate_hz)
-    stamp_ns = stamp_of(message.header) if stamped else max(recorded_ns - early_ns, 0)
-    return AudioBlock(stamp_ns, info.sample_rate_hz, samples)
+    length_ns = round(len(samples) * 1_000_000_000 / info.sample_rate_hz)
+    return AudioBlock(_begin_ns(message, recorded_ns, length_ns), info.sample_rate_hz, samples)
+
+
+def _begin_ns(message: Any, recorded_ns: int, length_ns: int) -> int:
+    """Return the time of a message's first sample."""
+    if hasattr(message, "timestamp"):
+        return nanoseconds(message.timestamp)
+    if hasattr(message, "audio"):
+        return stamp_of(message.header)
+    # AudioFrame is stamped when its last sample is there; what has no stamp was recorded then.
+    end_ns = stamp_of(message.header) if hasattr(message, "header") else recorded_ns
+    return max(end_ns - length_ns, 0)
 
 
 def _without_gaps(blocks: Iterator[AudioBlock], sound: BagSound) -> Iterator[AudioBlock]:

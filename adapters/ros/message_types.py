@@ -13,12 +13,13 @@ AUDIO, ARRAY = "worldstate_msgs/msg/MultiChannelAudio", "worldstate_msgs/msg/Mic
 ADVISORIES = "worldstate_msgs/msg/RiskAdvisories"
 STAMPED_PCM, PCM = "audio_common_msgs/msg/AudioDataStamped", "audio_common_msgs/msg/AudioData"
 PCM_INFO = "audio_common_msgs/msg/AudioInfo"
+AUDIO_FRAME, RAW_AUDIO = "audio_utils_msgs/msg/AudioFrame", "foxglove_msgs/msg/RawAudio"
 DETECTIONS, ODOMETRY = "vision_msgs/msg/Detection2DArray", "nav_msgs/msg/Odometry"
 OBJECTS = "autoware_perception_msgs/msg/PredictedObjects"
 MARKERS, TEXT = "visualization_msgs/msg/MarkerArray", "std_msgs/msg/String"
 
 _OURS = ("MultiChannelAudio", "MicrophoneArray", "RiskAdvisory", "RiskAdvisories")
-_OTHERS = ("audio_common_msgs", "autoware_perception_msgs", "vision_msgs")
+_OTHERS = "audio_common_msgs", "audio_utils_msgs", "autoware_perception_msgs", "foxglove_msgs", "vision_msgs"
 # What stands between the definitions of a file that holds several, as in bags.
 _SEPARATOR = "=" * 80 + "\nMSG: "
 _SPECIAL = {"string": "", "wstring": "", "bool": False}
@@ -71,7 +72,12 @@ def time_of(stamp_ns: int) -> dict[str, int]:
 
 def stamp_of(header: Any) -> int:
     """Return the stamp of a header, ns."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    return nanoseconds(header.stamp)
+
+
+def nanoseconds(time: Any) -> int:
+    """Return a time, ns."""
+    return int(time.sec) * 1_000_000_000 + int(time.nanosec)
 
 
 def _definitions() -> Iterator[tuple[str, str]]:

@@ -25,6 +25,8 @@ _ALONG_AXIS = 0.985
 
 # Covariances grow with the square: 40 bins of 1024 channels take 0.3 GB.
 MAX_MICROPHONES = 1024
+LEAST_SPACING_M = 1e-4
+"""Two microphones nearer than this are at one place: capsules are millimetres wide."""
 
 # Our own placement of 56 microphones: 7 staggered rows of 8, each moved off its row by a low-discrepancy
 # sequence (against grating lobes), then the columns drawn in by a power. The constants come from one search;
@@ -76,15 +78,16 @@ class MicrophoneArray:
     Parameters
     ----------
     positions_m : array_like, shape (M, 3)
-        Coordinates in `base_link` axes (x forward, y left, z up), metres; 2 <= M <= 1024, all different. The
-        order is that of the audio channels.
+        Coordinates in `base_link` axes (x forward, y left, z up), metres; 2 <= M <= 1024, at least .1 mm
+        apart. The order is that of the audio channels.
     name : str
         How messages call it.
 
     Raises
     ------
     InvalidArgumentError
-        On another shape, numbers that are not finite, or two microphones in one position.
+        On another shape, numbers that are not finite, or two microphones at one place, which the message
+        names, counted from 1.
 
     Examples
     --------
@@ -104,9 +107,12 @@ class MicrophoneArray:
             expected = f"2 to {MAX_MICROPHONES} microphones"
             raise InvalidArgumentError(f"positions_m: expected {expected}, got {len(positions)}")
         spacings = nearest_spacings_m(positions)
-        if spacings.min() == 0.0:
-            got = f"got microphones {np.flatnonzero(spacings == 0.0).tolist()} in one"
-            raise InvalidArgumentError(f"positions_m: expected different positions, {got}")
+        if spacings.min() < LEAST_SPACING_M:
+            from_one_m = np.linalg.norm(positions - positions[spacings.argmin()], axis=1)
+            one, other = np.argsort(from_one_m, kind="stable")[:2] + 1
+            expected = f"expected microphones at least {LEAST_SPACING_M:g} m apart"
+            got = f"got microphones {one} and {other} {spacings.min():.2g} m apart"
+            raise InvalidArgumentError(f"positions_m: {expected}, {got}")
         positions.flags.writeable = False
         object.__setattr__(self, "positions_m", positions)
 

@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.cli.common.inputs import stance
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.adapters.files.array_file import named_arrays, read_array, write_array_xml
+from worldstate.adapters.vehicle.car_file import read_car
+from worldstate.cli.common.inputs import add_array_options, stance
+from worldstate.frontend.array.microphone_array import MicrophoneArray, nearest_spacings_m, roof_array_56
 from worldstate.frontend.settings import default_band_hz
+from worldstate.ground.errors import InputFileError
 
 PLACES = [[0.5, 0.2, 1.4], [0.5, -0.2, 1.4], [0.1, 0.0, 1.5]]
 
@@ -71,3 +73,40 @@ def test_the_band_follows_the_spacing(spacing_m: float, rate_hz: float, band_hz:
 
 def test_the_roof_keeps_the_papers_band_exactly() -> None:
     assert default_band_hz(roof_array_56(), 47_998) == (300.0, 1800.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "microphones", "radius_m", "first_deg"),
+    [
+        ("respeaker-4", 4, 0.0405, 180),
+        ("respeaker-6", 6, 0.0463, 120),
+        ("uma-8", 7, 0.043, 90),
+        ("xmos", 7, 0.043, 240),
+    ],
+)
+def test_a_board_is_known_by_its_name(name: str, microphones: int, radius_m: float, first_deg: float) -> None:
+    array = read_array(name)
+    assert (array.name, array.n_microphones, array.ambiguity) == (name, microphones, "up-down")
+    ring = array.positions_m[microphones % 2 :]
+    np.testing.assert_allclose(np.linalg.norm(ring, axis=1), radius_m, atol=1e-4)
+    assert np.degrees(np.arctan2(ring[0, 1], ring[0, 0])) % 360 == pytest.approx(first_deg, abs=0.5)
+    assert np.ptp(nearest_spacings_m(ring)) < 2e-4, "a regular ring"
+    assert f"{1e3 * radius_m:g} mm" in named_arrays()[name]["source"]
+    assert name in str(add_array_options.__doc__)
+
+
+def test_a_file_goes_before_a_name_and_an_unknown_name_lists_the_known(tmp_path: Path) -> None:
+    (tmp_path / "uma-8").write_text(SAME["plain.csv"])
+    np.testing.assert_array_equal(read_array(tmp_path / "uma-8").positions_m, PLACES)
+    with pytest.raises(InputFileError, match=r"umma: .* one of respeaker-4, respeaker-6, uma-8, xmos"):
+        read_array("umma")
+    with pytest.raises(InputFileError, match="expected no axes with the name of an array, got acoular"):
+        read_array("xmos", "acoular")
+
+
+def test_a_car_file_mounts_a_board_by_its_name(tmp_path: Path) -> None:
+    mounted = {"file": "respeaker-4", "position_m": [1.0, 0.0, 1.5], "yaw_deg": 90}
+    (tmp_path / "car.json").write_text(json.dumps({"array": mounted}))
+    array = read_car(tmp_path / "car.json").array
+    assert array is not None
+    np.testing.assert_allclose(array.positions_m[0], [1.0, -0.0405, 1.5], atol=1e-12)

@@ -61,7 +61,7 @@ WRONG = {
     "shuffled and wrong": (SHUFFLED * [1, 1, 0.9], "elsewhere"),
     "one moved": (HERE + np.eye(56)[7][:, None] * [0, 0.003, 0], "microphones up to 3 mm elsewhere"),
     "a quarter turn": (HERE[:, [1, 0, 2]] * [-1, 1, 1], "axes swapped"),
-    "one twice": (np.vstack([HERE[:55], HERE[:1]]), "microphones [0, 55] in one"),
+    "one twice": (np.vstack([HERE[:55], HERE[:1]]), "microphones 1 and 56 0 m apart"),
 }
 FORMS = ("xml", "csv", "json")
 NO_METRES = dict.fromkeys(("millimetres", "centimetres"), "expected positions in metres")

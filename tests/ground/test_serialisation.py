@@ -12,7 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
-from worldstate.ground.serialisation import ADDED, FLAT, Keys, Layout, Probability, decode, encode
+from worldstate.ground.serialisation import (
+    ADDED,
+    FLAT,
+    Keys,
+    Layout,
+    Probability,
+    decode,
+    decode_json,
+    encode,
+)
 from worldstate.ground.typing import FloatArray, IntArray
 from worldstate.ground.values import NotUsable
 
@@ -153,3 +162,22 @@ def test_whatever_stands_in_a_field_is_read_or_refused_by_a_typed_error(key, val
         decode(Everything, written(**{key: value}), "file")
     except WorldstateError as error:
         assert str(error).startswith("file")
+
+
+@given(*2 * [st.text(st.characters(exclude_categories=()), max_size=4)])
+def test_json_text_can_be_written_again_or_is_refused(key, value):
+    """Of any code point, halves of surrogate pairs among them, which JSON escapes as \\ud800."""
+    text = json.dumps({key: [value]})
+    halves = "|".join((key, value)).encode("utf-16", "surrogatepass")
+    try:
+        halves.decode("utf-16")
+    except UnicodeDecodeError:
+        for refused in (text, json.dumps({key: value}, ensure_ascii=False)):
+            with pytest.raises(InvalidArgumentError, match=r"^car: expected JSON, got a text that is none"):
+                decode_json(refused, "car")
+    else:
+        json.dumps(decode_json(text, "car"), ensure_ascii=False).encode()
+
+
+def test_an_escaped_backslash_is_no_half_of_a_pair():
+    assert decode_json(r'["C:\\ud800", "\ud83d\ude97"]', "car") == ["C:\\ud800", "\N{AUTOMOBILE}"]

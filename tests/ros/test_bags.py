@@ -236,6 +236,107 @@ def test_bytes_of_audio_common_are_read_as_its_info_says(tmp_path):
         np.testing.assert_array_equal(heard, whole.astype(np.float32) / 2**15)
 
 
+# As their packages define them, written here by rosbags alone.
+FOREIGN = {
+    "audio_utils_msgs/msg/AudioFrame": """std_msgs/Header header
+        string format
+        uint32 channel_count
+        uint32 sampling_frequency
+        uint32 frame_sample_count
+        uint8[] data""",
+    "foxglove_msgs/msg/RawAudio": """builtin_interfaces/Time timestamp
+        uint8[] data
+        string format
+        uint32 sample_rate
+        uint32 number_of_channels""",
+}
+FRAME, RAW = FOREIGN
+KINDS = {"signed_16": "<i2", "signed_24": "<i4", "signed_32": "<i4", "float": "<f4", "pcm-s16": "<i2"}
+
+
+def foreign_bag(path: Path, samples: np.ndarray, said: str, *, lost: tuple[int, ...] = (), **changed) -> Path:
+    """Write samples of full scale 1 from 5 s on, in messages of .1 s, as another recorder would."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    kind, step = RAW if said.startswith("pcm") else FRAME, RATE_HZ // 10
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(FOREIGN[kind], kind))
+    time, head = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    full = 1.0 if said == "float" else 2.0 ** (int(said.rpartition("_")[2].removeprefix("pcm-s")) - 1)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        to = bag.add_connection("/mics", kind, typestore=store)
+        for k, part in enumerate(np.split(samples, range(step, len(samples), step))):
+            data = (part * full).astype(KINDS[said]).tobytes()
+            if said == "signed_24":
+                data = np.frombuffer(data, np.uint8).reshape(-1, 4)[:, :3].tobytes()
+            values = {"format": said, "data": np.frombuffer(data, np.uint8)}
+            tenths = 50 + k + (kind == FRAME)  # an AudioFrame is stamped when its last sample is there
+            stamp = time(sec=tenths // 10, nanosec=tenths % 10 * 100_000_000)
+            if kind == FRAME:
+                values |= {"header": head(stamp=stamp, frame_id="mics"), "channel_count": part.shape[1]}
+                values |= {"sampling_frequency": RATE_HZ, "frame_sample_count": len(part)}
+            else:
+                values |= {"timestamp": stamp, "sample_rate": RATE_HZ, "number_of_channels": part.shape[1]}
+            if k not in lost:
+                # What changes begins with the third message.
+                message = store.types[kind](**(values | (changed if k > 2 else {})))
+                bag.write(to, tenths * 100_000_000, store.serialize_cdr(message, kind))
+    return path
+
+
+@pytest.mark.parametrize("said", KINDS)
+def test_messages_that_describe_themselves_are_read_sample_for_sample(tmp_path, said):
+    samples = np.random.default_rng(2).integers(-(2**15), 2**15, (RATE_HZ * 2, CHANNELS)) / np.float32(2**15)
+    sound = read_bag(foreign_bag(tmp_path / "bag", samples, said)).sound
+    assert sound.start_ns == 5 * 10**9
+    with open_sound(sound, CHANNELS) as audio:
+        assert audio.sample_rate_hz == RATE_HZ
+        np.testing.assert_array_equal(np.concatenate(list(audio.blocks())), samples)
+
+
+def test_sixteen_channels_of_another_recorder_run_as_our_own_sound_does(tmp_path, caplog):
+    noise = np.random.default_rng(5).integers(-9000, 9000, (3 * RATE_HZ, 16)) / np.float32(2**15)
+    foreign_bag(tmp_path / "theirs", noise, "signed_16", lost=(12,))
+    write_blocks(tmp_path / "ours", noise, lost=(12,))
+    array = tmp_path / "ring.csv"
+    turns = 2 * np.pi * np.arange(16) / 16
+    array.write_text("".join(f"{0.2 * np.cos(t)},{0.2 * np.sin(t)},1.5\n" for t in turns))
+    for name in ("theirs", "ours"):
+        words = ["run", str(tmp_path / name), "--array", str(array), "--uncalibrated"]
+        assert main([*words, "--out", str(tmp_path / f"{name}.jsonl")]) == 0
+        assert f"{name}: 0.100 s of /mics are missing at 1.200 s" in caplog.text
+    states = (tmp_path / "theirs.jsonl").read_text()
+    assert len(states.splitlines()) == 21
+    assert states == (tmp_path / "ours.jsonl").read_text()
+
+
+@pytest.mark.parametrize(
+    ("said", "changed", "problem"),
+    [
+        ("signed_16", {"channel_count": 3}, "800 as frame_sample_count says, got 6400 bytes"),
+        ("signed_16", {"channel_count": 2, "frame_sample_count": 1600}, "and 4 channels as in the first"),
+        ("signed_16", {"channel_count": 0}, "channels: expected a number in [1, 1024], got 0"),
+        ("signed_16", {"sampling_frequency": 2**31}, "sample_rate_hz: expected a number in [1, 10000000]"),
+        ("signed_16", {"frame_sample_count": 2**32 - 1}, "4294967295 as frame_sample_count says"),
+        ("float", {"format": "double"}, "signed_16, signed_24, signed_32, float, got 'double'"),
+        ("float", {"data": np.full(12_800, 255, np.uint8)}, "expected finite samples, got nan in channel 1"),
+        ("pcm-s16", {"format": "opus"}, "/mics: expected one of pcm-s16, got 'opus'"),
+        ("pcm-s16", {"data": np.zeros(0, np.uint8)}, "expected whole samples of 4 channels, got 0 bytes"),
+        ("pcm-s16", {"data": np.zeros(9, np.uint8)}, "expected whole samples of 4 channels, got 9 bytes"),
+        ("pcm-s16", {"sample_rate": 16_000}, "expected 8000 Hz and 4 channels as in the first"),
+    ],
+)
+def test_a_message_that_contradicts_itself_or_the_first_is_refused(tmp_path, said, changed, problem):
+    path = foreign_bag(tmp_path / "bag", sound_of(RATE_HZ), said, **changed)
+    with (
+        pytest.raises(InputFileError, match=re.escape(problem)) as refused,
+        open_sound(read_bag(path).sound) as audio,
+    ):
+        list(audio.blocks())
+    assert str(refused.value).startswith(str(path))
+
+
 def test_a_lost_message_is_silence_that_is_said_and_a_long_gap_is_refused(tmp_path, caplog):
     samples = sound_of(4 * RATE_HZ)
     gone = write_blocks(tmp_path / "one_lost", samples, lost=(20,))
@@ -375,12 +476,15 @@ def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
     assert "`worldstate log replay` reads" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "signed_16", "pcm-s16"])
 def test_a_damaged_bag_is_refused_by_name(tmp_path, storage):
     samples = sound_of(RATE_HZ)
-    with bag_writer(tmp_path / "whole", storage) as write:
-        for k in range(10):
-            write("/mics", AUDIO, k, block(samples[800 * k : 800 * (k + 1)], 1 + k * 100_000_000))
+    if storage in KINDS:
+        foreign_bag(tmp_path / "whole", samples, storage)
+    else:
+        with bag_writer(tmp_path / "whole", storage) as write:
+            for k in range(10):
+                write("/mics", AUDIO, k, block(samples[800 * k : 800 * (k + 1)], 1 + k * 100_000_000))
     (good,) = (file for file in (tmp_path / "whole").iterdir() if file.suffix != ".yaml")
     content, rng, refused = good.read_bytes(), np.random.default_rng(3), 0
     damaged = tmp_path / f"damaged{good.suffix}"

@@ -176,7 +176,7 @@ def decode(hint: type[T], data: object, where: str) -> T:
 
 
 def decode_json(text: str, where: str) -> object:
-    """Decode strict JSON: no NaN, no infinity, bounded size and depth.
+    """Decode strict JSON: no NaN, no infinity, no half of a surrogate pair, bounded size and depth.
 
     Examples
     --------
@@ -189,9 +189,13 @@ def decode_json(text: str, where: str) -> object:
     if values > MOST_VALUES:
         raise InvalidArgumentError(f"{where}: expected at most {MOST_VALUES} values, got {values}")
     try:
-        return json.loads(text, parse_constant=_refuse_constant)
+        value: object = json.loads(text, parse_constant=_refuse_constant)
+        if "\\u" in text or not text.isascii():
+            # Half a surrogate pair has no bytes: it would fail where it is printed or written.
+            json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise InvalidArgumentError(f"{where}: expected JSON, got a text that is none ({error})") from error
+    return value
 
 
 def _refuse_constant(name: str) -> float:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.microphone_array import LEAST_SPACING_M, MicrophoneArray, roof_array_56
 from worldstate.ground.errors import InvalidArgumentError
 
 
@@ -72,9 +72,28 @@ def test_planar_array_really_cannot_tell_front_from_back() -> None:
         ([[0, 0, 0]], "2 to 1024"),
         ([[0, 0], [1, 1]], r"shape \(any, 3\)"),
         ([[0, 0, 0], [0, 0, np.nan]], "finite"),
-        ([[0, 0, 0], [0, 0.1, 0], [0, 0, 0]], r"\[0, 2\]"),
+        ([[0, 0, 0], [0, 0.1, 0], [0, 0, 0]], "microphones 1 and 3 0 m apart"),
     ],
 )
 def test_bad_positions_are_refused(positions: list[list[float]], message: str) -> None:
     with pytest.raises(InvalidArgumentError, match=message):
         MicrophoneArray(positions)
+
+
+@given(st.integers(2, 9), st.integers(0, 2**32 - 1), st.floats(0.0, 3.0), st.data())
+def test_two_microphones_at_one_place_are_refused_by_their_numbers(n, seed, in_least, data) -> None:
+    """Others stand 1 m apart."""
+    places = np.random.default_rng(seed).permutation(n)[:, None] * [0.0, 1.0, 0.0]
+    first, second = sorted(data.draw(st.lists(st.integers(0, n - 1), min_size=2, max_size=2, unique=True)))
+    places[second] = places[first] + [in_least * LEAST_SPACING_M, 0.0, 0.0]
+    if in_least > 1.001:
+        assert MicrophoneArray(places).n_microphones == n
+    elif in_least < 0.999:
+        said = rf"got microphones {first + 1} and {second + 1} .* m apart"
+        with pytest.raises(InvalidArgumentError, match=said):
+            MicrophoneArray(places)
+
+
+def test_of_two_pairs_at_one_place_one_pair_is_named() -> None:
+    with pytest.raises(InvalidArgumentError, match="got microphones 1 and 4 0 m apart"):
+        MicrophoneArray([[0, 1, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0]])

@@ -53,6 +53,7 @@ def add_array_options(
       XML   Acoular's and OVAD's <pos x= y= z= />: the array plane seen from behind, x right, y up, z forward
       CSV   x,y,z a line, with or without header and names: base_link, x forward, y left, z up
       JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too
+    or is the name of a board that lies flat, x forward: respeaker-4, respeaker-6, uma-8, xmos
     """
     describe(parser, add_array_options)
     add = parser.add_argument
