@@ -49,7 +49,7 @@ def reddish(image):
 def test_the_figure_over_time_names_its_panels(log, tmp_path):
     assert main(["log", "plot", str(log), "--out", str(tmp_path / "states.svg")]) == 0
     text = (tmp_path / "states.svg").read_text()
-    for said in ("advisory left", "camera (blue: found)", "vehicle hidden, left", "risk, right"):
+    for said in ("advisory left", "camera (tall: found)", "vehicle hidden, left", "risk, right"):
         assert f"<!-- {said} -->" in text
 
 

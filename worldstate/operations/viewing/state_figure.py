@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Of the sides, told apart from red and blue, which say hidden and in view.
-_SIDE_COLORS = (style.PURPLE, style.GREEN, style.ORANGE, style.SKY)
 _WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
 # Longest title in one line above a figure of this width.
 _TITLE_CHARACTERS = 100
@@ -38,12 +36,14 @@ _LIKELY = 0.5
 _SIZE_IN, _MOVING_DPI = (7.2, 5.2), 80
 # An entity less likely than this is drawn, and not named.
 _TOLD = 0.2
+# Of a sector that was searched, by what was found there.
+_NOTHING, _FOUND = 0.15, 0.4
 _LEGEND = (
-    ("hidden", style.RED, 0.35),
-    ("in view", style.BLUE, 0.35),
-    ("risk of a side, red if raised", style.ORANGE, 0.4),
-    ("searched, nothing found", style.GREEN, 0.25),
-    ("searched, found", style.PURPLE, 0.25),
+    ("hidden vehicle, and risk", style.HIDDEN, 0.4),
+    ("vehicle in view", style.IN_VIEW, 0.35),
+    ("advisory", style.DECISION, 0.4),
+    ("searched, nothing found", style.SEARCHED, _NOTHING),
+    ("searched, found", style.SEARCHED, _FOUND),
     ("behind an occluder", "0.5", 0.2),
 )
 
@@ -137,7 +137,7 @@ def write_state_figure(
         _draw_existence(existence, states)
         _draw_risk(risk, states)
         for axes in (azimuths, rows, existence, risk) if t0_s is not None else ():
-            entry = axes.axvline(t0_s, color="black", lw=1.2, ls="--")
+            entry = axes.axvline(t0_s, color=style.TRUTH, lw=1.2, ls="--")
             entry.set_label("line-of-sight entry $T_0$" if axes is azimuths else "")
         for axes in (azimuths, existence, risk):
             style.legend_beside(axes)
@@ -151,7 +151,7 @@ def _draw_truth(axes: "Axes", truth: Sequence[TrueTrack]) -> None:
     for track in truth:
         for shown, dashes, name in ((~track.in_view, ":", "out of sight"), (track.in_view, "-", "in sight")):
             line = np.where(shown, np.degrees(track.azimuth_rad), np.nan)
-            axes.plot(track.time_s, line, dashes, color="black", lw=2.0, label=f"vehicle, truth, {name}")
+            axes.plot(track.time_s, line, dashes, color=style.TRUTH, lw=2.0, label=f"vehicle, truth, {name}")
 
 
 def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
@@ -159,7 +159,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
     heard = [(seconds(state.stamp_ns), state.bearing.azimuth_rad) for state in states if state.bearing]
     if heard:
         time_s, azimuth_rad = np.array(heard).T
-        axes.plot(time_s, np.degrees(azimuth_rad), ".", color="0.45", ms=3, label="bearing of the sound")
+        axes.plot(time_s, np.degrees(azimuth_rad), ".", color=style.HEARD, ms=4, label="bearing of the sound")
     tracks: dict[tuple[str, bool], list[tuple[float, ...]]] = {}
     for state in states:
         for one in (part for known in state.entities for part in known.on_each_side()):
@@ -168,7 +168,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
                 row = seconds(state.stamp_ns), *np.degrees([one.azimuth_rad, *sector]).tolist()
                 tracks.setdefault((one.id, one.status == "hidden"), []).append(row)
     for (_, hidden), rows in tracks.items():
-        color, label = (style.RED, "hidden") if hidden else (style.BLUE, "in view")
+        color, label = (style.HIDDEN, "hidden") if hidden else (style.IN_VIEW, "in view")
         time_s, azimuth, low, high = style.with_gaps(np.array(rows)).T
         axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
         axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
@@ -180,18 +180,18 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     names = [f"advisory {side}" for side in _sides(states)]
     for row, side in enumerate(_sides(states)):
         on = [any(c.direction == side and c.advisory for c in state.cues) for state in states]
-        style.draw_bars(axes, _times(states), on, row, _SIDE_COLORS[row])
+        style.draw_bars(axes, _times(states), on, row, style.DECISION)
     # A look stands in every snapshot until the next one.
     looks = {(one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched}
     for sensor in sorted({sensor for sensor, _, _ in looks}):
         row = len(names)
-        for found, color in ((True, style.BLUE), (False, "0.75")):
+        for found, height in ((True, 10), (False, 4)):
             at_s = [seconds(stamp_ns) for name, stamp_ns, was in looks if name == sensor and was == found]
-            axes.plot(at_s, [row] * len(at_s), "|", color=color, ms=9 if found else 4)
-        names.append(f"{sensor} (blue: found)")
+            axes.plot(at_s, [row] * len(at_s), "|", color=style.SEARCHED, ms=height)
+        names.append(f"{sensor} (tall: found)")
     foreign = [isinstance(state.domain, Foreign) for state in states]
     deaf = [any(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]
-    for on, color, name in ((foreign, "0.6", "foreign sound"), (deaf, "0.3", "could not be heard")):
+    for on, color, name in ((foreign, style.HEARD, "foreign sound"), (deaf, "0.5", "could not be heard")):
         if any(on):
             style.draw_bars(axes, _times(states), on, len(names), color, height=0.6)
             names.append(name)
@@ -201,9 +201,9 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
 def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
     rows = [(seconds(state.stamp_ns), *_existence(state, _sides(states))) for state in states]
     time_s, *columns = style.with_gaps(np.array(rows)).T
-    for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
-        axes.plot(time_s, column, color=color, label=f"vehicle hidden, {side}")
-    axes.plot(time_s, columns[-1], color=style.BLUE, ls=":", label="the likeliest in view")
+    for side, dashes, column in zip(_sides(states), style.SIDE_DASHES, columns, strict=False):
+        axes.plot(time_s, column, dashes, color=style.HIDDEN, label=f"vehicle hidden, {side}")
+    axes.plot(time_s, columns[-1], color=style.IN_VIEW, label="the likeliest in view")
     axes.set(ylabel="existence\nprobability", ylim=(-0.02, 1.02))
 
 
@@ -222,14 +222,14 @@ def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
         cues = [next((one for one in state.cues if one.direction == side), None) for state in states]
         told = [(np.nan, np.nan) if c is None else (c.risk, (c.within or {}).get("3", np.nan)) for c in cues]
         time_s, risk, within = style.with_gaps(np.column_stack([_times(states), told])).T
-        axes.plot(time_s, risk, color=_SIDE_COLORS[row], label=f"risk, {side}")
+        axes.plot(time_s, risk, style.SIDE_DASHES[row], color=style.HIDDEN, label=f"risk, {side}")
         if np.isfinite(within).any():
-            axes.plot(time_s, within, color=_SIDE_COLORS[row], ls="--", label=f"in view within 3 s, {side}")
+            axes.plot(time_s, within, style.SIDE_DASHES[row], color=style.HIDDEN, lw=0.7)
     axes.set(ylabel="risk,\nprobability", ylim=(-0.02, 1.02))
 
 
 def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
-    return states[0].context.directions[: len(_SIDE_COLORS)]
+    return states[0].context.directions[: len(style.SIDE_DASHES)]
 
 
 def _times(states: Sequence[WorldState]) -> list[float]:
@@ -274,7 +274,7 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     for occluder in state.context.occluders:
         _draw_occluder(axes, occluder)
     for view in state.searched:
-        _wedge(axes, view.sector_rad, SEARCHED_M, style.PURPLE if view.found else style.GREEN, 0.25)
+        _wedge(axes, view.sector_rad, SEARCHED_M, style.SEARCHED, _FOUND if view.found else _NOTHING)
     for cue in state.cues:
         _draw_cue(axes, cue)
     for entity in (part for one in state.entities if one.moving for part in one.on_each_side()):
@@ -298,19 +298,18 @@ def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
     """Draw the risk, and say it on the cue's own side below the ego, where no sector lies."""
     raised = cue.advisory is not None
     sector = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
-    _wedge(axes, sector, CUE_M, style.RED if raised else style.ORANGE, 0.05 + 0.5 * cue.risk)
+    _wedge(axes, sector, CUE_M, style.DECISION if raised else style.HIDDEN, 0.05 + 0.5 * cue.risk)
     within = "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
     said = f"{cue.direction}{': ADVISORY' if raised else ''}\nrisk {cue.risk:.2f}{within}"
     left = cue.azimuth_rad > 0.0
-    axes.text(
-        -37 if left else 37, -2.5, said, color=style.RED if raised else "0.2", ha="left" if left else "right",
-        va="top", weight="bold" if raised else "normal",
-    )  # fmt: skip
+    x, side = (-37, "left") if left else (37, "right")
+    color, weight = (style.DECISION, "bold") if raised else ("0.2", "normal")
+    axes.text(x, -2.5, said, color=color, ha=side, va="top", weight=weight)
 
 
 def _draw_entity(axes: "Axes", entity: Entity) -> None:
     hidden = entity.status == "hidden"
-    color, density = style.RED if hidden else style.BLUE, entity.existence_probability
+    color, density = style.HIDDEN if hidden else style.IN_VIEW, entity.existence_probability
     sector = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
     _wedge(axes, sector, SECTOR_M, color, 0.05 + 0.3 * density)
     axes.plot(*zip((0.0, 0.0), _at(entity.azimuth_rad, SECTOR_M), strict=True), color=color, alpha=density)
