@@ -37,6 +37,19 @@ class WarningSummary:
     visible_entity_id: str | None  # The first moving entity that came into view
 
 
+def calibration_words(uncalibrated: int, hops: int) -> str:
+    """Return in words whether the cues kept to a false-alarm budget in all hops, in some or in none.
+
+    Examples
+    --------
+    >>> [calibration_words(n, 91) for n in (0, 3, 91)]
+    ['calibrated', 'uncalibrated in 3 of 91 hops', 'uncalibrated']
+    """
+    if not uncalibrated:
+        return "calibrated"
+    return "uncalibrated" if uncalibrated == hops else f"uncalibrated in {uncalibrated} of {hops} hops"
+
+
 @dataclass(slots=True)
 class WarningMeter:
     """Counts states and advisories while they go by, and keeps none of them."""
@@ -47,6 +60,7 @@ class WarningMeter:
     first_ns: int = 0
     last_ns: int = 0
     peak_risk: float = 0.0
+    uncalibrated: int = 0  # States whose cues keep to no budget
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None
@@ -56,6 +70,7 @@ class WarningMeter:
         """Take in the next state of the recording."""
         self.first_ns, self.last_ns = self.first_ns if self.states else state.stamp_ns, state.stamp_ns
         self.states, self.peak_risk = self.states + 1, max(self.peak_risk, state.risk)
+        self.uncalibrated += not state.calibrated
         raised = [cue for cue in state.cues if cue.advisory]
         if raised:
             now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk).entity_id
@@ -104,6 +119,8 @@ class RecordingReport:
         Seconds of audio per second of wall time, the whole chain.
     health : RecordingHealth
         What was wrong with the microphones.
+    calibration : str
+        In words: "calibrated", "uncalibrated", or in how many hops it was not.
     end : Checkpoint or None
         Belief and site after the last hop, to go on from; None where there was none.
 
@@ -128,13 +145,14 @@ class RecordingReport:
     peak_risk: float
     realtime_factor: float
     health: RecordingHealth
+    calibration: str
     end: Checkpoint | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
         figures = {"hops": self.hops, "peak_risk": self.peak_risk, "realtime_factor": self.realtime_factor}
         masked = {"masked_microphones": [channel + 1 for channel in self.health.masked_channels]}
-        return asdict(self.warning) | figures | masked
+        return asdict(self.warning) | figures | masked | {"calibration": self.calibration}
 
 
 def run_recording(
@@ -189,4 +207,7 @@ def run_recording(
             end = step.checkpoint
     elapsed_s, last_ns = time.perf_counter() - started, max(meter.last_ns, source.start_ns)
     factor = seconds(last_ns - source.start_ns) / elapsed_s
-    return RecordingReport(meter.summary(), meter.states, meter.peak_risk, factor, health.summary(), end)
+    calibration = calibration_words(meter.uncalibrated, meter.states)
+    return RecordingReport(
+        meter.summary(), meter.states, meter.peak_risk, factor, health.summary(), calibration, end
+    )

@@ -21,6 +21,7 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import LEAST_HEARD, InputFileError, seconds
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.operations import figure_style as style
+from worldstate.operations.recordings.recording_report import calibration_words
 from worldstate.state import Entity, Occluder, RiskCue, WorldState
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 _WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
 # Longest title in one line above a figure of this width.
 _TITLE_CHARACTERS = 100
+# Below this, odds of one to a thousand, no threshold lies; the first windows of a run reach -20.
+_LOWEST_NATS = -7.0
 # An entity is drawn where it more likely exists than not.
 _LIKELY = 0.5
 # A GIF this large has 576 x 416 pixels: labels of 9 points are still read in a browser.
@@ -100,7 +103,9 @@ def write_state_figure(
     t0_s: float | None = None,
     truth: Sequence[TrueTrack] = (),
 ) -> None:
-    """Draw azimuths, what was raised and seen, existence and risk over time.
+    """Draw azimuths, what was raised and seen, what decides it and the probabilities over time.
+
+    A state that is not calibrated has no threshold in the figure, and the title says so.
 
     Parameters
     ----------
@@ -126,25 +131,26 @@ def write_state_figure(
     True
     """
     with style.figure_file(path, 10.0, 8.6 if sound is None else 9.6) as figure:
-        heights = (1.0 if sound is None else 1.4, 0.42, 0.6, 0.6)
-        azimuths, rows, existence, risk = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+        heights = (1.0 if sound is None else 1.4, 0.42, 0.7, 0.6)
+        azimuths, rows, decision, probabilities = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         if sound is not None:
             label = "power of the sound over its median over azimuth, each window at its middle"
             style.draw_power(azimuths, sound.time_s, sound.azimuths_rad, sound.power, label)
         _draw_truth(azimuths, truth)
         _draw_azimuths(azimuths, states)
         _draw_rows(rows, states)
-        _draw_existence(existence, states)
-        _draw_risk(risk, states)
-        for axes in (azimuths, rows, existence, risk) if t0_s is not None else ():
+        _draw_decision(decision, states)
+        _draw_probabilities(probabilities, states)
+        for axes in (azimuths, rows, decision, probabilities) if t0_s is not None else ():
             entry = axes.axvline(t0_s, color=style.TRUTH, lw=1.2, ls="--")
             entry.set_label("line-of-sight entry $T_0$" if axes is azimuths else "")
-        for axes in (azimuths, existence, risk):
+        for axes in (azimuths, decision, probabilities):
             style.legend_beside(axes)
         # The first window begins a second before its decision.
         span_s = _times(states)[0] - _WINDOW_S, _times(states)[-1] + style.HOP_S
-        risk.set(xlabel="time (s), end of the decision window", xlim=span_s)
-        figure.suptitle(title if len(title) <= _TITLE_CHARACTERS else "..." + title[-_TITLE_CHARACTERS:])
+        probabilities.set(xlabel="time (s), end of the decision window", xlim=span_s)
+        shown = title if len(title) <= _TITLE_CHARACTERS else "..." + title[-_TITLE_CHARACTERS:]
+        figure.suptitle(f"{shown}{_uncalibrated(states)}")
 
 
 def _draw_truth(axes: "Axes", truth: Sequence[TrueTrack]) -> None:
@@ -198,38 +204,58 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     style.name_rows(axes, names)
 
 
-def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
-    rows = [(seconds(state.stamp_ns), *_existence(state, _sides(states))) for state in states]
-    time_s, *columns = style.with_gaps(np.array(rows)).T
-    for side, dashes, column in zip(_sides(states), style.SIDE_DASHES, columns, strict=False):
-        axes.plot(time_s, column, dashes, color=style.HIDDEN, label=f"vehicle hidden, {side}")
-    axes.plot(time_s, columns[-1], color=style.IN_VIEW, label="the likeliest in view")
-    axes.set(ylabel="existence\nprobability", ylim=(-0.02, 1.02))
+def _draw_decision(axes: "Axes", states: Sequence[WorldState]) -> None:
+    """Draw the log-odds that decide, the threshold where a budget stands behind it, and every onset."""
+    tables = {side: np.array([_decided(state, side) for state in states]) for side in _sides(states)}
+    for dashes, (side, rows) in zip(style.SIDE_DASHES, tables.items(), strict=False):
+        time_s, compared, *_ = style.with_gaps(rows).T
+        axes.plot(time_s, compared, dashes, color=style.HIDDEN, label=f"what decides, {side}")
+    for dashes, rows in zip(style.SIDE_DASHES, tables.values(), strict=False):
+        time_s, _, threshold, _ = style.with_gaps(rows).T
+        if np.isfinite(threshold).any():
+            axes.plot(time_s, threshold, dashes, color=style.DECISION, label="threshold")
+        onsets = rows[np.diff(rows[:, 3], prepend=0.0) > 0.0]
+        if len(onsets):
+            axes.plot(onsets[:, 0], onsets[:, 1], "v", color=style.DECISION, ms=8, label="onset")
+    axes.set(ylabel="log-odds\n(nats)")
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], _LOWEST_NATS))
 
 
-def _existence(state: WorldState, sides: Sequence[str]) -> list[float]:
-    """Return the likeliest hidden entity of each side, and the likeliest that moves in view."""
-    likeliest = dict.fromkeys((*sides, "in view"), 0.0)
-    for one in (part for known in state.entities for part in known.on_each_side()):
-        at = one.direction if one.status == "hidden" else "in view" if one.moving else None
-        if at in likeliest:
-            likeliest[at] = max(likeliest[at], one.existence_probability)
-    return list(likeliest.values())
+def _decided(state: WorldState, side: str) -> tuple[float, float, float, bool]:
+    """Return the time, what decides, its threshold (NaN without a budget) and whether an advisory stands."""
+    cue = next((one for one in state.cues if one.direction == side), None)
+    if cue is None or cue.evidence is None:
+        compared, threshold = math.nan, math.nan
+    else:
+        compared, threshold = cue.evidence.compared_nats, cue.evidence.threshold_nats
+    raised = cue is not None and cue.advisory is not None
+    return seconds(state.stamp_ns), compared, threshold if state.calibrated else math.nan, raised
 
 
-def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
-    for row, side in enumerate(_sides(states)):
-        cues = [next((one for one in state.cues if one.direction == side), None) for state in states]
-        told = [(np.nan, np.nan) if c is None else (c.risk, (c.within or {}).get("3", np.nan)) for c in cues]
-        time_s, risk, within = style.with_gaps(np.column_stack([_times(states), told])).T
-        axes.plot(time_s, risk, style.SIDE_DASHES[row], color=style.HIDDEN, label=f"risk, {side}")
-        if np.isfinite(within).any():
-            axes.plot(time_s, within, style.SIDE_DASHES[row], color=style.HIDDEN, lw=0.7)
-    axes.set(ylabel="risk,\nprobability", ylim=(-0.02, 1.02))
+def _draw_probabilities(axes: "Axes", states: Sequence[WorldState]) -> None:
+    rows = [(seconds(state.stamp_ns), *_probabilities(state, _sides(states))) for state in states]
+    time_s, in_view, *risks = style.with_gaps(np.array(rows)).T
+    for side, dashes, risk in zip(_sides(states), style.SIDE_DASHES, risks, strict=False):
+        axes.plot(time_s, risk, dashes, color=style.HIDDEN, label=f"risk, {side}")
+    axes.plot(time_s, in_view, color=style.IN_VIEW, label="a vehicle in view")
+    axes.set(ylabel="probability", ylim=(-0.02, 1.02))
+
+
+def _probabilities(state: WorldState, sides: Sequence[str]) -> list[float]:
+    """Return the existence of the likeliest vehicle in view, and the risk of each side."""
+    in_view = [one.existence_probability for one in state.entities if one.moving and one.status != "hidden"]
+    risks = {cue.direction: cue.risk for cue in state.cues}
+    return [max(in_view, default=0.0), *(risks.get(side, math.nan) for side in sides)]
 
 
 def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
     return states[0].context.directions[: len(style.SIDE_DASHES)]
+
+
+def _uncalibrated(states: Sequence[WorldState]) -> str:
+    """Return what a title ends in where a state keeps to no false-alarm budget."""
+    number = sum(not state.calibrated for state in states)
+    return f" ({calibration_words(number, len(states))})" if number else ""
 
 
 def _times(states: Sequence[WorldState]) -> list[float]:
@@ -283,7 +309,7 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     behind = any(abs(view.sector_rad[0]) > 0.6 * math.pi for view in state.searched)
     axes.set(xlim=(-38, 38), ylim=(-41 if behind else -11, 37), aspect="equal", xticks=(), yticks=())
     axes.spines[:].set_visible(False)
-    said = f"{seconds(state.stamp_ns):.1f} s" + (f"   {title}" if title else "")
+    said = f"{seconds(state.stamp_ns):.1f} s   {title}{_uncalibrated([state])}"
     axes.set_title(said, loc="left")
     _draw_legend(axes)
 
