@@ -1,7 +1,8 @@
 """`worldstate demo`: one occluded approach, simulated, heard and drawn.
 
 Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
-before any camera can see it. Leaves timeline.png, states.jsonl and summary.json in the output folder.
+before any camera can see it. Prints in a sentence how early it was announced, and leaves
+timeline.png, states.jsonl and summary.json in the output folder.
 
 example: worldstate demo --out out/demo --seed 7
 """
@@ -55,6 +56,9 @@ def _delivery_van(rng: "np.random.Generator") -> "simulation.SimulationSettings"
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
+    from worldstate.adapters.datasets.ovad import read_true_tracks
+    from worldstate.adapters.state_log import read_log
+    from worldstate.operations.recordings.recording_report import announcement
     from worldstate.operations.viewing.state_figure import drawn_run
 
     out = output.output_folder(arguments.out, "timeline.png", "states.jsonl", "summary.json")
@@ -64,4 +68,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     with drawn_run(out / "timeline.png", source, title) as draw:
         report = listening.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
     output.write_report(out / "summary.json", report.to_dict())
-    return output.CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}"])
+    states = (state for _, state in read_log(out / "states.jsonl"))
+    told = announcement(states, read_true_tracks(folder), "a van")
+    return output.CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}", told])

@@ -2,10 +2,11 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.adapters.listener import Step, listen_steps
 from worldstate.adapters.source import Source
@@ -211,3 +212,62 @@ def run_recording(
     return RecordingReport(
         meter.summary(), meter.states, meter.peak_risk, factor, health.summary(), calibration, end
     )
+
+
+def announcement(
+    states: Iterable[WorldState], truth: Sequence[TrueTrack], vehicle: str = "a vehicle"
+) -> str:
+    """Return in one sentence how long before it came into sight each vehicle was announced.
+
+    Parameters
+    ----------
+    states : iterable of WorldState
+        Of one recording.
+    truth : sequence of TrueTrack
+        Its vehicles; those that were in sight from the beginning, or never were, are not spoken of.
+    vehicle : str
+        What they are called.
+
+    Examples
+    --------
+    >>> announcement([], [])
+    'no vehicle came into sight, and none was announced'
+    """
+    onsets = _onsets_by_side(states)
+    came = sorted((*one.visible_s, _side(one)) for one in truth if one.visible_s and not one.in_view[0])
+    if not came:
+        told = ", and none was announced" if not onsets else ", although one was announced"
+        return f"no vehicle came into sight{told}"
+    sentences, before_s = [], dict[str, float]()
+    for first_s, last_s, side in came:
+        # What was announced of the one before it has ended with that one's hand-over.
+        own_s = [time_s for time_s in onsets.get(side, ()) if time_s > before_s.get(side, -math.inf)]
+        sentences.append(f"{vehicle} from the {side} was {_announced(own_s, first_s, last_s)}")
+        before_s[side] = first_s
+    return "; ".join(sentences)
+
+
+def _side(track: TrueTrack) -> str:
+    return "left" if track.azimuth_rad[track.in_view][0] > 0.0 else "right"
+
+
+def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
+    """Return when an advisory began, seconds, of each side that had one."""
+    onsets, standing = dict[str, list[float]](), set[str]()
+    for state in states:
+        raised = {cue.direction for cue in state.cues if cue.advisory is not None}
+        for side in raised - standing:
+            onsets.setdefault(side, []).append(seconds(state.stamp_ns))
+        standing = raised
+    return onsets
+
+
+def _announced(onsets_s: Sequence[float], first_s: float, last_s: float) -> str:
+    """Return how the onsets of its side stood to the time in which a vehicle was in sight."""
+    found = onset_outcome(onsets_s, first_s)
+    if found.lead_s:
+        return f"announced {found.lead_s:.1f} s before it came into sight"
+    if found.onsets_earlier:
+        return f"announced more than {LONGEST_LEAD_S:.0f} s before it came into sight"
+    late_s = next((time_s - first_s for time_s in onsets_s if first_s <= time_s <= last_s), None)
+    return "not announced" if late_s is None else f"announced {late_s:.1f} s after it came into sight"
