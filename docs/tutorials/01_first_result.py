@@ -5,12 +5,12 @@ from tempfile import TemporaryDirectory
 
 from tutorial_options import tutorial_options
 
-from worldstate import WorldState, listen
-from worldstate.adapters import open_source
-from worldstate.operations.figure_style import BLUE, RED, figure_file
+from worldstate import WorldState
+from worldstate.adapters import listen, open_source
+from worldstate.operations.figure_style import DECISION, HIDDEN, SIDE_DASHES, TRUTH, figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 
-COLOURS = {"left": BLUE, "right": RED}
+DASHES = dict(zip(("left", "right"), SIDE_DASHES, strict=False))
 
 
 def chance(state: WorldState, side: str) -> float:
@@ -31,14 +31,14 @@ def main(out: Path, size: str = "full") -> None:
             time_s = [state.stamp_ns / 1e9 for state in states]
             t0_s = open_source(Path(root) / row.folder).t0_s
             warned = []
-            for side, colour in COLOURS.items():
-                axes.plot(time_s, [chance(state, side) for state in states], color=colour, label=side)
+            for side, dashes in DASHES.items():
+                axes.plot(time_s, [chance(s, side) for s in states], dashes, color=HIDDEN, label=side)
                 on = [any(c.advisory and c.direction == side for c in state.cues) for state in states]
                 warned += [f"{side} at {time_s[on.index(True)]:.1f} s"] if any(on) else []
-                axes.fill_between(time_s, 0.0, 1.0, where=on, color=colour, alpha=0.12, linewidth=0)
+                axes.fill_between(time_s, 0.0, 1.0, where=on, color=DECISION, alpha=0.12, linewidth=0)
             came = f"from the {row.approach}" if row.approach != "none" else "no vehicle comes"
             if row.approach != "none" and t0_s is not None:
-                axes.axvline(t0_s, color="black", linestyle=":")
+                axes.axvline(t0_s, color=TRUTH, linestyle=":")
                 came += f", in view at {t0_s:.1f} s"
             axes.set(ylim=(0.0, 1.0), title=f"{row.environment}: {came}")
             print(f"{row.environment}, {came}; advisory {', '.join(warned) or 'none'}")

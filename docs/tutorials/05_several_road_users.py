@@ -9,10 +9,10 @@ import numpy as np
 from tutorial_options import tutorial_options
 
 from worldstate import listen
-from worldstate.operations.figure_style import BLUE, GREEN, RED, YELLOW, figure_file
+from worldstate.operations.figure_style import HIDDEN, IN_VIEW, SIDE_DASHES, TRUTH, figure_file
 from worldstate.simulation import VehicleSettings, draw_settings, simulate_recording, write_recording
 
-COLOURS = {"hidden": YELLOW, "visible": GREEN, "emerged": BLUE}
+COLOURS = {"hidden": HIDDEN, "emerged": IN_VIEW, "visible": IN_VIEW}
 
 
 def main(out: Path, size: str = "full") -> None:
@@ -38,13 +38,14 @@ def main(out: Path, size: str = "full") -> None:
                 where.plot(at, middle, ".", color=colour, markersize=4, label=one.status)
             for event in (one for one in state.events if one.kind in ("handed_over", "merged")):
                 print(f"{at:.1f} s: {event.entity_id[:8]} {event.kind}")
-        for side, colour in (("left", BLUE), ("right", RED)):
+        for side, dashes in zip(("left", "right"), SIDE_DASHES, strict=False):
             within = [next(c for c in state.cues if c.direction == side).within for state in states]
-            chance.plot(time_s, [math.nan if w is None else w["3"] for w in within], color=colour, label=side)
+            told = [math.nan if w is None else w["3"] for w in within]
+            chance.plot(time_s, told, dashes, color=HIDDEN, label=side)
         for side, at in comes:
-            where.axvline(at, color="black", linestyle=":", linewidth=1.0)
+            where.axvline(at, color=TRUTH, linestyle=":", linewidth=1.0)
             where.text(at, 78.0, f" {side}", fontsize=9)
-            chance.axvline(at, color="black", linestyle=":", linewidth=1.0)
+            chance.axvline(at, color=TRUTH, linestyle=":", linewidth=1.0)
         marks, names = where.get_legend_handles_labels()
         where.legend(dict(zip(names, marks, strict=True)).values(), dict.fromkeys(names), loc="lower left")
         where.set(ylim=(-95.0, 95.0), ylabel="azimuth, degrees\n(left positive)")

@@ -8,7 +8,7 @@ import numpy as np
 from tutorial_options import tutorial_options
 
 from worldstate import listen
-from worldstate.operations.figure_style import BLUE, RED, figure_file
+from worldstate.operations.figure_style import DECISION, HIDDEN, SIDE_DASHES, TRUTH, figure_file
 from worldstate.simulation import draw_settings, simulate_recording, write_recording
 
 
@@ -25,15 +25,15 @@ def main(out: Path, size: str = "full") -> None:
             states = list(listen(Path(root) / row.folder))
             time_s = np.array([state.stamp_ns / 1e9 for state in states])
             risk, speed = grid[:, number]
-            for side, colour in (("left", BLUE), ("right", RED)):
+            for side, dashes in zip(("left", "right"), SIDE_DASHES, strict=False):
                 cues = [next(c for c in state.cues if c.direction == side) for state in states]
-                risk.plot(time_s, [cue.risk for cue in cues], color=colour, label=side)
+                risk.plot(time_s, [cue.risk for cue in cues], dashes, color=HIDDEN, label=side)
                 on = [cue.advisory is not None for cue in cues]
-                risk.fill_between(time_s, 0.0, 1.0, where=on, color=colour, alpha=0.12, linewidth=0)
+                risk.fill_between(time_s, 0.0, 1.0, where=on, color=DECISION, alpha=0.12, linewidth=0)
                 print(f"{site}, {approach}: {side} at most {max(c.risk for c in cues):.2f}, ", end="")
                 print(f"advisory in {sum(on)} of {len(on)} hops")
             if approach != "none":
-                risk.axvline(settings.entry_s, color="black", linestyle=":")
+                risk.axvline(settings.entry_s, color=TRUTH, linestyle=":")
             speed.plot(time_s, 3.6 * settings.ego.at_mps(time_s), color="black")
             risk.set(ylim=(0.0, 1.0), xticks=(0, 5, 10), title=f"{site}: {approach}")
         grid[0, 0].set(ylabel="risk")

@@ -7,7 +7,7 @@ from tutorial_options import tutorial_options
 
 from worldstate import Entity, Measurement, NotUsable, SignatureEvidence, Unqueried, WorldFilter
 from worldstate.measurement import Position, PositionScan
-from worldstate.operations.figure_style import figure_file
+from worldstate.operations.figure_style import HIDDEN, TRUTH, figure_file
 
 NOT_ASKED, UNKNOWN = Unqueried("no camera"), NotUsable("not measured by light")
 NOISE = tuple(map(tuple, np.diag([2.25, 2.25, 0.25, 0.25]).tolist()))  # of the receiver's x, y, vx, vy
@@ -48,9 +48,9 @@ def main(out: Path, size: str = "full") -> None:
             exists.plot(time_s, [0.0 if e is None else e.existence_probability for e in left], label=name)
             told = [(np.nan,) * 3 if e is None else e.time_to_visible_s or (np.nan,) * 3 for e in left]
             print(f"{name}: {sum(map(bool, left))} states, {np.isfinite(told).sum() // 3} with a time")
-        when.fill_between(time_s, *np.transpose(told)[[0, 2]], alpha=0.2, color="C2", linewidth=0)
-        when.plot(time_s, np.transpose(told)[1], color="C2", label="both, nine of ten cases")
-        when.plot(time_s, np.maximum((way_m - EDGE_M) / SPEED_MPS, 0.0), "k:", label="truth")
+        when.fill_between(time_s, *np.transpose(told)[[0, 2]], alpha=0.2, color=HIDDEN, linewidth=0)
+        when.plot(time_s, np.transpose(told)[1], color=HIDDEN, label="both, nine of ten cases")
+        when.plot(time_s, np.maximum((way_m - EDGE_M) / SPEED_MPS, 0.0), ":", color=TRUTH, label="truth")
         exists.set(xlabel="time, s", ylabel="existence of a hidden one, left")
         when.set(ylim=(0.0, None), xlabel="time, s", ylabel="time to visible, s")
         _ = exists.legend(loc="upper left"), when.legend()

@@ -7,14 +7,14 @@ import numpy as np
 from tutorial_options import tutorial_options
 from worldstate_lab.planner.encounters import EgoVehicle
 
-from worldstate import WorldState, listen
-from worldstate.adapters import open_source
-from worldstate.operations.figure_style import BLUE, GREEN, RED, figure_file
+from worldstate import WorldState
+from worldstate.adapters import listen, open_source
+from worldstate.operations.figure_style import CATEGORIES, figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 
 EGO, HOP_S, BEGINS_M = EgoVehicle(), 0.1, 20.0
 # Chance from which on a vehicle is assumed; .01 is a choice: `worldstate-lab planner` sets it on streams.
-THRESHOLDS = {"no knowledge": (np.inf, RED), "phantom": (0.0, BLUE), "chance": (0.01, GREEN)}
+THRESHOLDS = {"no knowledge": np.inf, "phantom": 0.0, "chance": 0.01}
 
 
 def chance(state: WorldState) -> float:
@@ -45,7 +45,7 @@ def main(out: Path, size: str = "full") -> None:
             t0_s = open_source(Path(root) / row.folder).t0_s or 7.0
             begins_ns = 1e9 * (t0_s - BEGINS_M / EGO.limit_mps)  # at the limit it is at the line at T0
             states = [one for one in listen(Path(root) / row.folder) if one.stamp_ns >= begins_ns]
-            for name, (threshold, colour) in THRESHOLDS.items():
+            for (name, threshold), colour in zip(THRESHOLDS.items(), CATEGORIES, strict=False):
                 beyond_m, speed = drive(states, threshold)
                 axes.plot(beyond_m, 3.6 * speed, color=colour, label=name)
                 slow_s = HOP_S * np.sum((speed < EGO.limit_mps - 0.1) & (beyond_m < 0.0))

@@ -1,10 +1,25 @@
 """Figures are written whole, in a format that the name says, and leave the caller's settings alone."""
 
+from itertools import combinations
+
 import matplotlib as mpl
+import numpy as np
 import pytest
 
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.figure_style import figure_file, legend_beside
+from worldstate.operations.figure_style import (
+    CATEGORIES,
+    DECISION,
+    HEARD,
+    HIDDEN,
+    IN_VIEW,
+    SEARCHED,
+    TRUTH,
+    figure_file,
+    legend_beside,
+)
+
+MEANINGS = HIDDEN, IN_VIEW, SEARCHED, HEARD, TRUTH, DECISION
 
 
 @pytest.mark.parametrize("name", ["a.xyz", "a", "a.jpg"])
@@ -33,3 +48,36 @@ def test_a_figure_that_fails_leaves_no_file(tmp_path):
     with pytest.raises(ZeroDivisionError), figure_file(tmp_path / "a.png", 3, 2):
         raise ZeroDivisionError
     assert not list(tmp_path.iterdir())
+
+
+# From linear sRGB to what a protanope, deuteranope and tritanope see (Machado et al. 2009), and to CIE XYZ.
+SEEN = np.array([
+    np.eye(3),
+    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+])  # fmt: skip
+XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def linear(colour):
+    shown = np.array(mpl.colors.to_rgb(colour))
+    return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+
+
+def lab(seen):
+    share = XYZ @ np.clip(seen, 0.0, 1.0) / XYZ.sum(axis=1)
+    x, y, z = np.where(share > 0.008856, np.cbrt(share), 7.787 * share + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("colours", [MEANINGS, CATEGORIES])
+def test_colours_are_told_apart_with_any_colour_vision(colours):
+    for one, other in combinations(colours, 2):
+        apart = [np.linalg.norm(lab(seen @ linear(one)) - lab(seen @ linear(other))) for seen in SEEN]
+        assert min(apart) > 15.0, (one, other)
+
+
+@pytest.mark.parametrize("colour", MEANINGS)
+def test_a_line_of_a_meaning_is_seen_on_white_paper(colour):
+    assert 1.05 / (XYZ[1] @ linear(colour) + 0.05) > 3.0

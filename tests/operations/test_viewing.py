@@ -49,7 +49,7 @@ def reddish(image):
 def test_the_figure_over_time_names_its_panels(log, tmp_path):
     assert main(["log", "plot", str(log), "--out", str(tmp_path / "states.svg")]) == 0
     text = (tmp_path / "states.svg").read_text()
-    for said in ("advisory left", "camera (blue: found)", "vehicle hidden, left", "risk, right"):
+    for said in ("advisory left", "camera (tall: found)", "what decides, left", "risk, right"):
         assert f"<!-- {said} -->" in text
 
 
@@ -154,6 +154,35 @@ def test_an_advisory_stands_in_the_row_of_its_side(panels, states):
     bar = rows.collections[0].get_paths()[0].get_extents()
     assert names[round((bar.y0 + bar.y1) / 2)] == "advisory left"
     assert bar.x0 == pytest.approx(raised[0].stamp_ns / 1e9)
+
+
+def test_what_decides_is_drawn_with_its_threshold_and_onsets(panels, states):
+    budgeted = [replace(state, calibrated=True) for state in states]
+    terms = [next(cue for cue in state.cues if cue.direction == "left").evidence for state in states]
+    lines = {line.get_label(): line for line in panels(budgeted)[2].lines}
+    compared = [one.compared_nats for one in terms]
+    assert lines["what decides, left"].get_ydata() == pytest.approx(compared)
+    assert lines["threshold"].get_ydata() == pytest.approx([one.threshold_nats for one in terms])
+    raised = [any(cue.advisory and cue.direction == "left" for cue in state.cues) for state in states]
+    first = raised.index(True)
+    onset = [[states[first].stamp_ns / 1e9, compared[first]]]
+    assert lines["onset"].get_xydata().tolist() == pytest.approx(np.array(onset))
+
+
+def test_without_a_budget_no_threshold_is_drawn_and_the_title_says_so(panels, states):
+    shown = panels(states)
+    assert not any(line.get_label() == "threshold" for line in shown[2].lines)
+    assert shown[0].figure.get_suptitle() == " (uncalibrated)"
+    half = [replace(state, calibrated=i > 0) for i, state in enumerate(states)]
+    shown = panels(half)
+    (line, *_) = (line for line in shown[2].lines if line.get_label() == "threshold")
+    assert np.isfinite(line.get_ydata()).tolist() == [state.calibrated for state in half]
+    assert "uncalibrated in 1 of" in shown[0].figure.get_suptitle()
+
+
+def test_a_log_without_a_budget_is_summed_up_as_uncalibrated(log, tmp_path, capsys):
+    assert main(["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")]) == 0
+    assert "uncalibrated" in capsys.readouterr().out
 
 
 def test_no_line_is_drawn_across_a_gap():

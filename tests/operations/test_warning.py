@@ -1,7 +1,11 @@
 """Lead time and hand-over, read off a stream of states."""
 
+import numpy as np
+import pytest
+
+from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.ground.values import nanoseconds
-from worldstate.operations.recordings.recording_report import WarningMeter
+from worldstate.operations.recordings.recording_report import WarningMeter, announcement
 from worldstate.state import Advisory, Context, Entity, RiskCue, WorldState
 from worldstate.state.context import Priors
 
@@ -58,3 +62,39 @@ def test_parked_cars_are_no_hand_over():
 
     assert summary(5.0, {}, seen("parked", False), seen("coming", True)).visible_entity_id == "coming"
     assert summary(5.0, {}, seen("parked", False)).visible_entity_id is None
+
+
+def track(side: str, first_s: float, last_s: float) -> TrueTrack:
+    time_s = np.arange(100) / 10
+    azimuth_rad = np.full(100, 0.5 if side == "left" else -0.5)
+    in_view = (time_s > first_s - 0.05) & (time_s < last_s + 0.05)
+    return TrueTrack(time_s, azimuth_rad, in_view, np.zeros((100, 2)))
+
+
+LEFT = track("left", 6.0, 8.0)
+
+
+@pytest.mark.parametrize(
+    ("onsets_s", "truth", "told"),
+    [
+        ([3.2], [LEFT], "a van from the left was announced 2.8 s before it came into sight"),
+        ([0.5], [LEFT], "a van from the left was announced more than 5 s before it came into sight"),
+        ([6.4], [LEFT], "a van from the left was announced 0.4 s after it came into sight"),
+        ([9.0], [LEFT], "a van from the left was not announced"),
+        ([], [LEFT], "a van from the left was not announced"),
+        ([3.2], [track("right", 6.0, 8.0)], "a van from the right was not announced"),
+        ([], [], "no vehicle came into sight, and none was announced"),
+        ([3.2], [], "no vehicle came into sight, although one was announced"),
+        ([3.2], [track("left", 0.0, 8.0)], "no vehicle came into sight, although one was announced"),
+        (
+            [1.0, 3.5],
+            [track("left", 5.0, 6.0), track("left", 2.0, 3.0)],
+            "a van from the left was announced 1.0 s before it came into sight; "
+            "a van from the left was announced 1.5 s before it came into sight",
+        ),
+    ],
+)
+def test_each_vehicle_is_told_with_the_time_by_which_it_was_announced(onsets_s, truth, told):
+    hops = [hop / 10 for hop in range(100)]
+    states = [state(time_s, any(at <= time_s < at + 0.3 for at in onsets_s)) for time_s in hops]
+    assert announcement(states, truth, "a van") == told

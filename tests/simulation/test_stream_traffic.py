@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.commissioning.stream_figure import FLOW_COLOURS
+from worldstate.commissioning.stream_figure import FLOWS
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.junction import place
@@ -231,5 +231,5 @@ def test_signals_are_the_vehicles_own_and_bells_those_of_riders() -> None:
         Traffic("test", {}, signals={"voice": 0.1})
 
 
-def test_every_flow_has_a_colour_in_the_figure():
-    assert set(FLOW_COLOURS) >= set(MANOEUVRES)
+def test_every_flow_has_a_row_in_the_figure():
+    assert set(FLOWS) >= set(MANOEUVRES)

@@ -5,17 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.operations.figure_style import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    YELLOW,
-    figure_file,
-    legend_beside,
-)
+from worldstate.operations.figure_style import HEARD, HIDDEN, IN_VIEW, TRUTH, figure_file, legend_beside
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.stream.truth import VehicleTruth
 from worldstate.simulation.stream.writing import WrittenStream
@@ -23,16 +13,14 @@ from worldstate.simulation.stream.writing import WrittenStream
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# One colour for what comes out of a hidden arm alike, others for each kind of negative.
-FLOW_COLOURS = {
-    "left": RED, "right": RED, "both": RED, "queue": RED, "follows": ORANGE, "waits": PURPLE,
-    "turns_away": BLUE, "parks": SKY, "far": "0.5", "from_behind": GREEN, "from_ahead": YELLOW,
-    "stands": BLUE, "leaves": SKY, "joins": SKY,
-}  # fmt: skip
+# Rows of the events: first what comes out of a hidden arm, then each kind of negative.
+FLOWS = (
+    "left", "right", "both", "queue", "follows", "waits", "turns_away", "parks", "far", "from_behind",
+    "from_ahead", "stands", "leaves", "joins",
+)  # fmt: skip
 MAP_M = 60.0  # as far to the sides
 WALLS_M = 12.0  # the ego's own street is drawn this far behind it
 COLUMNS = 1600  # of the spectrogram: more than the figure has dots
-HIDDEN_STYLE, SEEN_STYLE = ":", "-"
 
 
 def write_stream_figure(stream: WrittenStream, path: Path) -> None:
@@ -53,15 +41,14 @@ def _draw_map(axes: "Axes", stream: WrittenStream) -> None:
     for line in _walls(stream.settings.site):
         axes.plot(*np.array(line).T, color="black", linewidth=2.0)
     for one in stream.vehicles:
-        colour, label = FLOW_COLOURS[one.event.flow], one.event.flow.replace("_", " ")
-        for shown, style in ((~one.in_view, HIDDEN_STYLE), (one.in_view, SEEN_STYLE)):
+        for shown, colour, label in ((~one.in_view, HIDDEN, "hidden"), (one.in_view, IN_VIEW, "in view")):
             # Those of one flow drive on the same lane: a line each, a hand's breadth beside the last one.
             beside = 0.15 * (one.number % 8 - 3.5)
             y, x = (np.where(shown, value, np.nan) for value in (one.y_m, one.x_m + beside))
-            axes.plot(y, x, style, color=colour, linewidth=0.8, label=label if style == SEEN_STYLE else None)
+            axes.plot(y, x, color=colour, linewidth=0.8, label=label)
     axes.plot(0.0, 0.0, "^", color="black", markersize=9, label="array")
     axes.set(xlim=(MAP_M, -MAP_M), ylim=(-WALLS_M, 22.0), aspect="equal")
-    axes.set(xlabel="y (m), left positive; dotted where hidden", ylabel="x (m), ahead")
+    axes.set(xlabel="y (m), left positive", ylabel="x (m), ahead")
 
 
 def _walls(site: Site) -> list[list[tuple[float, float]]]:
@@ -94,7 +81,7 @@ def _draw_spectrogram(axes: "Axes", stream: WrittenStream) -> None:
 
 
 def _draw_events(axes: "Axes", stream: WrittenStream) -> None:
-    rows = [*FLOW_COLOURS, *sorted({one.sound.kind for one in stream.sounds})]
+    rows = [*FLOWS, *sorted({one.sound.kind for one in stream.sounds})]
     for one in stream.vehicles:
         _draw_event(axes, one, rows.index(one.event.flow))
     for sound in stream.sounds:
@@ -102,16 +89,15 @@ def _draw_events(axes: "Axes", stream: WrittenStream) -> None:
         axes.broken_barh([span], (rows.index(sound.sound.kind) - 0.35, 0.7), color="0.7", lw=0)
     axes.set(yticks=range(len(rows)), yticklabels=[row.replace("_", " ") for row in rows])
     axes.tick_params(axis="y", labelsize=7)
-    axes.set(xlabel="time (s); pale: in earshot, full: in view, tick: first line of sight")
+    axes.set(xlabel="time (s); pink: in earshot, blue: in view, tick: first line of sight")
     axes.set_ylim(len(rows) - 0.4, -0.6)
 
 
 def _draw_event(axes: "Axes", one: VehicleTruth, row: int) -> None:
-    colour = FLOW_COLOURS[one.event.flow]
     span = (one.event.start_s, one.event.end_s - one.event.start_s)
-    axes.broken_barh([span], (row - 0.35, 0.7), color=colour, alpha=0.3, lw=0)
+    axes.broken_barh([span], (row - 0.35, 0.7), color=HEARD, alpha=0.5, lw=0)
     seen = one.time_s[one.in_view]
     if seen.size:
-        axes.broken_barh([(seen[0], seen[-1] - seen[0] + 0.1)], (row - 0.35, 0.7), color=colour, lw=0)
+        axes.broken_barh([(seen[0], seen[-1] - seen[0] + 0.1)], (row - 0.35, 0.7), color=IN_VIEW, lw=0)
     if one.t0_s is not None:
-        axes.plot([one.t0_s] * 2, [row - 0.45, row + 0.45], color="black", linewidth=0.8)
+        axes.plot([one.t0_s] * 2, [row - 0.45, row + 0.45], color=TRUTH, linewidth=0.8)

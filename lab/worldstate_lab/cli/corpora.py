@@ -30,7 +30,7 @@ from worldstate.cli.common.output import CommandResult, output_folder, write_rep
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.figure_style import BLUE, ORANGE, RED, figure_file, legend_beside
+from worldstate.operations.figure_style import CATEGORIES, figure_file, legend_beside
 from worldstate_lab.report.table import plain
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, draw_band_profile, hear_clips
 from worldstate_lab.signatures.signature_study import (
@@ -88,12 +88,12 @@ def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
     places = np.arange(len(rows))[::-1]
     for place, row in zip(places, rows, strict=True):
         value, low, high = (np.nan if one is None else one for one in (row.value, row.low, row.high))
-        colour = BLUE if row.figure == "AUROC" else ORANGE
+        colour = CATEGORIES[2 if row.figure == "AUROC" else 1]
         axes.barh(place, value, color=colour, alpha=0.75, label=row.figure)
         axes.plot([low, high], [place, place], color="black", linewidth=1.2, label="95 % over recordings")
         if row.paper is not None:
             # A single number is a span of no length: only its marker shows.
-            axes.plot(row.paper, [place, place], "|-", color=RED, ms=11, mew=2.5, lw=2.5, label="paper")
+            axes.plot(row.paper, [place] * 2, "|-", color=CATEGORIES[3], ms=11, mew=2.5, label="paper")
     axes.set_yticks(places, [f"{row.name}\n{row.corpus}" for row in rows], fontsize=7.0)
     axes.axvline(CHANCE, color="grey", linewidth=0.8, linestyle=":", label="chance")
     axes.set(xlim=(0.0, 1.03), xlabel="AUROC; balanced accuracy where the bar is orange")

@@ -38,7 +38,7 @@ from worldstate.cli.common.output import CommandResult, output_folder, write_rep
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.figure_style import BLUE, RED, figure_file
+from worldstate.operations.figure_style import CATEGORIES, TRUTH, figure_file
 from worldstate_lab.streets.realism import Realism, measure_realism, realism_lines
 from worldstate_lab.streets.set_classifiers import FAR_AZIMUTHS_DEG
 from worldstate_lab.streets.simulated_windows import (
@@ -58,7 +58,7 @@ LABELS = {
     "position_deg": "position of the peak (deg)",
     "prominence": "prominence",
 }
-COLOURS = {"real": BLUE, "simulated": RED}
+COLOURS = {"real": TRUTH, "simulated": CATEGORIES[1]}
 
 
 def write_realism_figure(

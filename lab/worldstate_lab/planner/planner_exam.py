@@ -10,7 +10,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, RED, SKY, figure_file
+from worldstate.operations.figure_style import CATEGORIES, TRUTH, figure_file
 from worldstate.operations.metrics.approach_table import share_interval
 from worldstate_lab.metrics.intervals import draw_weights, middle, stratified_draws
 
@@ -299,7 +299,7 @@ def _figures(
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLOURS = {UNAWARE: RED, PHANTOM: BLUE, FULL: ORANGE, CHANCE: GREEN, LOUD: SKY}
+_COLOURS = dict(zip((UNAWARE, FULL, PHANTOM, CHANCE, LOUD), CATEGORIES, strict=False))
 _TOLD = {UNAWARE: "no knowledge", PHANTOM: "phantom at every corner", FULL: "phantom, full brakes"}
 _ARM_M, _BEHIND_M, _BEYOND_M = 13.0, 9.0, 2.0
 
@@ -339,12 +339,12 @@ def _draw_corner(
     eye = planners[CHANCE].loud.front_m[i, step] - ego.eye_m
     for side, sight in zip((1.0, -1.0), sight_m(met, np.full(len(met), eye))[i], strict=True):
         lane = met.lane_m[i, 0 if side > 0 else 1]
-        axes.plot([0.0, side * sight], [eye, lane], color=GREEN, linewidth=0.8, linestyle=":")
+        axes.plot([0.0, side * sight], [eye, lane], color=_COLOURS[CHANCE], linewidth=0.8, linestyle=":")
     for k in np.flatnonzero(met.length_m[i]).tolist():
         y0, sign = met.to_come_m[i, step, k], 1.0 if met.side[i, k] == 0 else -1.0
         low = min(sign * y0, sign * (y0 + met.length_m[i, k]))
         corner = low, met.lane_m[i, met.side[i, k]] - 0.5 * met.width_m[i, k]
-        axes.add_patch(Rectangle(corner, met.length_m[i, k], met.width_m[i, k], color="black"))
+        axes.add_patch(Rectangle(corner, met.length_m[i, k], met.width_m[i, k], color=TRUTH))
     far = met.lane_m[i].max() + _BEYOND_M
     axes.set(xlim=(_ARM_M, -_ARM_M), ylim=(-_BEHIND_M, far), aspect="equal")
     axes.set(xlabel="left, m", ylabel="ahead, m", title="a vehicle that neither of them sees yet")
@@ -373,7 +373,7 @@ def _draw_costs(
     def place(one: Mapping[str, float | int]) -> tuple[float, float]:
         return one[rare], 1000.0 * one["loud_collisions"] / one["loud_replays"]
 
-    axes.plot(*zip(*(place(one) for one in curve), strict=True), color=GREEN, marker=".", zorder=2)
+    axes.plot(*zip(*(place(one) for one in curve), strict=True), color=_COLOURS[CHANCE], marker=".", zorder=2)
     for name, one in figures.items():
         axes.plot(*place(one), color=_COLOURS[name], marker="o", markersize=8, linestyle="", clip_on=False)
     axes.set(xlabel=f"needless braking, s ({SHARES[0]:.0%} with a vehicle)", xlim=(0.0, None))

@@ -17,7 +17,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
-from worldstate.operations.figure_style import GREEN, RED, legend_beside
+from worldstate.operations.figure_style import legend_beside
 from worldstate.simulation.parallel import in_processes
 
 from .traffic_clips import BACKGROUND, ClipLabels, TrafficClip, read_clip
@@ -148,11 +148,10 @@ def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArr
 
 def draw_band_profile(axes: "Axes", profile: BandProfile, shaded_hz: tuple[float, float]) -> None:
     """Draw the ratios of a profile over its bands, a range shaded: that of the shape, or the paper's."""
-    axes.axvspan(
-        *shaded_hz, color=RED, alpha=0.12, linewidth=0, label=f"{shaded_hz[0]:.0f}-{shaded_hz[1]:.0f} Hz"
-    )
+    low, high = shaded_hz
+    axes.axvspan(low, high, color="0.9", linewidth=0, label=f"{low:.0f}-{high:.0f} Hz")
     axes.stairs(profile.by_level, profile.edges_hz, label="level", baseline=None)
-    axes.stairs(profile.by_shape, profile.edges_hz, label="shape", baseline=None, color=GREEN)
+    axes.stairs(profile.by_shape, profile.edges_hz, label="shape", baseline=None)
     axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio,\nvehicle against none")
     # Decades alone would leave a span of two of them with three labels.
     axes.set_xlim(profile.edges_hz[0], profile.edges_hz[-1])

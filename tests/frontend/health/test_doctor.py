@@ -12,8 +12,14 @@ from worldstate.adapters.audio.sound_file import SilentChannelsError, open_audio
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.health.channel_health import Fault
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.operations.recordings.channel_report import rate_from_duration
+from worldstate.operations.recordings.channel_report import (
+    ChannelVerdict,
+    RecordingHealth,
+    rate_from_duration,
+    write_array_figure,
+)
 from worldstate.simulation import draw_settings, simulate_recording
 
 RATE = 47_998
@@ -80,6 +86,13 @@ def test_it_says_what_to_do(street: np.ndarray, write: Callable, capsys: pytest.
         assert words in table[channel]
     assert any(line.startswith("1 dropout (splice at sample ") for line in lines)
     assert lines[-1].startswith("not healthy: swapped 4, 41;")
+
+
+@pytest.mark.parametrize("fault", Fault)
+def test_a_microphone_with_any_fault_is_drawn(fault: Fault, tmp_path: Path) -> None:
+    health = RecordingHealth((ChannelVerdict(3, fault, 1.0, 1.0, 1.0),), (), 0, 1, 0.5)
+    write_array_figure(roof_array_56(), health, tmp_path / "array.svg")
+    assert f"<!-- {fault.value} -->" in (tmp_path / "array.svg").read_text()
 
 
 def test_a_wrong_sample_rate(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,7 +29,7 @@ from worldstate.adapters.camera.video import VIDEO_NAME, Video
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.ground import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
-from worldstate.operations.figure_style import figure_file, legend_beside
+from worldstate.operations.figure_style import SEARCHED, figure_file, legend_beside
 
 MakeDetector = Callable[[], Detector]
 
@@ -301,10 +301,12 @@ def write_absence_figure(rates: MissRates, path: Path) -> None:
             counts = rates.families[name]
             beta, (low, high) = counts.miss_rates(rates.repeats), counts.interval(rates.repeats)
             for i, row in enumerate(beta):
+                # Paler off the axis: all are looks.
+                shade = 1.0 - 0.75 * i / max(len(beta) - 1, 1)
                 label = f"{rates.azimuth_deg[i]:.0f}-{rates.azimuth_deg[i + 1]:.0f}°"
-                (line,) = axes.plot(LEVELS, row, marker="o", label=label)
+                axes.plot(LEVELS, row, marker="os^Dv"[i % 5], color=SEARCHED, alpha=shade, label=label)
                 if np.sum(counts.looks[i]):
-                    axes.fill_between(LEVELS, low[i], high[i], color=line.get_color(), alpha=0.12, lw=0)
+                    axes.fill_between(LEVELS, low[i], high[i], color=SEARCHED, alpha=0.12 * shade, lw=0)
             axes.plot(LEVELS, counts.clutter_rates, color="grey", linestyle=":", label="clutter")
             axes.set(title=name, xlabel="degradation $d$", ylim=(0.0, 1.0))
         panels[0].set_ylabel(r"miss rate $\beta(\theta, d)$")

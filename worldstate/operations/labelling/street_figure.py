@@ -10,7 +10,7 @@ import numpy as np
 
 from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.ground.typing import BoolArray
-from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, figure_file, legend_beside
+from worldstate.operations.figure_style import HIDDEN, IN_VIEW, SIDE_DASHES, TRUTH, figure_file, legend_beside
 from worldstate.smoothing.learned_street import LearnedStreet, context_of, with_pass
 from worldstate.smoothing.observations import SmoothedTrack
 from worldstate.state.context import Occluder
@@ -27,7 +27,8 @@ _BEFORE_S, _APART_M = (1.0, 2.0, 3.0), 1.3  # Rows of the drawing, so that their
 _WIDEST_M, _COLUMNS = 26.0, 2
 _EVERY = 5  # Half a second apart, they can still be told from one another
 _FARTHEST_M = 40.0
-_COLOURS = {"left": BLUE, "right": ORANGE}
+_DASHES = dict(zip(("left", "right"), SIDE_DASHES, strict=False))
+_EDGE = "0.35"  # Of what hides: no vehicle, so no colour
 _SAME_PASS_S = 2.0  # Of T0: vehicles nearer to one another are mostly not seen apart
 
 
@@ -52,11 +53,11 @@ def write_street_figure(stages: Sequence[tuple[str, LearnedStreet]], path: Path)
             )
 
 
-def draw_edge(axes: "Axes", one: Occluder, color: str = BLUE) -> None:
+def draw_edge(axes: "Axes", one: Occluder) -> None:
     """Draw the line of sight past an edge as it is believed, two deviations either way."""
     low, high = (_aside_m(one.edge_azimuth_rad + k * one.edge_std_rad) for k in (-2.0, 2.0))
-    axes.fill([0.0, low, high], [0.0, _LANE_M, _LANE_M], color=color, alpha=0.25, linewidth=0.0)
-    axes.plot([0.0, _aside_m(one.edge_azimuth_rad)], [0.0, _LANE_M], color=color, label="edge, as learned")
+    axes.fill([0.0, low, high], [0.0, _LANE_M, _LANE_M], color=_EDGE, alpha=0.25, linewidth=0.0)
+    axes.plot([0.0, _aside_m(one.edge_azimuth_rad)], [0.0, _LANE_M], color=_EDGE, label="edge, as learned")
 
 
 def _draw_learned(axes: "Axes", one: Occluder, pace_spread: float) -> None:
@@ -65,8 +66,8 @@ def _draw_learned(axes: "Axes", one: Occluder, pace_spread: float) -> None:
         ahead_m = _LANE_M + _APART_M * row
         factors = math.exp(-pace_spread), 1.0, math.exp(pace_spread)
         slow, usual, fast = (_place_m(one, factor, time_s) for factor in factors)
-        axes.plot([slow, fast], [ahead_m, ahead_m], color=BLUE, alpha=0.3, linewidth=4.0)
-        axes.plot(usual, ahead_m, "o", color=BLUE, markersize=4)
+        axes.plot([slow, fast], [ahead_m, ahead_m], color=HIDDEN, alpha=0.3, linewidth=4.0)
+        axes.plot(usual, ahead_m, "o", color=HIDDEN, markersize=4)
 
 
 def _aside_m(azimuth_rad: float) -> float:
@@ -82,7 +83,7 @@ def _place_m(one: Occluder, factor: float, time_s: float) -> float:
 def write_pass_figure(
     passes: Sequence[PassLabel], path: Path, title: str, truth: Sequence[TrueTrack] = ()
 ) -> None:
-    """Draw every pass seen from above, the ego at the origin and looking up; hidden parts are dashed."""
+    """Draw every pass seen from above, the ego at the origin and looking up."""
     with figure_file(path, 8.5, 3.4) as figure:
         axes = figure.add_subplot(title=title)
         draw_passes(axes, passes, truth)
@@ -95,25 +96,28 @@ def draw_passes(axes: "Axes", passes: Sequence[PassLabel], truth: Sequence[TrueT
     for occluder in context_of(street).occluders:
         # Of an arm that no vehicle came out of, nothing is known.
         if not occluder.assumed:
-            draw_edge(axes, occluder, "0.5")
+            draw_edge(axes, occluder)
     for one in passes:
         hidden = one.track.time_s < one.t0.time_s
-        draw_track(axes, one.track, hidden, _COLOURS[one.arm], f"{one.arm}, smoothed")
+        draw_track(axes, one.track, hidden, _DASHES[one.arm], f"{one.arm}, smoothed")
         _draw_truth(axes, one, truth)
     axes.plot(0.0, 0.0, "k^", markersize=9)
     span = {"xlim": (_FARTHEST_M, -_FARTHEST_M), "ylim": (-4.0, 25.0)}
     axes.set(**span, xlabel="left, m", ylabel="ahead, m", aspect="equal")
 
 
-def draw_track(axes: "Axes", track: SmoothedTrack, hidden: BoolArray, color: str, label: str) -> None:
-    """Draw a track with an ellipse of two deviations every half second; hidden parts are dashed."""
+def draw_track(axes: "Axes", track: SmoothedTrack, hidden: BoolArray, dashes: str, label: str) -> None:
+    """Draw a track with an ellipse of two deviations every half second, by where it was hidden."""
     from matplotlib.patches import Ellipse
 
     states = track.states
     # The first state in view ends the hidden part, too: it is one vehicle.
-    for part, style in ((hidden | np.roll(hidden, 1), "--"), (~hidden, "-")):
-        axes.plot(*states[part, 1::-1].T, style, color=color, label=label)
-    for place, spread in zip(states[::_EVERY], track.covariance[::_EVERY], strict=True):
+    unseen = hidden | np.roll(hidden, 1)
+    for part, color, shown in ((unseen, HIDDEN, "hidden"), (~hidden, IN_VIEW, "in view")):
+        axes.plot(*states[part, 1::-1].T, dashes, color=color, label=f"{label}, {shown}")
+    spreads = track.covariance[::_EVERY]
+    for place, spread, was_hidden in zip(states[::_EVERY], spreads, hidden[::_EVERY], strict=True):
+        color = HIDDEN if was_hidden else IN_VIEW
         lengths, axis = np.linalg.eigh(spread[:2, :2])
         angle = np.degrees(np.arctan2(axis[0, 1], axis[1, 1]))
         # Four deviations from end to end hold .86 of a Gaussian of two dimensions.
@@ -128,4 +132,4 @@ def _draw_truth(axes: "Axes", one: PassLabel, truth: Sequence[TrueTrack]) -> Non
         return
     true = truth[nearest]
     during = (true.time_s >= one.track.time_s[0]) & (true.time_s <= one.track.time_s[-1])
-    axes.plot(*true.position_m[during, ::-1].T, ":", color=GREEN, linewidth=2.0, label="truth")
+    axes.plot(*true.position_m[during, ::-1].T, ":", color=TRUTH, linewidth=2.0, label="truth")

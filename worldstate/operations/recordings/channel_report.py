@@ -38,15 +38,10 @@ _MISPLACED = frozenset({Fault.SWAPPED, Fault.DELAY, Fault.DRIFT})
 _DEAF = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.DELAY, Fault.DRIFT})
 # Dropouts beyond these are counted, not listed.
 _LISTED_DROPOUTS = 100
-_COLOURS = {
-    "dead": "gray",
-    "intermittent": "silver",
-    "noisy": style.RED,
-    "inverted": style.PURPLE,
-    "swapped": style.ORANGE,
-    "clipped": "tab:brown",
-    "offset": style.SKY,
-    "level": style.BLUE,
+# Eleven faults by six colours and two markers.
+_MARKS: dict[Fault, dict[str, Any]] = {
+    fault: {"color": style.CATEGORIES[i % 6], "marker": "oD"[i // 6], "alpha": 0.8, "lw": 0}
+    for i, fault in enumerate(Fault)
 }
 # Areas of markers, points squared: one that holds a number of two digits, one that fits a line of the legend,
 # and how much smaller a second fault is drawn on the first.
@@ -238,22 +233,21 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
     place = array.centred_m[:, [across, up]]
     with style.figure_file(path, 7.5, 6.0) as figure:
         axes = figure.add_subplot()
-        axes.scatter(place[:, 0], place[:, 1], s=_AREA, color=style.GREEN, alpha=0.35, lw=0)
-        axes.scatter([], [], s=_LEGEND_AREA, color=style.GREEN, alpha=0.35, lw=0, label="well")
+        axes.scatter(place[:, 0], place[:, 1], s=_AREA, color="0.85", lw=0)
+        axes.scatter([], [], s=_LEGEND_AREA, color="0.85", lw=0, label="well")
         drawn: Counter[int] = Counter()
         for fault in sorted({verdict.fault for verdict in health.verdicts}):
             channels = [verdict.channel for verdict in health.verdicts if verdict.fault == fault]
             areas = [_AREA * _SMALLER ** drawn[channel] for channel in channels]
-            colour = _COLOURS[fault.value]
-            axes.scatter(place[channels, 0], place[channels, 1], s=areas, color=colour, alpha=0.8, lw=0)
-            axes.scatter([], [], s=_LEGEND_AREA, color=colour, alpha=0.8, lw=0, label=fault.value)
+            axes.scatter(place[channels, 0], place[channels, 1], s=areas, **_MARKS[fault])
+            axes.scatter([], [], s=_LEGEND_AREA, **_MARKS[fault], label=fault.value)
             drawn.update(channels)
         for channel, point in enumerate(place):
             axes.annotate(str(channel + 1), point, ha="center", va="center", fontsize=7.5)
         for verdict in health.verdicts:
             if verdict.looks_like is not None:
                 # Bent, so that the two arrows of a swapped pair do not cover each other.
-                arrow = {"arrowstyle": "->", "color": _COLOURS["swapped"], "shrinkA": 9, "shrinkB": 9}
+                arrow = {"arrowstyle": "->", "color": "black", "shrinkA": 9, "shrinkB": 9}
                 arrow["connectionstyle"] = "arc3,rad=0.2"
                 axes.annotate("", place[verdict.looks_like], place[verdict.channel], arrowprops=arrow)
         axes.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", aspect="equal")

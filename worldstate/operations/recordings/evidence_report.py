@@ -145,6 +145,8 @@ def evidence_report(
 
 def common_lines(state: WorldState) -> Iterator[str]:
     """Yield what all sides share: sound, looks, the state of the sensors, what has just happened."""
+    if not state.calibrated:
+        yield "uncalibrated: no false-alarm budget stands behind the thresholds"
     if isinstance(state.domain, Foreign):
         yield f"sound: {state.domain.reason}: the evidence of this hop counts little"
     elif isinstance(state.domain, WarningSignal):

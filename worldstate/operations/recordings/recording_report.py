@@ -2,10 +2,11 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.adapters.listener import Step, listen_steps
 from worldstate.adapters.source import Source
@@ -37,6 +38,19 @@ class WarningSummary:
     visible_entity_id: str | None  # The first moving entity that came into view
 
 
+def calibration_words(uncalibrated: int, hops: int) -> str:
+    """Return in words whether the cues kept to a false-alarm budget in all hops, in some or in none.
+
+    Examples
+    --------
+    >>> [calibration_words(n, 91) for n in (0, 3, 91)]
+    ['calibrated', 'uncalibrated in 3 of 91 hops', 'uncalibrated']
+    """
+    if not uncalibrated:
+        return "calibrated"
+    return "uncalibrated" if uncalibrated == hops else f"uncalibrated in {uncalibrated} of {hops} hops"
+
+
 @dataclass(slots=True)
 class WarningMeter:
     """Counts states and advisories while they go by, and keeps none of them."""
@@ -47,6 +61,7 @@ class WarningMeter:
     first_ns: int = 0
     last_ns: int = 0
     peak_risk: float = 0.0
+    uncalibrated: int = 0  # States whose cues keep to no budget
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None
@@ -56,6 +71,7 @@ class WarningMeter:
         """Take in the next state of the recording."""
         self.first_ns, self.last_ns = self.first_ns if self.states else state.stamp_ns, state.stamp_ns
         self.states, self.peak_risk = self.states + 1, max(self.peak_risk, state.risk)
+        self.uncalibrated += not state.calibrated
         raised = [cue for cue in state.cues if cue.advisory]
         if raised:
             now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk).entity_id
@@ -104,6 +120,8 @@ class RecordingReport:
         Seconds of audio per second of wall time, the whole chain.
     health : RecordingHealth
         What was wrong with the microphones.
+    calibration : str
+        In words: "calibrated", "uncalibrated", or in how many hops it was not.
     end : Checkpoint or None
         Belief and site after the last hop, to go on from; None where there was none.
 
@@ -128,13 +146,14 @@ class RecordingReport:
     peak_risk: float
     realtime_factor: float
     health: RecordingHealth
+    calibration: str
     end: Checkpoint | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
         figures = {"hops": self.hops, "peak_risk": self.peak_risk, "realtime_factor": self.realtime_factor}
         masked = {"masked_microphones": [channel + 1 for channel in self.health.masked_channels]}
-        return asdict(self.warning) | figures | masked
+        return asdict(self.warning) | figures | masked | {"calibration": self.calibration}
 
 
 def run_recording(
@@ -189,4 +208,66 @@ def run_recording(
             end = step.checkpoint
     elapsed_s, last_ns = time.perf_counter() - started, max(meter.last_ns, source.start_ns)
     factor = seconds(last_ns - source.start_ns) / elapsed_s
-    return RecordingReport(meter.summary(), meter.states, meter.peak_risk, factor, health.summary(), end)
+    calibration = calibration_words(meter.uncalibrated, meter.states)
+    return RecordingReport(
+        meter.summary(), meter.states, meter.peak_risk, factor, health.summary(), calibration, end
+    )
+
+
+def announcement(
+    states: Iterable[WorldState], truth: Sequence[TrueTrack], vehicle: str = "a vehicle"
+) -> str:
+    """Return in one sentence how long before it came into sight each vehicle was announced.
+
+    Parameters
+    ----------
+    states : iterable of WorldState
+        Of one recording.
+    truth : sequence of TrueTrack
+        Its vehicles; those that were in sight from the beginning, or never were, are not spoken of.
+    vehicle : str
+        What they are called.
+
+    Examples
+    --------
+    >>> announcement([], [])
+    'no vehicle came into sight, and none was announced'
+    """
+    onsets = _onsets_by_side(states)
+    came = sorted((*one.visible_s, _side(one)) for one in truth if one.visible_s and not one.in_view[0])
+    if not came:
+        told = ", and none was announced" if not onsets else ", although one was announced"
+        return f"no vehicle came into sight{told}"
+    sentences, before_s = [], dict[str, float]()
+    for first_s, last_s, side in came:
+        # What was announced of the one before it has ended with that one's hand-over.
+        own_s = [time_s for time_s in onsets.get(side, ()) if time_s > before_s.get(side, -math.inf)]
+        sentences.append(f"{vehicle} from the {side} was {_announced(own_s, first_s, last_s)}")
+        before_s[side] = first_s
+    return "; ".join(sentences)
+
+
+def _side(track: TrueTrack) -> str:
+    return "left" if track.azimuth_rad[track.in_view][0] > 0.0 else "right"
+
+
+def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
+    """Return when an advisory began, seconds, of each side that had one."""
+    onsets, standing = dict[str, list[float]](), set[str]()
+    for state in states:
+        raised = {cue.direction for cue in state.cues if cue.advisory is not None}
+        for side in raised - standing:
+            onsets.setdefault(side, []).append(seconds(state.stamp_ns))
+        standing = raised
+    return onsets
+
+
+def _announced(onsets_s: Sequence[float], first_s: float, last_s: float) -> str:
+    """Return how the onsets of its side stood to the time in which a vehicle was in sight."""
+    found = onset_outcome(onsets_s, first_s)
+    if found.lead_s:
+        return f"announced {found.lead_s:.1f} s before it came into sight"
+    if found.onsets_earlier:
+        return f"announced more than {LONGEST_LEAD_S:.0f} s before it came into sight"
+    late_s = next((time_s - first_s for time_s in onsets_s if first_s <= time_s <= last_s), None)
+    return "not announced" if late_s is None else f"announced {late_s:.1f} s after it came into sight"

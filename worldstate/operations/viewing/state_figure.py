@@ -21,29 +21,32 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground import LEAST_HEARD, InputFileError, seconds
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.operations import figure_style as style
+from worldstate.operations.recordings.recording_report import calibration_words
 from worldstate.state import Entity, Occluder, RiskCue, WorldState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Of the sides, told apart from red and blue, which say hidden and in view.
-_SIDE_COLORS = (style.PURPLE, style.GREEN, style.ORANGE, style.SKY)
 _WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
 # Longest title in one line above a figure of this width.
 _TITLE_CHARACTERS = 100
+# Below this, odds of one to a thousand, no threshold lies; the first windows of a run reach -20.
+_LOWEST_NATS = -7.0
 # An entity is drawn where it more likely exists than not.
 _LIKELY = 0.5
 # A GIF this large has 576 x 416 pixels: labels of 9 points are still read in a browser.
 _SIZE_IN, _MOVING_DPI = (7.2, 5.2), 80
 # An entity less likely than this is drawn, and not named.
 _TOLD = 0.2
+# Of a sector that was searched, by what was found there.
+_NOTHING, _FOUND = 0.15, 0.4
 _LEGEND = (
-    ("hidden", style.RED, 0.35),
-    ("in view", style.BLUE, 0.35),
-    ("risk of a side, red if raised", style.ORANGE, 0.4),
-    ("searched, nothing found", style.GREEN, 0.25),
-    ("searched, found", style.PURPLE, 0.25),
+    ("hidden vehicle, and risk", style.HIDDEN, 0.4),
+    ("vehicle in view", style.IN_VIEW, 0.35),
+    ("advisory", style.DECISION, 0.4),
+    ("searched, nothing found", style.SEARCHED, _NOTHING),
+    ("searched, found", style.SEARCHED, _FOUND),
     ("behind an occluder", "0.5", 0.2),
 )
 
@@ -100,7 +103,9 @@ def write_state_figure(
     t0_s: float | None = None,
     truth: Sequence[TrueTrack] = (),
 ) -> None:
-    """Draw azimuths, what was raised and seen, existence and risk over time.
+    """Draw azimuths, what was raised and seen, what decides it and the probabilities over time.
+
+    A state that is not calibrated has no threshold in the figure, and the title says so.
 
     Parameters
     ----------
@@ -126,32 +131,33 @@ def write_state_figure(
     True
     """
     with style.figure_file(path, 10.0, 8.6 if sound is None else 9.6) as figure:
-        heights = (1.0 if sound is None else 1.4, 0.42, 0.6, 0.6)
-        azimuths, rows, existence, risk = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+        heights = (1.0 if sound is None else 1.4, 0.42, 0.7, 0.6)
+        azimuths, rows, decision, probabilities = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         if sound is not None:
             label = "power of the sound over its median over azimuth, each window at its middle"
             style.draw_power(azimuths, sound.time_s, sound.azimuths_rad, sound.power, label)
         _draw_truth(azimuths, truth)
         _draw_azimuths(azimuths, states)
         _draw_rows(rows, states)
-        _draw_existence(existence, states)
-        _draw_risk(risk, states)
-        for axes in (azimuths, rows, existence, risk) if t0_s is not None else ():
-            entry = axes.axvline(t0_s, color="black", lw=1.2, ls="--")
+        _draw_decision(decision, states)
+        _draw_probabilities(probabilities, states)
+        for axes in (azimuths, rows, decision, probabilities) if t0_s is not None else ():
+            entry = axes.axvline(t0_s, color=style.TRUTH, lw=1.2, ls="--")
             entry.set_label("line-of-sight entry $T_0$" if axes is azimuths else "")
-        for axes in (azimuths, existence, risk):
+        for axes in (azimuths, decision, probabilities):
             style.legend_beside(axes)
         # The first window begins a second before its decision.
         span_s = _times(states)[0] - _WINDOW_S, _times(states)[-1] + style.HOP_S
-        risk.set(xlabel="time (s), end of the decision window", xlim=span_s)
-        figure.suptitle(title if len(title) <= _TITLE_CHARACTERS else "..." + title[-_TITLE_CHARACTERS:])
+        probabilities.set(xlabel="time (s), end of the decision window", xlim=span_s)
+        shown = title if len(title) <= _TITLE_CHARACTERS else "..." + title[-_TITLE_CHARACTERS:]
+        figure.suptitle(f"{shown}{_uncalibrated(states)}")
 
 
 def _draw_truth(axes: "Axes", truth: Sequence[TrueTrack]) -> None:
     for track in truth:
         for shown, dashes, name in ((~track.in_view, ":", "out of sight"), (track.in_view, "-", "in sight")):
             line = np.where(shown, np.degrees(track.azimuth_rad), np.nan)
-            axes.plot(track.time_s, line, dashes, color="black", lw=2.0, label=f"vehicle, truth, {name}")
+            axes.plot(track.time_s, line, dashes, color=style.TRUTH, lw=2.0, label=f"vehicle, truth, {name}")
 
 
 def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
@@ -159,7 +165,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
     heard = [(seconds(state.stamp_ns), state.bearing.azimuth_rad) for state in states if state.bearing]
     if heard:
         time_s, azimuth_rad = np.array(heard).T
-        axes.plot(time_s, np.degrees(azimuth_rad), ".", color="0.45", ms=3, label="bearing of the sound")
+        axes.plot(time_s, np.degrees(azimuth_rad), ".", color=style.HEARD, ms=4, label="bearing of the sound")
     tracks: dict[tuple[str, bool], list[tuple[float, ...]]] = {}
     for state in states:
         for one in (part for known in state.entities for part in known.on_each_side()):
@@ -168,7 +174,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
                 row = seconds(state.stamp_ns), *np.degrees([one.azimuth_rad, *sector]).tolist()
                 tracks.setdefault((one.id, one.status == "hidden"), []).append(row)
     for (_, hidden), rows in tracks.items():
-        color, label = (style.RED, "hidden") if hidden else (style.BLUE, "in view")
+        color, label = (style.HIDDEN, "hidden") if hidden else (style.IN_VIEW, "in view")
         time_s, azimuth, low, high = style.with_gaps(np.array(rows)).T
         axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
         axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
@@ -180,56 +186,76 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
     names = [f"advisory {side}" for side in _sides(states)]
     for row, side in enumerate(_sides(states)):
         on = [any(c.direction == side and c.advisory for c in state.cues) for state in states]
-        style.draw_bars(axes, _times(states), on, row, _SIDE_COLORS[row])
+        style.draw_bars(axes, _times(states), on, row, style.DECISION)
     # A look stands in every snapshot until the next one.
     looks = {(one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched}
     for sensor in sorted({sensor for sensor, _, _ in looks}):
         row = len(names)
-        for found, color in ((True, style.BLUE), (False, "0.75")):
+        for found, height in ((True, 10), (False, 4)):
             at_s = [seconds(stamp_ns) for name, stamp_ns, was in looks if name == sensor and was == found]
-            axes.plot(at_s, [row] * len(at_s), "|", color=color, ms=9 if found else 4)
-        names.append(f"{sensor} (blue: found)")
+            axes.plot(at_s, [row] * len(at_s), "|", color=style.SEARCHED, ms=height)
+        names.append(f"{sensor} (tall: found)")
     foreign = [isinstance(state.domain, Foreign) for state in states]
     deaf = [any(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]
-    for on, color, name in ((foreign, "0.6", "foreign sound"), (deaf, "0.3", "could not be heard")):
+    for on, color, name in ((foreign, style.HEARD, "foreign sound"), (deaf, "0.5", "could not be heard")):
         if any(on):
             style.draw_bars(axes, _times(states), on, len(names), color, height=0.6)
             names.append(name)
     style.name_rows(axes, names)
 
 
-def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
-    rows = [(seconds(state.stamp_ns), *_existence(state, _sides(states))) for state in states]
-    time_s, *columns = style.with_gaps(np.array(rows)).T
-    for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
-        axes.plot(time_s, column, color=color, label=f"vehicle hidden, {side}")
-    axes.plot(time_s, columns[-1], color=style.BLUE, ls=":", label="the likeliest in view")
-    axes.set(ylabel="existence\nprobability", ylim=(-0.02, 1.02))
+def _draw_decision(axes: "Axes", states: Sequence[WorldState]) -> None:
+    """Draw the log-odds that decide, the threshold where a budget stands behind it, and every onset."""
+    tables = {side: np.array([_decided(state, side) for state in states]) for side in _sides(states)}
+    for dashes, (side, rows) in zip(style.SIDE_DASHES, tables.items(), strict=False):
+        time_s, compared, *_ = style.with_gaps(rows).T
+        axes.plot(time_s, compared, dashes, color=style.HIDDEN, label=f"what decides, {side}")
+    for dashes, rows in zip(style.SIDE_DASHES, tables.values(), strict=False):
+        time_s, _, threshold, _ = style.with_gaps(rows).T
+        if np.isfinite(threshold).any():
+            axes.plot(time_s, threshold, dashes, color=style.DECISION, label="threshold")
+        onsets = rows[np.diff(rows[:, 3], prepend=0.0) > 0.0]
+        if len(onsets):
+            axes.plot(onsets[:, 0], onsets[:, 1], "v", color=style.DECISION, ms=8, label="onset")
+    axes.set(ylabel="log-odds\n(nats)")
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], _LOWEST_NATS))
 
 
-def _existence(state: WorldState, sides: Sequence[str]) -> list[float]:
-    """Return the likeliest hidden entity of each side, and the likeliest that moves in view."""
-    likeliest = dict.fromkeys((*sides, "in view"), 0.0)
-    for one in (part for known in state.entities for part in known.on_each_side()):
-        at = one.direction if one.status == "hidden" else "in view" if one.moving else None
-        if at in likeliest:
-            likeliest[at] = max(likeliest[at], one.existence_probability)
-    return list(likeliest.values())
+def _decided(state: WorldState, side: str) -> tuple[float, float, float, bool]:
+    """Return the time, what decides, its threshold (NaN without a budget) and whether an advisory stands."""
+    cue = next((one for one in state.cues if one.direction == side), None)
+    if cue is None or cue.evidence is None:
+        compared, threshold = math.nan, math.nan
+    else:
+        compared, threshold = cue.evidence.compared_nats, cue.evidence.threshold_nats
+    raised = cue is not None and cue.advisory is not None
+    return seconds(state.stamp_ns), compared, threshold if state.calibrated else math.nan, raised
 
 
-def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
-    for row, side in enumerate(_sides(states)):
-        cues = [next((one for one in state.cues if one.direction == side), None) for state in states]
-        told = [(np.nan, np.nan) if c is None else (c.risk, (c.within or {}).get("3", np.nan)) for c in cues]
-        time_s, risk, within = style.with_gaps(np.column_stack([_times(states), told])).T
-        axes.plot(time_s, risk, color=_SIDE_COLORS[row], label=f"risk, {side}")
-        if np.isfinite(within).any():
-            axes.plot(time_s, within, color=_SIDE_COLORS[row], ls="--", label=f"in view within 3 s, {side}")
-    axes.set(ylabel="risk,\nprobability", ylim=(-0.02, 1.02))
+def _draw_probabilities(axes: "Axes", states: Sequence[WorldState]) -> None:
+    rows = [(seconds(state.stamp_ns), *_probabilities(state, _sides(states))) for state in states]
+    time_s, in_view, *risks = style.with_gaps(np.array(rows)).T
+    for side, dashes, risk in zip(_sides(states), style.SIDE_DASHES, risks, strict=False):
+        axes.plot(time_s, risk, dashes, color=style.HIDDEN, label=f"risk, {side}")
+    axes.plot(time_s, in_view, color=style.IN_VIEW, label="a vehicle in view")
+    axes.set(ylabel="probability", ylim=(-0.02, 1.02))
+
+
+def _probabilities(state: WorldState, sides: Sequence[str]) -> list[float]:
+    """Return the existence of the likeliest vehicle in view, and the risk of each side."""
+    in_view = [one.existence_probability for one in state.entities if one.moving and one.status != "hidden"]
+    risks = {cue.direction: cue.risk for cue in state.cues}
+    return [max(in_view, default=0.0), *(risks.get(side, math.nan) for side in sides)]
 
 
 def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
-    return states[0].context.directions[: len(_SIDE_COLORS)]
+    return states[0].context.directions[: len(style.SIDE_DASHES)]
+
+
+def _uncalibrated(states: Sequence[WorldState]) -> str:
+    """Return what a title ends in where a state keeps to no false-alarm budget."""
+    number = sum(not state.calibrated for state in states)
+    return f" ({calibration_words(number, len(states))})" if number else ""
 
 
 def _times(states: Sequence[WorldState]) -> list[float]:
@@ -274,7 +300,7 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     for occluder in state.context.occluders:
         _draw_occluder(axes, occluder)
     for view in state.searched:
-        _wedge(axes, view.sector_rad, SEARCHED_M, style.PURPLE if view.found else style.GREEN, 0.25)
+        _wedge(axes, view.sector_rad, SEARCHED_M, style.SEARCHED, _FOUND if view.found else _NOTHING)
     for cue in state.cues:
         _draw_cue(axes, cue)
     for entity in (part for one in state.entities if one.moving for part in one.on_each_side()):
@@ -283,7 +309,7 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     behind = any(abs(view.sector_rad[0]) > 0.6 * math.pi for view in state.searched)
     axes.set(xlim=(-38, 38), ylim=(-41 if behind else -11, 37), aspect="equal", xticks=(), yticks=())
     axes.spines[:].set_visible(False)
-    said = f"{seconds(state.stamp_ns):.1f} s" + (f"   {title}" if title else "")
+    said = f"{seconds(state.stamp_ns):.1f} s   {title}{_uncalibrated([state])}"
     axes.set_title(said, loc="left")
     _draw_legend(axes)
 
@@ -298,19 +324,18 @@ def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
     """Draw the risk, and say it on the cue's own side below the ego, where no sector lies."""
     raised = cue.advisory is not None
     sector = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
-    _wedge(axes, sector, CUE_M, style.RED if raised else style.ORANGE, 0.05 + 0.5 * cue.risk)
+    _wedge(axes, sector, CUE_M, style.DECISION if raised else style.HIDDEN, 0.05 + 0.5 * cue.risk)
     within = "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
     said = f"{cue.direction}{': ADVISORY' if raised else ''}\nrisk {cue.risk:.2f}{within}"
     left = cue.azimuth_rad > 0.0
-    axes.text(
-        -37 if left else 37, -2.5, said, color=style.RED if raised else "0.2", ha="left" if left else "right",
-        va="top", weight="bold" if raised else "normal",
-    )  # fmt: skip
+    x, side = (-37, "left") if left else (37, "right")
+    color, weight = (style.DECISION, "bold") if raised else ("0.2", "normal")
+    axes.text(x, -2.5, said, color=color, ha=side, va="top", weight=weight)
 
 
 def _draw_entity(axes: "Axes", entity: Entity) -> None:
     hidden = entity.status == "hidden"
-    color, density = style.RED if hidden else style.BLUE, entity.existence_probability
+    color, density = style.HIDDEN if hidden else style.IN_VIEW, entity.existence_probability
     sector = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
     _wedge(axes, sector, SECTOR_M, color, 0.05 + 0.3 * density)
     axes.plot(*zip((0.0, 0.0), _at(entity.azimuth_rad, SECTOR_M), strict=True), color=color, alpha=density)

@@ -8,7 +8,7 @@ import numpy as np
 
 from worldstate.abduction.cueing.risk_map import reliability_curve
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from worldstate.operations.figure_style import CATEGORIES
 from worldstate_lab.report.table import Figure, Value
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MOST_POINTS = 200
 GREY = "0.55"
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
-COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
+PROPOSED_COLOUR, *COLOURS = CATEGORIES
 
 
 def legend_below(canvas: "Canvas", columns: int = 2) -> None:
@@ -168,10 +168,10 @@ def _draw_operating(canvas: "Canvas", points: Sequence[OperatingPoint], linear: 
     axes.set_xscale("symlog", linthresh=linear)
     line = [(one.false_alarms_per_hour.value, one.detection.value) for one in curve]
     if line:
-        axes.plot(*zip(*line, strict=True), color=GREEN, zorder=1)
+        axes.plot(*zip(*line, strict=True), color=PROPOSED_COLOUR, zorder=1)
         axes.plot([], [], "o", color="black", fillstyle="none", label="the paper's (open)")
     for one in curve:
-        _mark(canvas, one, GREEN, "o", r"proposed, over $\alpha$")
+        _mark(canvas, one, PROPOSED_COLOUR, "o", r"proposed, over $\alpha$")
         place = one.false_alarms_per_hour.value, one.detection.value
         axes.annotate(f"{one.alpha:g}", place, (-5, 5), textcoords="offset points", ha="right", fontsize=8)
     for i, one in enumerate(others):

@@ -14,7 +14,7 @@ from worldstate.ground.errors import WorldstateError
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import FloatArray, ImageArray, IntArray
 from worldstate.ground.values import NotUsable
-from worldstate.operations.figure_style import BLUE, GREEN, PURPLE, RED
+from worldstate.operations.figure_style import CATEGORIES, DECISION, HIDDEN, IN_VIEW, SEARCHED, TRUTH
 from worldstate.operations.metrics.approach_table import onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.evaluation.evaluation import ALPHA, Evaluation
@@ -25,7 +25,7 @@ from worldstate_lab.report.table import Figure, Section, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from .measured_values import PROPOSED
-from .panels import COLOURS, GREY, MARKS, legend_below
+from .panels import GREY, MARKS, legend_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,12 +44,11 @@ def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float])
         for row, name in enumerate(names):
             leads = np.sort(leads_s[name][np.isfinite(leads_s[name])])
             # Spread by rank, not at random: the picture of the same numbers stays the same.
-            axes.plot(
-                leads, row + 0.28 * (np.arange(leads.size) % 5 - 2) / 2, ".", color=BLUE, alpha=0.55, ms=4
-            )
+            spread = row + 0.28 * (np.arange(leads.size) % 5 - 2) / 2
+            axes.plot(leads, spread, ".", color=CATEGORIES[0], alpha=0.55, ms=4)
             axes.plot(leads.mean(), row, "|", color="black", ms=17, mew=2.0, label="mean of the detected")
             if name in paper_s:
-                axes.plot(paper_s[name], row, "D", color=RED, fillstyle="none", ms=6, label="paper")
+                axes.plot(paper_s[name], row, "D", color=CATEGORIES[3], fillstyle="none", ms=6, label="paper")
         counts = [f"{name}\n{np.isfinite(leads_s[name]).sum()} of {leads_s[name].size}" for name in names]
         axes.set_yticks(range(len(names)), counts, fontsize=8.5)
         axes.set(xlabel="lead time (s)", ylim=(len(names) - 0.5, -0.5))
@@ -88,7 +87,7 @@ def junction_figure(
     def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         for (method, by_site), offset, colour, mark in zip(
-            values.items(), offsets, COLOURS, MARKS, strict=False
+            values.items(), offsets, CATEGORIES, MARKS, strict=False
         ):
             for site, value in by_site.items():
                 row = sites.index(site) + offset
@@ -402,31 +401,31 @@ def _draw_image(axes: "Axes", shown: ApproachImage) -> None:
     if shown.box_px is not None:
         x1, y1, x2, y2 = shown.box_px
         # Two strokes, so that the box shows on dark and on bright images.
-        for colour, style in (("white", "-"), (RED, (0, (3, 2)))):
+        for colour, style in (("white", "-"), (IN_VIEW, (0, (3, 2)))):
             box = Rectangle(
                 (x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linestyle=style, linewidth=1.6
             )
             axes.add_patch(box)
     if shown.column_px is not None:
         axes.axvline(shown.column_px, color="white", linewidth=1.4)
-        axes.axvline(shown.column_px, color=RED, linewidth=1.4, linestyle=":")
+        axes.axvline(shown.column_px, color=HIDDEN, linewidth=1.4, linestyle=":")
     axes.set_title(shown.title, fontsize=9)
     axes.set(xticks=[], yticks=[])
 
 
 def _draw_statistic(axes: "Axes", t0_s: float, said: Decisions, seen_s: FloatArray) -> None:
-    axes.plot(said.time_s, said.score, color=BLUE, label="statistic $s(t)$")
+    axes.plot(said.time_s, said.score, color=HIDDEN, label="statistic $s(t)$")
     label = rf"$\gamma(\alpha={ALPHA:g})$"
     if np.isfinite(said.threshold).all():
-        axes.axhline(float(said.threshold[0]), color=BLUE, linestyle=":", label=label)
+        axes.axhline(float(said.threshold[0]), color=DECISION, linestyle=":", label=label)
     # Advisory and boxes stand above the range of the statistic, where they cover nothing of it.
     top = max(1.0, float(np.nanmax(said.score, initial=0.0)))
     bars = [(t, _HOP_S) for t in said.time_s[said.alarm]]
-    axes.broken_barh(bars, (1.05 * top, 0.1 * top), color=GREEN, lw=0, label="advisory")
+    axes.broken_barh(bars, (1.05 * top, 0.1 * top), color=DECISION, lw=0, label="advisory")
     axes.plot(
-        seen_s, np.full(seen_s.size, 1.22 * top), "|", color=PURPLE, ms=9, label="moving box of the camera"
+        seen_s, np.full(seen_s.size, 1.22 * top), "|", color=SEARCHED, ms=9, label="moving box of the camera"
     )
-    axes.axvline(t0_s, color="black", linestyle="--", linewidth=1.2, label="$T_0$")
+    axes.axvline(t0_s, color=TRUTH, linestyle="--", linewidth=1.2, label="$T_0$")
     axes.set(xlabel="time (s)", ylabel="statistic", ylim=(-0.03 * top, 1.32 * top))
     axes.set_yticks(np.linspace(0.0, top, 5))
     axes.set_xlim(0.0, float(said.time_s[-1]) + _HOP_S)
