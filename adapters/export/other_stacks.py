@@ -267,6 +267,9 @@ def _fill(moving: Any, one: LaneObject) -> None:
 
 # ODAS sends as many tracks each time, empty ones with id 0.
 _TRACKS = 4
+# ODAS Studio splits the stream at "}", newline, "{", and puts back the brace that is lost only where neither of
+# the two characters before the last is one: hence ODAS's own layout, in which "]" has a line of its own.
+_ODAS_MESSAGE = '{{\n    "timeStamp": {stamp},\n    "src": [\n        {sources}\n    ]\n}}\n'
 
 
 class OdasTracks:
@@ -274,8 +277,8 @@ class OdasTracks:
 
     Examples
     --------
-    >>> OdasTracks().line(WorldState(0, 12))[:60]
-    '{"timeStamp": 12, "src": [{"id": 0, "tag": "", "x": 0.0, "y"'
+    >>> json.loads(OdasTracks().message(WorldState(0, 12)))["timeStamp"]
+    12
     """
 
     def __init__(self) -> None:
@@ -283,15 +286,16 @@ class OdasTracks:
         self._numbers: dict[str, int] = {}
         self._next = count(1)
 
-    def line(self, state: WorldState) -> str:
-        """Return one line: the likeliest moving entities as directions, existence as activity."""
+    def message(self, state: WorldState) -> str:
+        """Return one message: the likeliest moving entities as directions, existence as activity."""
         there = {one.id for one in state.entities}
         self._numbers = {name: number for name, number in self._numbers.items() if name in there}
         moving = [one for one in state.entities if one.moving]
         likeliest = sorted(moving, key=lambda one: -one.existence_probability)[:_TRACKS]
         tracks = [self._track(one) for one in likeliest]
         empty = {"id": 0, "tag": "", "x": 0.0, "y": 0.0, "z": 0.0, "activity": 0.0}
-        return json.dumps({"timeStamp": state.seq, "src": tracks + [empty] * (_TRACKS - len(tracks))})
+        sources = map(json.dumps, tracks + [empty] * (_TRACKS - len(tracks)))
+        return _ODAS_MESSAGE.format(stamp=state.seq, sources=",\n        ".join(sources))
 
     def _track(self, entity: Entity) -> dict[str, object]:
         if entity.id not in self._numbers:
@@ -304,7 +308,7 @@ class OdasTracks:
 
 @contextmanager
 def odas_socket(address: str) -> Iterator[Callable[[WorldState], None]]:
-    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's line."""
+    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's message."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise InvalidArgumentError(f"--export odas: expected HOST:PORT, got {address}")
@@ -315,4 +319,4 @@ def odas_socket(address: str) -> Iterator[Callable[[WorldState], None]]:
         # It has no file name, by which the command would name it.
         raise InvalidArgumentError(f"--export odas: expected a listener at {address} ({error})") from error
     with connection:
-        yield lambda state: connection.sendall((tracks.line(state) + "\n").encode())
+        yield lambda state: connection.sendall(tracks.message(state).encode())

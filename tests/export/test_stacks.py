@@ -2,11 +2,14 @@
 
 import json
 import math
+import os
 import re
 import socket
+import subprocess
 import threading
 import uuid
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -145,6 +148,19 @@ def test_labels_and_sizes_are_those_of_the_likeliest_class():
     assert speed == pytest.approx(4.0)
 
 
+class OdasStudio:
+    """The rule by which ODAS Studio's socket handler takes messages out of what arrives."""
+
+    def __init__(self):
+        self.rest, self.messages = "", []
+
+    def take(self, text):
+        *whole, self.rest = (self.rest + text).split("}\n{")
+        for part in whole:
+            opened = part if part.startswith("{") else "{" + part
+            self.messages.append(opened if "}" in opened[-3:-1] else opened + "}")
+
+
 def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
     received = []
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -153,15 +169,16 @@ def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
             connection, _ = server.accept()
             with connection:
                 while data := connection.recv(4096):
-                    received.append(data)
+                    received.append(data.decode())
 
         listener = threading.Thread(target=serve)
         listener.start()
         assert main(["log", "replay", str(log), "--export", f"odas=127.0.0.1:{server.getsockname()[1]}"]) == 0
         listener.join(timeout=20.0)
-    # Packets are cut anywhere; a reader of ODAS splits the text where one object ends and the next begins.
-    parts = b"".join(received).decode().rstrip("\n").split("}\n{")
-    tracks = [json.loads("{" * (k > 0) + part + "}" * (k < len(parts) - 1)) for k, part in enumerate(parts)]
+    studio = OdasStudio()
+    for text in (*received, "{"):
+        studio.take(text)
+    tracks = [json.loads(one) for one in studio.messages]
     assert [one["timeStamp"] for one in tracks] == [state.seq for state in STATES]
     for one, state in zip(tracks, STATES, strict=True):
         assert len(one["src"]) == 4
@@ -171,13 +188,55 @@ def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
     assert tracks[0]["src"][0]["id"] == tracks[-1]["src"][0]["id"]
 
 
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=6), st.sets(st.integers(0, 3000), max_size=8))
+def test_odas_messages_are_whole_however_the_stream_is_cut(vehicles, cuts):
+    one, tracks = HIDDEN.entities[0], OdasTracks()
+    ticks = [
+        replace(HIDDEN, seq=tick, entities=tuple(replace(one, id=f"entity-{k}") for k in range(many)))
+        for tick, many in enumerate(vehicles)
+    ]
+    stream, studio, ends = "".join(map(tracks.message, ticks)) + "{", OdasStudio(), [0, *sorted(cuts), None]
+    for first, end in pairwise(ends):
+        studio.take(stream[first:end])
+    found = [json.loads(message) for message in studio.messages]
+    assert [message["timeStamp"] for message in found] == list(range(len(vehicles)))
+    sources = [sum(source["id"] > 0 for source in message["src"]) for message in found]
+    assert sources == [min(many, 4) for many in vehicles]
+
+
+# Listens at a free port, prints what the window of ODAS Studio would be sent, and ends with the connection.
+STUDIO_PROGRAM = """
+const net = require('net'), listen = net.Server.prototype.listen;
+net.Server.prototype.listen = function (port, then) { return listen.call(this, 0, '127.0.0.1', then); };
+const send = (name, text) => {
+  if (name === 'newTracking') console.log('got ' + JSON.stringify(JSON.parse(text)));
+  if (name === 'remote-offline') process.exit(0);
+};
+const studio = { mainWindow: { webContents: { send } }, odas: {} };
+require(require('path').resolve(process.argv[1], 'servers.js')).startTrackingServer(studio);
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("ODAS_STUDIO" not in os.environ, reason="ODAS_STUDIO names no checkout of odas_web")
+def test_the_handler_of_odas_studio_gets_every_message_but_the_last(log):
+    command = ["node", "-e", STUDIO_PROGRAM, os.environ["ODAS_STUDIO"]]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as node:
+        port = re.search(r'"port":(\d+)', node.stdout.readline())[1]
+        assert main(["log", "replay", str(log), "--export", f"odas=127.0.0.1:{port}"]) == 0
+        printed, _ = node.communicate(timeout=60.0)
+    got = [json.loads(line[4:]) for line in printed.splitlines() if line.startswith("got ")]
+    # It takes a message when the next begins.
+    assert [one["timeStamp"] for one in got] == [state.seq for state in STATES[:-1]]
+
+
 def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgotten():
     tracks, numbers = OdasTracks(), []
     with_entity = next(state for state in STATES if state.entities)
     for hop in range(200):
         one = replace(with_entity.entities[0], id=f"entity-{hop}", moving=True)
-        line = json.loads(tracks.line(replace(with_entity, entities=(one,))))
-        numbers.append(line["src"][0]["id"])
+        message = json.loads(tracks.message(replace(with_entity, entities=(one,))))
+        numbers.append(message["src"][0]["id"])
     assert numbers == list(range(1, 201)) and len(tracks._numbers) == 1
 
 
