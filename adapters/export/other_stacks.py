@@ -10,7 +10,7 @@ import struct
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from worldstate.adapters.files.file_io import atomic_path, line_writer
 from worldstate.ground import FloatArray, InvalidArgumentError, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.state import Entity, WorldState
+from worldstate.state.sensor import Ego
 
 # Real vehicles of OVAD pass some 9 m ahead of the ego; another junction has another distance.
 CROSSING_M = 9.0
@@ -40,7 +41,7 @@ class LaneObject:
     velocity_mps: FloatArray  # x, y; zero where it is not known
     covariance: FloatArray  # shape (2, 2): of the position, m^2
     measured: bool  # Whether a sensor measured the position; else the lane is assumed
-    confidence: float  # Probability that it goes along its path
+    confidence: float  # Probability that it exists and goes along its path
 
     @property
     def yaw_rad(self) -> float:
@@ -68,13 +69,13 @@ def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[
     coming = {cue.direction: (cue.within or {}).get("3") for cue in state.cues}
     moving = (part for one in state.entities if one.moving for part in one.on_each_side())
     for entity in moving:
-        hidden, within = entity.status == "hidden", coming.get(entity.direction or "")
-        # That a vehicle comes into view is said given all that was heard, so of one that exists it is more.
-        given = within / max(entity.existence_probability, 1e-6) if hidden and within is not None else 1.0
+        within = coming.get(entity.direction or "") if entity.status == "hidden" else None
+        # Existence times the chance that it comes, given that it exists: that product is what the cue states.
+        confidence = min(entity.existence_probability, 1.0 if within is None else within)
         if entity.position_m is None:
-            yield _assumed(entity, crossing_m, paces.get(entity.direction or "", 0.0), min(given, 1.0))
+            yield _assumed(entity, crossing_m, paces.get(entity.direction or "", 0.0), confidence)
         else:
-            yield _measured(entity, entity.position_m, min(given, 1.0))
+            yield _measured(entity, entity.position_m, confidence)
 
 
 def _measured(entity: Entity, position_m: tuple[float, float, float], confidence: float) -> LaneObject:
@@ -100,6 +101,17 @@ def _assumed(entity: Entity, crossing_m: float, pace_hz: float, confidence: floa
     return LaneObject(entity, position, velocity, covariance, False, confidence)
 
 
+def _in_map(one: LaneObject, ego: Ego) -> LaneObject:
+    """Return an object in the map; its covariance gains that of the pose of the ego vehicle."""
+    cos, sin = math.cos(ego.yaw_rad), math.sin(ego.yaw_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    x, y = offset = turn @ one.position_m
+    by_pose = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
+    covariance = turn @ one.covariance @ turn.T + by_pose @ np.array(ego.covariance) @ by_pose.T
+    position, velocity = np.array(ego.position_m) + offset, turn @ one.velocity_mps
+    return replace(one, position_m=position, velocity_mps=velocity, covariance=covariance)
+
+
 # Of autoware_perception_msgs/ObjectClassification; a tram is none of them.
 LABELS = {"unknown": 0, "car": 1, "van": 1, "truck": 2, "bus": 3, "motorcycle": 5, "bicycle": 6, "person": 7}
 # Length, width and height of a usual one, metres.
@@ -116,23 +128,50 @@ _UNKNOWN_VARIANCE = 1e4
 
 
 def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[str, Any]:
-    """Return the message; hidden entities stand in the occluded lane, see `lane_objects`.
+    """Return the message, in the frame `map`; hidden entities stand in the occluded lane, see `lane_objects`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If no odometry with a pose has said where the ego vehicle is in the map.
 
     Examples
     --------
-    >>> autoware_objects(WorldState(1_500_000_000, 0))
-    {'header': {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'base_link'}, 'objects': []}
+    >>> ego = Ego((2.0, 0.0), 0.0, ((0.0,) * 3,) * 3, 5.0, 0.0, localised=True)
+    >>> autoware_objects(WorldState(1_500_000_000, 0, ego=ego))
+    {'header': {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'map'}, 'objects': []}
     """
+    ego = state.ego
+    if ego is None or not ego.localised:
+        got = "none" if ego is None else "a speed without a pose"
+        raise InvalidArgumentError(
+            f"Autoware's objects stand in the map: expected odometry with x_m, y_m and yaw_rad, got {got}"
+        )
     sec, nanosec = divmod(state.stamp_ns, 1_000_000_000)
-    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": state.frame_id}
-    return {"header": header, "objects": [_object(one) for one in lane_objects(state, crossing_m)]}
+    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "map"}
+    objects = [_object(_in_map(one, ego)) for one in lane_objects(state, crossing_m)]
+    return {"header": header, "objects": objects}
+
+
+def is_localised(state: WorldState) -> bool:
+    """Return whether it is known where the ego vehicle is in the map."""
+    return state.ego is not None and state.ego.localised
 
 
 @contextmanager
 def autoware_lines(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes the messages of states, one a line."""
+    """Lend a function that writes the messages of states, one a line; the first state must have a pose."""
+    started = False
     with line_writer(path) as write:
-        yield lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+
+        def write_state(state: WorldState) -> None:
+            nonlocal started
+            # After a fault of the clock the pose is unknown for a while, which does not end a run.
+            if not started or is_localised(state):
+                write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+            started = True
+
+        yield write_state
 
 
 def likeliest_label(one: LaneObject) -> int:
@@ -143,23 +182,21 @@ def likeliest_label(one: LaneObject) -> int:
 
 def _object(one: LaneObject) -> dict[str, Any]:
     speed = float(np.hypot(*one.velocity_mps))
-    pose = {"pose": _pose(one.position_m, one.yaw_rad), "covariance": _covariance(one.covariance)}
+    length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
+    poses = [_pose(point, 0.5 * height, one.yaw_rad) for point in one.path_m()]
+    pose = {"pose": poses[0], "covariance": _covariance(one.covariance)}
     twist = {"linear": _xyz(speed, 0.0), "angular": _xyz(0.0, 0.0)}  # in the axes of the object
     still = {"linear": _xyz(0.0, 0.0), "angular": _xyz(0.0, 0.0)}
     unknown = _covariance(np.diag([_UNKNOWN_VARIANCE] * 2))
     path = {
-        "path": [_pose(point, one.yaw_rad) for point in one.path_m()],
+        "path": poses,
         "time_step": {"sec": int(PATH_STEP_S), "nanosec": int(PATH_STEP_S % 1.0 * 1e9)},
         "confidence": one.confidence,
     }
-    length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
     return {
         "object_id": {"uuid": list(uuid.UUID(one.entity.id).bytes)},
         "existence_probability": one.entity.existence_probability,
-        "classification": [
-            {"label": LABELS.get(said.label, 0), "probability": said.probability}
-            for said in one.entity.classification
-        ],
+        "classification": _classification(one.entity),
         "kinematics": {
             "initial_pose_with_covariance": pose,
             "initial_twist_with_covariance": {"twist": twist, "covariance": unknown},
@@ -174,14 +211,21 @@ def _object(one: LaneObject) -> dict[str, Any]:
     }
 
 
-def _pose(position_m: FloatArray, yaw_rad: float) -> dict[str, Any]:
-    half = 0.5 * yaw_rad
+def _classification(entity: Entity) -> list[dict[str, Any]]:
+    """Return the classes, the likeliest first: planners take the first one, and fail where there is none."""
+    told = [(LABELS.get(said.label, 0), said.probability) for said in entity.classification] or [(0, 1.0)]
+    likeliest = sorted(told, key=lambda said: -said[1])
+    return [{"label": label, "probability": probability} for label, probability in likeliest]
+
+
+def _pose(position_m: FloatArray, z_m: float, yaw_rad: float) -> dict[str, Any]:
+    (x, y), half = position_m.tolist(), 0.5 * yaw_rad
     turned = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
-    return {"position": _xyz(*position_m.tolist()), "orientation": turned}
+    return {"position": _xyz(x, y, z_m), "orientation": turned}
 
 
-def _xyz(x: float, y: float) -> dict[str, float]:
-    return {"x": x, "y": y, "z": 0.0}
+def _xyz(x: float, y: float, z: float = 0.0) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
 
 
 def _covariance(of_xy: FloatArray) -> list[float]:
@@ -267,8 +311,8 @@ def _fill(moving: Any, one: LaneObject) -> None:
 
 # ODAS sends as many tracks each time, empty ones with id 0.
 _TRACKS = 4
-# ODAS Studio splits the stream at "}", newline, "{", and puts back the brace that is lost only where neither of
-# the two characters before the last is one: hence ODAS's own layout, in which "]" has a line of its own.
+# ODAS Studio splits the stream at "}", newline, "{", and puts back the brace that is lost only where neither
+# of the two characters before the last is one: hence ODAS's own layout, in which "]" has a line of its own.
 _ODAS_MESSAGE = '{{\n    "timeStamp": {stamp},\n    "src": [\n        {sources}\n    ]\n}}\n'
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scripted_states import scripted_states
+from scripted_states import EGO, scripted_states
 
 from worldstate.adapters.export.other_stacks import OdasTracks, autoware_objects, lane_objects
 from worldstate.cli.main import main
@@ -117,12 +117,79 @@ def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lan
         check("PredictedObjects", message)
         ids = [str(uuid.UUID(bytes=bytes(one["object_id"]["uuid"]))) for one in message["objects"]]
         assert ids == [one.id for one in state.entities if one.moving]
+        assert message["header"]["frame_id"] == "map"
     (path,) = json.loads(lines[0])["objects"][0]["kinematics"]["predicted_paths"]
-    ahead = [pose["position"]["x"] for pose in path["path"]]
-    across = [pose["position"]["y"] for pose in path["path"]]
+    # The car stands at (100, 50) with its front along y: ahead of it is y, to its right x.
+    ahead = [pose["position"]["y"] - 50.0 for pose in path["path"]]
+    across = [100.0 - pose["position"]["x"] for pose in path["path"]]
     assert ahead == pytest.approx([9.0] * 7)
     assert np.diff(across) == pytest.approx(-0.5 * 0.5 * 9.0), "at the pace of the usual corner"
-    assert 0.0 < path["confidence"] <= 1.0
+    assert across[0] > 0.0, "it is hidden on the left"
+    for line in lines:
+        for one in json.loads(line)["objects"]:
+            poses = one["kinematics"]["predicted_paths"][0]["path"]
+            at = one["kinematics"]["initial_pose_with_covariance"]["pose"]
+            assert {pose["position"]["z"] for pose in (at, *poses)} == {0.5 * one["shape"]["dimensions"]["z"]}
+
+
+@settings(max_examples=20)
+@given(st.floats(-3.1, 3.1), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0))
+def test_an_object_stands_in_the_map_where_the_car_sees_it_and_is_as_uncertain_as_both(yaw, x, y):
+    ego = replace(EGO, position_m=(x, y), yaw_rad=yaw, covariance=((0.09, 0, 0), (0, 0.09, 0), (0, 0, 0.01)))
+    known = tuple(map(tuple, np.diag([0.25, 1.0, 1.0, 1.0]).tolist()))
+    certain = replace(PLACED.entities[0], covariance=known)
+    (one,) = autoware_objects(replace(PLACED, entities=(certain,), ego=ego))["objects"]
+    pose = one["kinematics"]["initial_pose_with_covariance"]
+    at = complex(pose["pose"]["position"]["x"], pose["pose"]["position"]["y"])
+    seen_m = (at - complex(x, y)) * np.exp(-1j * yaw)
+    assert (seen_m.real, seen_m.imag) == pytest.approx(certain.position_m[:2])
+    turned = 2.0 * math.atan2(pose["pose"]["orientation"]["z"], pose["pose"]["orientation"]["w"])
+    assert np.exp(1j * turned) == pytest.approx(np.exp(1j * (yaw - 0.5 * np.pi))), "it drives to the right"
+    # An error of the car's yaw moves the object by its range.
+    trace = sum(np.reshape(pose["covariance"], (6, 6)).diagonal()[:2])
+    range_m = math.hypot(*certain.position_m[:2])
+    assert trace == pytest.approx(0.25 + 1.0 + 2 * 0.09 + 0.01 * range_m**2)
+
+
+@pytest.mark.parametrize("ego", [None, replace(EGO, localised=False)])
+def test_objects_of_a_car_that_is_nowhere_in_the_map_are_refused(ego, tmp_path, capsys):
+    (tmp_path / "states.jsonl").write_text(replace(HIDDEN, ego=ego).to_json() + "\n")
+    out = tmp_path / "objects.jsonl"
+    assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", f"autoware={out}"]) == 2
+    assert "expected odometry with x_m, y_m and yaw_rad" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_pose_that_is_lost_on_the_way_leaves_states_out(tmp_path):
+    states = [HIDDEN, replace(HIDDEN, seq=90, ego=None), PLACED]
+    (tmp_path / "states.jsonl").write_text("".join(state.to_json() + "\n" for state in states))
+    out = tmp_path / "objects.jsonl"
+    assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", f"autoware={out}"]) == 0
+    assert len(out.read_text().splitlines()) == 2
+
+
+def stops_for(message, least_confidence=0.05, kinds=(0, 1, 2, 3, 4, 5, 6)):
+    """Return the objects that Autoware's intersection module minds, of unknown kind as well."""
+    return [
+        one
+        for one in message["objects"]
+        if one["classification"][0]["label"] in kinds
+        and any(path["confidence"] >= least_confidence for path in one["kinematics"]["predicted_paths"])
+    ]
+
+
+def test_an_existence_of_a_twentieth_stops_nobody():
+    faint = replace(HIDDEN.entities[0], existence_probability=0.05, hidden_probability=0.05, sides=())
+    likely = replace(faint, existence_probability=0.9, hidden_probability=0.9)
+    cue = next(one for one in HIDDEN.cues if one.direction == faint.direction)
+    for entity, within, minded in ((faint, 0.04, 0), (likely, 0.04, 0), (likely, 0.6, 1)):
+        state = replace(HIDDEN, entities=(entity,), cues=(replace(cue, within={"3": within}),))
+        message = autoware_objects(state)
+        assert len(stops_for(message)) == minded
+        (path,) = message["objects"][0]["kinematics"]["predicted_paths"]
+        assert path["confidence"] == pytest.approx(within)
+    in_view = replace(PLACED, entities=(replace(PLACED.entities[0], existence_probability=0.04),))
+    assert not stops_for(autoware_objects(in_view)), "of one in view the existence alone counts"
 
 
 @settings(max_examples=30)
@@ -138,6 +205,14 @@ def test_who_is_only_heard_keeps_the_azimuth_and_its_deviation_in_the_lane(azimu
     gradient = np.array([-y, x]) / (x * x + y * y)
     assert math.sqrt(gradient @ one.covariance @ gradient) == pytest.approx(std, rel=1e-6)
     assert np.linalg.eigvalsh(one.covariance).min() >= -1e-9
+
+
+def test_the_likeliest_class_comes_first_and_one_is_always_there():
+    doubted = replace(PLACED.entities[0], classification=PLACED.entities[0].classification[::-1])
+    (one,) = autoware_objects(replace(PLACED, entities=(doubted,)))["objects"]
+    assert [said["label"] for said in one["classification"]] == [1, 0]
+    nothing = replace(PLACED, entities=(replace(doubted, classification=()),))
+    assert autoware_objects(nothing)["objects"][0]["classification"] == [{"label": 0, "probability": 1.0}]
 
 
 def test_labels_and_sizes_are_those_of_the_likeliest_class():
