@@ -38,7 +38,7 @@ class LaneObject:
 
     entity: Entity
     position_m: FloatArray  # x, y of the frame of the state
-    velocity_mps: FloatArray  # x, y; zero where it is not known
+    velocity_mps: FloatArray  # x, y over ground; zero where it is not known
     covariance: FloatArray  # shape (2, 2): of the position, m^2
     measured: bool  # Whether a sensor measured the position; else the lane is assumed
     confidence: float  # Probability that it exists and goes along its path
@@ -73,7 +73,8 @@ def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[
         # Existence times the chance that it comes, given that it exists: that product is what the cue states.
         confidence = min(entity.existence_probability, 1.0 if within is None else within)
         if entity.position_m is None:
-            yield _assumed(entity, crossing_m, paces.get(entity.direction or "", 0.0), confidence)
+            pace_hz = paces.get(entity.direction or "", 0.0)
+            yield _assumed(entity, crossing_m, pace_hz, confidence, _twist(state))
         else:
             yield _measured(entity, entity.position_m, confidence)
 
@@ -84,7 +85,22 @@ def _measured(entity: Entity, position_m: tuple[float, float, float], confidence
     return LaneObject(entity, np.array(position_m[:2]), velocity, known, True, confidence)
 
 
-def _assumed(entity: Entity, crossing_m: float, pace_hz: float, confidence: float) -> LaneObject:
+def _twist(state: WorldState) -> tuple[float, float]:
+    """Return speed and yaw rate of the ego vehicle."""
+    if state.ego is None:
+        return state.context.ego_speed_mps or 0.0, 0.0
+    return state.ego.speed_mps, state.ego.yaw_rate_rad_s
+
+
+def _of_axes(position_m: FloatArray, twist: tuple[float, float]) -> FloatArray:
+    """Return the velocity over ground of a place in the axes of the ego vehicle, which drives and turns."""
+    (x, y), (speed_mps, yaw_rate_rad_s) = position_m.tolist(), twist
+    return np.array([speed_mps - yaw_rate_rad_s * y, yaw_rate_rad_s * x])
+
+
+def _assumed(
+    entity: Entity, crossing_m: float, pace_hz: float, confidence: float, twist: tuple[float, float]
+) -> LaneObject:
     azimuth_rad = entity.azimuth_rad
     along = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
     across = np.array([-along[1], along[0]])
@@ -97,7 +113,10 @@ def _assumed(entity: Entity, crossing_m: float, pace_hz: float, confidence: floa
     if entity.status == "hidden":
         velocity = np.array([0.0, -math.copysign(pace_hz * crossing_m, azimuth_rad)])
     else:
-        velocity = (entity.azimuth_rate_rad_s or 0.0) * turned
+        velocity = (entity.azimuth_rate_rad_s or 0.0) * turned + _of_axes(position, twist)
+        if not turned[0]:
+            # The lane stays where it is: a drive towards it changes the azimuth of what stands in it.
+            velocity = np.array([0.0, velocity[1] - velocity[0] * along[1] / along[0]])
     return LaneObject(entity, position, velocity, covariance, False, confidence)
 
 
@@ -196,7 +215,10 @@ def _object(one: LaneObject) -> dict[str, Any]:
     return {
         "object_id": {"uuid": list(uuid.UUID(one.entity.id).bytes)},
         "existence_probability": one.entity.existence_probability,
-        "classification": _classification(one.entity),
+        # Planners take the first one, and fail where there is none.
+        "classification": [
+            {"label": LABELS.get(kind, 0), "probability": share} for kind, share in _kinds(one.entity)
+        ],
         "kinematics": {
             "initial_pose_with_covariance": pose,
             "initial_twist_with_covariance": {"twist": twist, "covariance": unknown},
@@ -211,11 +233,11 @@ def _object(one: LaneObject) -> dict[str, Any]:
     }
 
 
-def _classification(entity: Entity) -> list[dict[str, Any]]:
-    """Return the classes, the likeliest first: planners take the first one, and fail where there is none."""
-    told = [(LABELS.get(said.label, 0), said.probability) for said in entity.classification] or [(0, 1.0)]
-    likeliest = sorted(told, key=lambda said: -said[1])
-    return [{"label": label, "probability": probability} for label, probability in likeliest]
+def _kinds(entity: Entity) -> list[tuple[str, float]]:
+    """Return the classes with their probabilities, the likeliest first; what is left to one is unknown."""
+    told = [(said.label, said.probability) for said in entity.classification]
+    left = 1.0 - sum(probability for _, probability in told)
+    return sorted(told + [("unknown", left)] * (left > 1e-6), key=lambda kind: -kind[1])
 
 
 def _pose(position_m: FloatArray, z_m: float, yaw_rad: float) -> dict[str, Any]:
@@ -238,6 +260,8 @@ def _covariance(of_xy: FloatArray) -> list[float]:
 # Of osi3.MovingObject.VehicleClassification, by Autoware's numbers; a person has another type.
 _VEHICLES = {1: "TYPE_CAR", 2: "TYPE_HEAVY_TRUCK", 3: "TYPE_BUS", 5: "TYPE_MOTORBIKE", 6: "TYPE_BICYCLE"}
 _PERSON = 7
+# Of the height of the middle, assumed: a van is .5 m higher than a car, and roads have a camber.
+_Z_STD_M = 0.3
 
 
 def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
@@ -255,15 +279,23 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
         stamp.seconds, stamp.nanos = divmod(state.stamp_ns, 1_000_000_000)
     data.sensor_id.value = 1
     # The axes of the state are those of the vehicle: a virtual sensor at their origin.
-    data.mounting_position.position.x = data.mounting_position.position.y = 0.0
+    _set(data.mounting_position.position, x=0.0, y=0.0, z=0.0)
+    _set(data.mounting_position.orientation, yaw=0.0, pitch=0.0, roll=0.0)
     header = data.moving_object_header
     header.cycle_counter = state.seq
     impaired = any(sensor.condition != "working" for sensor in state.sensors)
     available = "AVAILABLE_REDUCED" if impaired else "AVAILABLE"
     header.data_qualifier = getattr(header, f"DATA_QUALIFIER_{available}")
     for one in lane_objects(state, crossing_m):
-        _fill(data.moving_object.add(), one)
+        relative_mps = one.velocity_mps - _of_axes(one.position_m, _twist(state))
+        _fill(data.moving_object.add(), one, relative_mps)
     return data
+
+
+def _set(part: Any, **values: float) -> None:
+    """Set all values of a part: a vector of OSI has three, or is not there."""
+    for name, value in values.items():
+        setattr(part, name, value)
 
 
 @contextmanager
@@ -279,7 +311,7 @@ def osi_trace(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], 
         yield write
 
 
-def _fill(moving: Any, one: LaneObject) -> None:
+def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
     entity = one.entity
     header = moving.header
     # OSI counts in 64 bits, of which the highest marks a value that is not set.
@@ -289,19 +321,20 @@ def _fill(moving: Any, one: LaneObject) -> None:
     predicted = entity.status == "hidden" or not one.measured
     known = "PREDICTED" if predicted else "MEASURED"
     header.measurement_state = getattr(header, f"MEASUREMENT_STATE_{known}")
-    base, spread = moving.base, one.covariance.diagonal() ** 0.5
-    base.position.x, base.position.y = one.position_m.tolist()
-    base.velocity.x, base.velocity.y = one.velocity_mps.tolist()
-    base.position.z = base.velocity.z = 0.0  # A vector has three values, or is not set
-    base.orientation.yaw = one.yaw_rad
-    moving.base_rmse.position.x, moving.base_rmse.position.y = spread.tolist()
-    size = base.dimension
-    size.length, size.width, size.height = SIZES_M.get(likeliest_label(one), CAR_M)
+    (x, y), (vx, vy) = one.position_m.tolist(), relative_mps.tolist()
+    x_std, y_std = (one.covariance.diagonal() ** 0.5).tolist()
+    length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
+    base = moving.base
+    _set(base.position, x=x, y=y, z=0.5 * height)  # the middle of the box
+    _set(base.velocity, x=vx, y=vy, z=0.0)
+    _set(base.orientation, yaw=one.yaw_rad, pitch=0.0, roll=0.0)
+    _set(moving.base_rmse.position, x=x_std, y=y_std, z=_Z_STD_M)
+    _set(base.dimension, length=length, width=width, height=height)
     moving.movement_state = moving.MOVEMENT_STATE_MOVING
     kinds = optional("osi3.osi_object_pb2").MovingObject
-    for said in entity.classification:
-        number, candidate = LABELS.get(said.label, 0), moving.candidate.add()
-        candidate.probability = said.probability
+    for label, probability in _kinds(entity):
+        number, candidate = LABELS.get(label, 0), moving.candidate.add()
+        candidate.probability = probability
         known = kinds.TYPE_VEHICLE if number else kinds.TYPE_UNKNOWN
         candidate.type = kinds.TYPE_PEDESTRIAN if number == _PERSON else known
         if number in _VEHICLES:

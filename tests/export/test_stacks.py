@@ -17,7 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_states import EGO, scripted_states
 
-from worldstate.adapters.export.other_stacks import OdasTracks, autoware_objects, lane_objects
+from worldstate.adapters.export.other_stacks import (
+    OdasTracks,
+    autoware_objects,
+    lane_objects,
+    osi_sensor_data,
+)
 from worldstate.cli.main import main
 
 STATES = scripted_states()
@@ -53,10 +58,87 @@ def test_osi_reads_the_trace_and_finds_every_entity(log, tmp_path):
     last = found[-1].moving_object[0]
     assert last.header.measurement_state == last.header.MEASUREMENT_STATE_MEASURED
     assert (last.base.position.x, last.base.position.y) == PLACED.entities[0].position_m[:2]
+    assert last.base.position.z == 0.5 * last.base.dimension.height, "it is the middle of the box"
     car, unknown = last.candidate
     assert (car.probability, unknown.probability) == (0.7, 0.3)
     assert car.vehicle_classification.type == car.vehicle_classification.TYPE_CAR
     assert found[-2].moving_object[0].header.tracking_id == last.header.tracking_id
+
+
+# Ranges that OSI's definitions name, by the field.
+OSI_RANGES = {
+    "nanos": (0, 999_999_999), "seconds": (0, math.inf), "probability": (0.0, 1.0), "age": (0.0, math.inf),
+    "existence_probability": (0.0, 1.0), "length": (0.0, math.inf), "width": (0.0, math.inf),
+    "height": (0.0, math.inf), "yaw": (-math.pi, math.pi), "pitch": (-math.pi, math.pi),
+    "roll": (-math.pi, math.pi), "value": (0, 2**64 - 2),
+}  # fmt: skip
+OSI_WHOLE = {"Vector3d", "Orientation3d", "Dimension3d", "Timestamp", "InterfaceVersion", "MountingPosition"}
+OSI_NEEDED = {
+    "SensorData": "version timestamp sensor_id mounting_position last_measurement_time moving_object_header",
+    "DetectedEntityHeader": "measurement_time cycle_counter data_qualifier",
+    "DetectedMovingObject": "header base base_rmse movement_state candidate",
+    "DetectedItemHeader": "tracking_id existence_probability age measurement_state",
+    "BaseMoving": "position",
+    "CandidateMovingObject": "probability type",
+}
+
+
+def osi_faults(message, place="SensorData"):
+    """Yield what the rules of OSI refuse of a message, and of the messages in it."""
+    kind, filled = message.DESCRIPTOR, {field.name: value for field, value in message.ListFields()}
+    named = OSI_NEEDED.get(kind.name, "").split()
+    needed = [field.name for field in kind.fields] if kind.name in OSI_WHOLE else named
+    yield from (f"{place}: {name} is not set" for name in set(needed) - filled.keys())
+    for field, value in message.ListFields():
+        for number, part in enumerate(value if field.is_repeated else [value]):
+            inner = f"{place}.{field.name}[{number}]"
+            if field.message_type is not None:
+                yield from osi_faults(part, inner)
+            elif field.enum_type is not None:
+                if part == 0 and field.name != "type":
+                    yield f"{inner} is unknown"
+            else:
+                low, high = OSI_RANGES.get(field.name, (-math.inf, math.inf))
+                if not low <= part <= high:
+                    yield f"{inner} is {part}"
+
+
+def stamp_of(time):
+    return time.seconds * 10**9 + time.nanos
+
+
+def test_osi_messages_keep_the_rules_of_its_definitions():
+    both = HIDDEN.entities[0]
+    several = tuple(replace(both, id=str(uuid.uuid5(uuid.NAMESPACE_OID, str(k)))) for k in range(5))
+    no_class = replace(PLACED, entities=(replace(PLACED.entities[0], classification=()),))
+    before = -1
+    later = [replace(no_class, stamp_ns=10**10), replace(HIDDEN, stamp_ns=10**11, entities=several)]
+    for state in [*STATES, *later]:
+        message = osi_sensor_data(state)
+        assert list(osi_faults(message)) == []
+        assert (message.version.version_major, message.version.version_minor) >= (3, 8)
+        measured = stamp_of(message.moving_object_header.measurement_time)
+        assert before < measured <= stamp_of(message.last_measurement_time) <= stamp_of(message.timestamp)
+        before = stamp_of(message.timestamp)
+        numbers = [one.header.tracking_id.value for one in message.moving_object]
+        assert len(numbers) == len(set(numbers)) == sum(one.moving for one in state.entities)
+        for one in message.moving_object:
+            assert sum(kind.probability for kind in one.candidate) == pytest.approx(1.0)
+            assert one.base_rmse.position.z > 0.0
+
+
+@settings(max_examples=30)
+@given(st.floats(-1.3, 1.3), st.floats(-0.5, 0.5), st.floats(0.0, 15.0), st.floats(-0.3, 0.3))
+def test_a_drive_does_not_move_what_is_seen_across_the_road(azimuth, rate, speed, turning):
+    ego = replace(EGO, speed_mps=speed, yaw_rate_rad_s=turning)
+    seen = replace(STATES[-2].entities[0], azimuth_rad=azimuth, azimuth_rate_rad_s=rate)
+    state = replace(STATES[-2], entities=(seen,), ego=ego)
+    base = osi_sensor_data(state).moving_object[0].base
+    x, y, vx, vy = base.position.x, base.position.y, base.velocity.x, base.velocity.y
+    # OSI's velocity is that in the axes of the vehicle: the azimuth changes as it was seen to.
+    assert (x * vy - y * vx) / (x * x + y * y) == pytest.approx(rate, abs=1e-9)
+    (one,) = lane_objects(state)
+    assert one.velocity_mps[0] == pytest.approx(0.0, abs=1e-9), "over ground it stays in its lane"
 
 
 # As the .msg files of autoware_perception_msgs, geometry_msgs and unique_identifier_msgs say.
