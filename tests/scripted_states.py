@@ -10,8 +10,11 @@ from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.measurement import Look
 from worldstate.state import Classification
+from worldstate.state.sensor import Ego
 
 SILENT, FLAT = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+# It stands in the map with its front to the left of the map's x axis.
+EGO = Ego((100.0, 50.0), 0.5 * np.pi, ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, 1e-4)), 0.0, 0.0, True)
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
@@ -25,7 +28,7 @@ def scripted_states(hops: int = 5) -> list[WorldState]:
         world = world.update(
             Measurement(hop * 10**8, FLAT, look.answer, SILENT, SILENT, (), look, None, sequence=reading)
         )
-        states.append(world.state)
+        states.append(replace(world.state, ego=EGO))
     return [*states[1:], *_in_view(states[-1])]
 
 

@@ -10,7 +10,7 @@ import struct
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from worldstate.adapters.files.file_io import atomic_path, line_writer
 from worldstate.ground import FloatArray, InvalidArgumentError, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.state import Entity, WorldState
+from worldstate.state.sensor import Ego
 
 # Real vehicles of OVAD pass some 9 m ahead of the ego; another junction has another distance.
 CROSSING_M = 9.0
@@ -37,10 +38,10 @@ class LaneObject:
 
     entity: Entity
     position_m: FloatArray  # x, y of the frame of the state
-    velocity_mps: FloatArray  # x, y; zero where it is not known
+    velocity_mps: FloatArray  # x, y over ground; zero where it is not known
     covariance: FloatArray  # shape (2, 2): of the position, m^2
     measured: bool  # Whether a sensor measured the position; else the lane is assumed
-    confidence: float  # Probability that it goes along its path
+    confidence: float  # Probability that it exists and goes along its path
 
     @property
     def yaw_rad(self) -> float:
@@ -68,13 +69,14 @@ def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[
     coming = {cue.direction: (cue.within or {}).get("3") for cue in state.cues}
     moving = (part for one in state.entities if one.moving for part in one.on_each_side())
     for entity in moving:
-        hidden, within = entity.status == "hidden", coming.get(entity.direction or "")
-        # That a vehicle comes into view is said given all that was heard, so of one that exists it is more.
-        given = within / max(entity.existence_probability, 1e-6) if hidden and within is not None else 1.0
+        within = coming.get(entity.direction or "") if entity.status == "hidden" else None
+        # Existence times the chance that it comes, given that it exists: that product is what the cue states.
+        confidence = min(entity.existence_probability, 1.0 if within is None else within)
         if entity.position_m is None:
-            yield _assumed(entity, crossing_m, paces.get(entity.direction or "", 0.0), min(given, 1.0))
+            pace_hz = paces.get(entity.direction or "", 0.0)
+            yield _assumed(entity, crossing_m, pace_hz, confidence, _twist(state))
         else:
-            yield _measured(entity, entity.position_m, min(given, 1.0))
+            yield _measured(entity, entity.position_m, confidence)
 
 
 def _measured(entity: Entity, position_m: tuple[float, float, float], confidence: float) -> LaneObject:
@@ -83,7 +85,22 @@ def _measured(entity: Entity, position_m: tuple[float, float, float], confidence
     return LaneObject(entity, np.array(position_m[:2]), velocity, known, True, confidence)
 
 
-def _assumed(entity: Entity, crossing_m: float, pace_hz: float, confidence: float) -> LaneObject:
+def _twist(state: WorldState) -> tuple[float, float]:
+    """Return speed and yaw rate of the ego vehicle."""
+    if state.ego is None:
+        return state.context.ego_speed_mps or 0.0, 0.0
+    return state.ego.speed_mps, state.ego.yaw_rate_rad_s
+
+
+def _of_axes(position_m: FloatArray, twist: tuple[float, float]) -> FloatArray:
+    """Return the velocity over ground of a place in the axes of the ego vehicle, which drives and turns."""
+    (x, y), (speed_mps, yaw_rate_rad_s) = position_m.tolist(), twist
+    return np.array([speed_mps - yaw_rate_rad_s * y, yaw_rate_rad_s * x])
+
+
+def _assumed(
+    entity: Entity, crossing_m: float, pace_hz: float, confidence: float, twist: tuple[float, float]
+) -> LaneObject:
     azimuth_rad = entity.azimuth_rad
     along = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
     across = np.array([-along[1], along[0]])
@@ -96,8 +113,22 @@ def _assumed(entity: Entity, crossing_m: float, pace_hz: float, confidence: floa
     if entity.status == "hidden":
         velocity = np.array([0.0, -math.copysign(pace_hz * crossing_m, azimuth_rad)])
     else:
-        velocity = (entity.azimuth_rate_rad_s or 0.0) * turned
+        velocity = (entity.azimuth_rate_rad_s or 0.0) * turned + _of_axes(position, twist)
+        if not turned[0]:
+            # The lane stays where it is: a drive towards it changes the azimuth of what stands in it.
+            velocity = np.array([0.0, velocity[1] - velocity[0] * along[1] / along[0]])
     return LaneObject(entity, position, velocity, covariance, False, confidence)
+
+
+def _in_map(one: LaneObject, ego: Ego) -> LaneObject:
+    """Return an object in the map; its covariance gains that of the pose of the ego vehicle."""
+    cos, sin = math.cos(ego.yaw_rad), math.sin(ego.yaw_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    x, y = offset = turn @ one.position_m
+    by_pose = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
+    covariance = turn @ one.covariance @ turn.T + by_pose @ np.array(ego.covariance) @ by_pose.T
+    position, velocity = np.array(ego.position_m) + offset, turn @ one.velocity_mps
+    return replace(one, position_m=position, velocity_mps=velocity, covariance=covariance)
 
 
 # Of autoware_perception_msgs/ObjectClassification; a tram is none of them.
@@ -116,23 +147,50 @@ _UNKNOWN_VARIANCE = 1e4
 
 
 def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[str, Any]:
-    """Return the message; hidden entities stand in the occluded lane, see `lane_objects`.
+    """Return the message, in the frame `map`; hidden entities stand in the occluded lane, see `lane_objects`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If no odometry with a pose has said where the ego vehicle is in the map.
 
     Examples
     --------
-    >>> autoware_objects(WorldState(1_500_000_000, 0))
-    {'header': {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'base_link'}, 'objects': []}
+    >>> ego = Ego((2.0, 0.0), 0.0, ((0.0,) * 3,) * 3, 5.0, 0.0, localised=True)
+    >>> autoware_objects(WorldState(1_500_000_000, 0, ego=ego))
+    {'header': {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'map'}, 'objects': []}
     """
+    ego = state.ego
+    if ego is None or not ego.localised:
+        got = "none" if ego is None else "a speed without a pose"
+        raise InvalidArgumentError(
+            f"Autoware's objects stand in the map: expected odometry with x_m, y_m and yaw_rad, got {got}"
+        )
     sec, nanosec = divmod(state.stamp_ns, 1_000_000_000)
-    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": state.frame_id}
-    return {"header": header, "objects": [_object(one) for one in lane_objects(state, crossing_m)]}
+    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "map"}
+    objects = [_object(_in_map(one, ego)) for one in lane_objects(state, crossing_m)]
+    return {"header": header, "objects": objects}
+
+
+def is_localised(state: WorldState) -> bool:
+    """Return whether it is known where the ego vehicle is in the map."""
+    return state.ego is not None and state.ego.localised
 
 
 @contextmanager
 def autoware_lines(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes the messages of states, one a line."""
+    """Lend a function that writes the messages of states, one a line; the first state must have a pose."""
+    started = False
     with line_writer(path) as write:
-        yield lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+
+        def write_state(state: WorldState) -> None:
+            nonlocal started
+            # After a fault of the clock the pose is unknown for a while, which does not end a run.
+            if not started or is_localised(state):
+                write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+            started = True
+
+        yield write_state
 
 
 def likeliest_label(one: LaneObject) -> int:
@@ -143,22 +201,23 @@ def likeliest_label(one: LaneObject) -> int:
 
 def _object(one: LaneObject) -> dict[str, Any]:
     speed = float(np.hypot(*one.velocity_mps))
-    pose = {"pose": _pose(one.position_m, one.yaw_rad), "covariance": _covariance(one.covariance)}
+    length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
+    poses = [_pose(point, 0.5 * height, one.yaw_rad) for point in one.path_m()]
+    pose = {"pose": poses[0], "covariance": _covariance(one.covariance)}
     twist = {"linear": _xyz(speed, 0.0), "angular": _xyz(0.0, 0.0)}  # in the axes of the object
     still = {"linear": _xyz(0.0, 0.0), "angular": _xyz(0.0, 0.0)}
     unknown = _covariance(np.diag([_UNKNOWN_VARIANCE] * 2))
     path = {
-        "path": [_pose(point, one.yaw_rad) for point in one.path_m()],
+        "path": poses,
         "time_step": {"sec": int(PATH_STEP_S), "nanosec": int(PATH_STEP_S % 1.0 * 1e9)},
         "confidence": one.confidence,
     }
-    length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
     return {
         "object_id": {"uuid": list(uuid.UUID(one.entity.id).bytes)},
         "existence_probability": one.entity.existence_probability,
+        # Planners take the first one, and fail where there is none.
         "classification": [
-            {"label": LABELS.get(said.label, 0), "probability": said.probability}
-            for said in one.entity.classification
+            {"label": LABELS.get(kind, 0), "probability": share} for kind, share in _kinds(one.entity)
         ],
         "kinematics": {
             "initial_pose_with_covariance": pose,
@@ -174,14 +233,21 @@ def _object(one: LaneObject) -> dict[str, Any]:
     }
 
 
-def _pose(position_m: FloatArray, yaw_rad: float) -> dict[str, Any]:
-    half = 0.5 * yaw_rad
+def _kinds(entity: Entity) -> list[tuple[str, float]]:
+    """Return the classes with their probabilities, the likeliest first; what is left to one is unknown."""
+    told = [(said.label, said.probability) for said in entity.classification]
+    left = 1.0 - sum(probability for _, probability in told)
+    return sorted(told + [("unknown", left)] * (left > 1e-6), key=lambda kind: -kind[1])
+
+
+def _pose(position_m: FloatArray, z_m: float, yaw_rad: float) -> dict[str, Any]:
+    (x, y), half = position_m.tolist(), 0.5 * yaw_rad
     turned = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
-    return {"position": _xyz(*position_m.tolist()), "orientation": turned}
+    return {"position": _xyz(x, y, z_m), "orientation": turned}
 
 
-def _xyz(x: float, y: float) -> dict[str, float]:
-    return {"x": x, "y": y, "z": 0.0}
+def _xyz(x: float, y: float, z: float = 0.0) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
 
 
 def _covariance(of_xy: FloatArray) -> list[float]:
@@ -194,6 +260,8 @@ def _covariance(of_xy: FloatArray) -> list[float]:
 # Of osi3.MovingObject.VehicleClassification, by Autoware's numbers; a person has another type.
 _VEHICLES = {1: "TYPE_CAR", 2: "TYPE_HEAVY_TRUCK", 3: "TYPE_BUS", 5: "TYPE_MOTORBIKE", 6: "TYPE_BICYCLE"}
 _PERSON = 7
+# Of the height of the middle, assumed: a van is .5 m higher than a car, and roads have a camber.
+_Z_STD_M = 0.3
 
 
 def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
@@ -211,15 +279,23 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
         stamp.seconds, stamp.nanos = divmod(state.stamp_ns, 1_000_000_000)
     data.sensor_id.value = 1
     # The axes of the state are those of the vehicle: a virtual sensor at their origin.
-    data.mounting_position.position.x = data.mounting_position.position.y = 0.0
+    _set(data.mounting_position.position, x=0.0, y=0.0, z=0.0)
+    _set(data.mounting_position.orientation, yaw=0.0, pitch=0.0, roll=0.0)
     header = data.moving_object_header
     header.cycle_counter = state.seq
     impaired = any(sensor.condition != "working" for sensor in state.sensors)
     available = "AVAILABLE_REDUCED" if impaired else "AVAILABLE"
     header.data_qualifier = getattr(header, f"DATA_QUALIFIER_{available}")
     for one in lane_objects(state, crossing_m):
-        _fill(data.moving_object.add(), one)
+        relative_mps = one.velocity_mps - _of_axes(one.position_m, _twist(state))
+        _fill(data.moving_object.add(), one, relative_mps)
     return data
+
+
+def _set(part: Any, **values: float) -> None:
+    """Set all values of a part: a vector of OSI has three, or is not there."""
+    for name, value in values.items():
+        setattr(part, name, value)
 
 
 @contextmanager
@@ -235,7 +311,7 @@ def osi_trace(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], 
         yield write
 
 
-def _fill(moving: Any, one: LaneObject) -> None:
+def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
     entity = one.entity
     header = moving.header
     # OSI counts in 64 bits, of which the highest marks a value that is not set.
@@ -245,19 +321,20 @@ def _fill(moving: Any, one: LaneObject) -> None:
     predicted = entity.status == "hidden" or not one.measured
     known = "PREDICTED" if predicted else "MEASURED"
     header.measurement_state = getattr(header, f"MEASUREMENT_STATE_{known}")
-    base, spread = moving.base, one.covariance.diagonal() ** 0.5
-    base.position.x, base.position.y = one.position_m.tolist()
-    base.velocity.x, base.velocity.y = one.velocity_mps.tolist()
-    base.position.z = base.velocity.z = 0.0  # A vector has three values, or is not set
-    base.orientation.yaw = one.yaw_rad
-    moving.base_rmse.position.x, moving.base_rmse.position.y = spread.tolist()
-    size = base.dimension
-    size.length, size.width, size.height = SIZES_M.get(likeliest_label(one), CAR_M)
+    (x, y), (vx, vy) = one.position_m.tolist(), relative_mps.tolist()
+    x_std, y_std = (one.covariance.diagonal() ** 0.5).tolist()
+    length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
+    base = moving.base
+    _set(base.position, x=x, y=y, z=0.5 * height)  # the middle of the box
+    _set(base.velocity, x=vx, y=vy, z=0.0)
+    _set(base.orientation, yaw=one.yaw_rad, pitch=0.0, roll=0.0)
+    _set(moving.base_rmse.position, x=x_std, y=y_std, z=_Z_STD_M)
+    _set(base.dimension, length=length, width=width, height=height)
     moving.movement_state = moving.MOVEMENT_STATE_MOVING
     kinds = optional("osi3.osi_object_pb2").MovingObject
-    for said in entity.classification:
-        number, candidate = LABELS.get(said.label, 0), moving.candidate.add()
-        candidate.probability = said.probability
+    for label, probability in _kinds(entity):
+        number, candidate = LABELS.get(label, 0), moving.candidate.add()
+        candidate.probability = probability
         known = kinds.TYPE_VEHICLE if number else kinds.TYPE_UNKNOWN
         candidate.type = kinds.TYPE_PEDESTRIAN if number == _PERSON else known
         if number in _VEHICLES:
@@ -267,6 +344,9 @@ def _fill(moving: Any, one: LaneObject) -> None:
 
 # ODAS sends as many tracks each time, empty ones with id 0.
 _TRACKS = 4
+# ODAS Studio splits the stream at "}", newline, "{", and puts back the brace that is lost only where neither
+# of the two characters before the last is one: hence ODAS's own layout, in which "]" has a line of its own.
+_ODAS_MESSAGE = '{{\n    "timeStamp": {stamp},\n    "src": [\n        {sources}\n    ]\n}}\n'
 
 
 class OdasTracks:
@@ -274,8 +354,8 @@ class OdasTracks:
 
     Examples
     --------
-    >>> OdasTracks().line(WorldState(0, 12))[:60]
-    '{"timeStamp": 12, "src": [{"id": 0, "tag": "", "x": 0.0, "y"'
+    >>> json.loads(OdasTracks().message(WorldState(0, 12)))["timeStamp"]
+    12
     """
 
     def __init__(self) -> None:
@@ -283,15 +363,16 @@ class OdasTracks:
         self._numbers: dict[str, int] = {}
         self._next = count(1)
 
-    def line(self, state: WorldState) -> str:
-        """Return one line: the likeliest moving entities as directions, existence as activity."""
+    def message(self, state: WorldState) -> str:
+        """Return one message: the likeliest moving entities as directions, existence as activity."""
         there = {one.id for one in state.entities}
         self._numbers = {name: number for name, number in self._numbers.items() if name in there}
         moving = [one for one in state.entities if one.moving]
         likeliest = sorted(moving, key=lambda one: -one.existence_probability)[:_TRACKS]
         tracks = [self._track(one) for one in likeliest]
         empty = {"id": 0, "tag": "", "x": 0.0, "y": 0.0, "z": 0.0, "activity": 0.0}
-        return json.dumps({"timeStamp": state.seq, "src": tracks + [empty] * (_TRACKS - len(tracks))})
+        sources = map(json.dumps, tracks + [empty] * (_TRACKS - len(tracks)))
+        return _ODAS_MESSAGE.format(stamp=state.seq, sources=",\n        ".join(sources))
 
     def _track(self, entity: Entity) -> dict[str, object]:
         if entity.id not in self._numbers:
@@ -304,7 +385,7 @@ class OdasTracks:
 
 @contextmanager
 def odas_socket(address: str) -> Iterator[Callable[[WorldState], None]]:
-    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's line."""
+    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's message."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise InvalidArgumentError(f"--export odas: expected HOST:PORT, got {address}")
@@ -315,4 +396,4 @@ def odas_socket(address: str) -> Iterator[Callable[[WorldState], None]]:
         # It has no file name, by which the command would name it.
         raise InvalidArgumentError(f"--export odas: expected a listener at {address} ({error})") from error
     with connection:
-        yield lambda state: connection.sendall((tracks.line(state) + "\n").encode())
+        yield lambda state: connection.sendall(tracks.message(state).encode())

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 from worldstate.adapters.audio.sound_file import Audio, SoundInput, open_audio, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME, Recording
-from worldstate.adapters.export.other_stacks import CROSSING_M, autoware_objects
+from worldstate.adapters.export.other_stacks import CROSSING_M, autoware_objects, is_localised
 from worldstate.adapters.export.scene import SceneItem, SceneLine, SceneTriangles, scene_update
 from worldstate.adapters.files.file_io import atomic_path, check_target, read_json
 from worldstate.adapters.files.odometry_file import OdometryLog
@@ -171,7 +171,8 @@ def _driven(ego: OdometryLog | None, start_ns: int) -> Iterator[_Event]:
         yield stamp_ns, ODOMETRY_TOPIC, types.ODOMETRY, frames | {"twist": {"twist": twist}}
 
 
-ADVISORIES_TOPIC, OBJECTS_TOPIC = "/worldstate/advisories", "/worldstate/objects"
+# Autoware's planners listen for objects there.
+ADVISORIES_TOPIC, OBJECTS_TOPIC = "/worldstate/advisories", "/perception/object_recognition/objects"
 MARKERS_TOPIC, SNAPSHOT_TOPIC = "/worldstate/markers", "/worldstate/snapshot"
 # Of visualization_msgs/Marker.
 ARROW, CUBE, LINE_STRIP, LABEL, TRIANGLE_LIST = 0, 1, 4, 9, 11
@@ -187,7 +188,8 @@ def state_bag(
 
         def write_state(state: WorldState) -> None:
             write(ADVISORIES_TOPIC, types.ADVISORIES, state.stamp_ns, risk_advisories(state))
-            write(OBJECTS_TOPIC, types.OBJECTS, state.stamp_ns, autoware_objects(state, crossing_m))
+            if is_localised(state):
+                write(OBJECTS_TOPIC, types.OBJECTS, state.stamp_ns, autoware_objects(state, crossing_m))
             write(MARKERS_TOPIC, types.MARKERS, state.stamp_ns, scene_markers(state))
             write(SNAPSHOT_TOPIC, types.TEXT, state.stamp_ns, {"data": state.to_json()})
 

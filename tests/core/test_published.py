@@ -102,7 +102,7 @@ def street(
                 SearchedSector(Sector(0.0, 0.5), 80.0, rng.uniform(0.8, 0.9)),
             )
         if hop % 6 == 0:
-            pose = EgoPose((0.02 * hop, 0.01 * hop), 0.001 * hop) if hop % 12 else None
+            pose = EgoPose((0.02 * hop, 0.01 * hop), 0.001 * hop) if hop % 12 == 0 else None
             yield Odometry(
                 "wheels", stamp_ns + 3 * 10**6, rng.uniform(0.0, 0.5), rng.normal() * 0.01, pose=pose
             )

@@ -2,19 +2,27 @@
 
 import json
 import math
+import os
 import re
 import socket
+import subprocess
 import threading
 import uuid
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scripted_states import scripted_states
+from scripted_states import EGO, scripted_states
 
-from worldstate.adapters.export.other_stacks import OdasTracks, autoware_objects, lane_objects
+from worldstate.adapters.export.other_stacks import (
+    OdasTracks,
+    autoware_objects,
+    lane_objects,
+    osi_sensor_data,
+)
 from worldstate.cli.main import main
 
 STATES = scripted_states()
@@ -50,10 +58,87 @@ def test_osi_reads_the_trace_and_finds_every_entity(log, tmp_path):
     last = found[-1].moving_object[0]
     assert last.header.measurement_state == last.header.MEASUREMENT_STATE_MEASURED
     assert (last.base.position.x, last.base.position.y) == PLACED.entities[0].position_m[:2]
+    assert last.base.position.z == 0.5 * last.base.dimension.height, "it is the middle of the box"
     car, unknown = last.candidate
     assert (car.probability, unknown.probability) == (0.7, 0.3)
     assert car.vehicle_classification.type == car.vehicle_classification.TYPE_CAR
     assert found[-2].moving_object[0].header.tracking_id == last.header.tracking_id
+
+
+# Ranges that OSI's definitions name, by the field.
+OSI_RANGES = {
+    "nanos": (0, 999_999_999), "seconds": (0, math.inf), "probability": (0.0, 1.0), "age": (0.0, math.inf),
+    "existence_probability": (0.0, 1.0), "length": (0.0, math.inf), "width": (0.0, math.inf),
+    "height": (0.0, math.inf), "yaw": (-math.pi, math.pi), "pitch": (-math.pi, math.pi),
+    "roll": (-math.pi, math.pi), "value": (0, 2**64 - 2),
+}  # fmt: skip
+OSI_WHOLE = {"Vector3d", "Orientation3d", "Dimension3d", "Timestamp", "InterfaceVersion", "MountingPosition"}
+OSI_NEEDED = {
+    "SensorData": "version timestamp sensor_id mounting_position last_measurement_time moving_object_header",
+    "DetectedEntityHeader": "measurement_time cycle_counter data_qualifier",
+    "DetectedMovingObject": "header base base_rmse movement_state candidate",
+    "DetectedItemHeader": "tracking_id existence_probability age measurement_state",
+    "BaseMoving": "position",
+    "CandidateMovingObject": "probability type",
+}
+
+
+def osi_faults(message, place="SensorData"):
+    """Yield what the rules of OSI refuse of a message, and of the messages in it."""
+    kind, filled = message.DESCRIPTOR, {field.name: value for field, value in message.ListFields()}
+    named = OSI_NEEDED.get(kind.name, "").split()
+    needed = [field.name for field in kind.fields] if kind.name in OSI_WHOLE else named
+    yield from (f"{place}: {name} is not set" for name in set(needed) - filled.keys())
+    for field, value in message.ListFields():
+        for number, part in enumerate(value if field.is_repeated else [value]):
+            inner = f"{place}.{field.name}[{number}]"
+            if field.message_type is not None:
+                yield from osi_faults(part, inner)
+            elif field.enum_type is not None:
+                if part == 0 and field.name != "type":
+                    yield f"{inner} is unknown"
+            else:
+                low, high = OSI_RANGES.get(field.name, (-math.inf, math.inf))
+                if not low <= part <= high:
+                    yield f"{inner} is {part}"
+
+
+def stamp_of(time):
+    return time.seconds * 10**9 + time.nanos
+
+
+def test_osi_messages_keep_the_rules_of_its_definitions():
+    both = HIDDEN.entities[0]
+    several = tuple(replace(both, id=str(uuid.uuid5(uuid.NAMESPACE_OID, str(k)))) for k in range(5))
+    no_class = replace(PLACED, entities=(replace(PLACED.entities[0], classification=()),))
+    before = -1
+    later = [replace(no_class, stamp_ns=10**10), replace(HIDDEN, stamp_ns=10**11, entities=several)]
+    for state in [*STATES, *later]:
+        message = osi_sensor_data(state)
+        assert list(osi_faults(message)) == []
+        assert (message.version.version_major, message.version.version_minor) >= (3, 8)
+        measured = stamp_of(message.moving_object_header.measurement_time)
+        assert before < measured <= stamp_of(message.last_measurement_time) <= stamp_of(message.timestamp)
+        before = stamp_of(message.timestamp)
+        numbers = [one.header.tracking_id.value for one in message.moving_object]
+        assert len(numbers) == len(set(numbers)) == sum(one.moving for one in state.entities)
+        for one in message.moving_object:
+            assert sum(kind.probability for kind in one.candidate) == pytest.approx(1.0)
+            assert one.base_rmse.position.z > 0.0
+
+
+@settings(max_examples=30)
+@given(st.floats(-1.3, 1.3), st.floats(-0.5, 0.5), st.floats(0.0, 15.0), st.floats(-0.3, 0.3))
+def test_a_drive_does_not_move_what_is_seen_across_the_road(azimuth, rate, speed, turning):
+    ego = replace(EGO, speed_mps=speed, yaw_rate_rad_s=turning)
+    seen = replace(STATES[-2].entities[0], azimuth_rad=azimuth, azimuth_rate_rad_s=rate)
+    state = replace(STATES[-2], entities=(seen,), ego=ego)
+    base = osi_sensor_data(state).moving_object[0].base
+    x, y, vx, vy = base.position.x, base.position.y, base.velocity.x, base.velocity.y
+    # OSI's velocity is that in the axes of the vehicle: the azimuth changes as it was seen to.
+    assert (x * vy - y * vx) / (x * x + y * y) == pytest.approx(rate, abs=1e-9)
+    (one,) = lane_objects(state)
+    assert one.velocity_mps[0] == pytest.approx(0.0, abs=1e-9), "over ground it stays in its lane"
 
 
 # As the .msg files of autoware_perception_msgs, geometry_msgs and unique_identifier_msgs say.
@@ -114,12 +199,79 @@ def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lan
         check("PredictedObjects", message)
         ids = [str(uuid.UUID(bytes=bytes(one["object_id"]["uuid"]))) for one in message["objects"]]
         assert ids == [one.id for one in state.entities if one.moving]
+        assert message["header"]["frame_id"] == "map"
     (path,) = json.loads(lines[0])["objects"][0]["kinematics"]["predicted_paths"]
-    ahead = [pose["position"]["x"] for pose in path["path"]]
-    across = [pose["position"]["y"] for pose in path["path"]]
+    # The car stands at (100, 50) with its front along y: ahead of it is y, to its right x.
+    ahead = [pose["position"]["y"] - 50.0 for pose in path["path"]]
+    across = [100.0 - pose["position"]["x"] for pose in path["path"]]
     assert ahead == pytest.approx([9.0] * 7)
     assert np.diff(across) == pytest.approx(-0.5 * 0.5 * 9.0), "at the pace of the usual corner"
-    assert 0.0 < path["confidence"] <= 1.0
+    assert across[0] > 0.0, "it is hidden on the left"
+    for line in lines:
+        for one in json.loads(line)["objects"]:
+            poses = one["kinematics"]["predicted_paths"][0]["path"]
+            at = one["kinematics"]["initial_pose_with_covariance"]["pose"]
+            assert {pose["position"]["z"] for pose in (at, *poses)} == {0.5 * one["shape"]["dimensions"]["z"]}
+
+
+@settings(max_examples=20)
+@given(st.floats(-3.1, 3.1), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0))
+def test_an_object_stands_in_the_map_where_the_car_sees_it_and_is_as_uncertain_as_both(yaw, x, y):
+    ego = replace(EGO, position_m=(x, y), yaw_rad=yaw, covariance=((0.09, 0, 0), (0, 0.09, 0), (0, 0, 0.01)))
+    known = tuple(map(tuple, np.diag([0.25, 1.0, 1.0, 1.0]).tolist()))
+    certain = replace(PLACED.entities[0], covariance=known)
+    (one,) = autoware_objects(replace(PLACED, entities=(certain,), ego=ego))["objects"]
+    pose = one["kinematics"]["initial_pose_with_covariance"]
+    at = complex(pose["pose"]["position"]["x"], pose["pose"]["position"]["y"])
+    seen_m = (at - complex(x, y)) * np.exp(-1j * yaw)
+    assert (seen_m.real, seen_m.imag) == pytest.approx(certain.position_m[:2])
+    turned = 2.0 * math.atan2(pose["pose"]["orientation"]["z"], pose["pose"]["orientation"]["w"])
+    assert np.exp(1j * turned) == pytest.approx(np.exp(1j * (yaw - 0.5 * np.pi))), "it drives to the right"
+    # An error of the car's yaw moves the object by its range.
+    trace = sum(np.reshape(pose["covariance"], (6, 6)).diagonal()[:2])
+    range_m = math.hypot(*certain.position_m[:2])
+    assert trace == pytest.approx(0.25 + 1.0 + 2 * 0.09 + 0.01 * range_m**2)
+
+
+@pytest.mark.parametrize("ego", [None, replace(EGO, localised=False)])
+def test_objects_of_a_car_that_is_nowhere_in_the_map_are_refused(ego, tmp_path, capsys):
+    (tmp_path / "states.jsonl").write_text(replace(HIDDEN, ego=ego).to_json() + "\n")
+    out = tmp_path / "objects.jsonl"
+    assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", f"autoware={out}"]) == 2
+    assert "expected odometry with x_m, y_m and yaw_rad" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_pose_that_is_lost_on_the_way_leaves_states_out(tmp_path):
+    states = [HIDDEN, replace(HIDDEN, seq=90, ego=None), PLACED]
+    (tmp_path / "states.jsonl").write_text("".join(state.to_json() + "\n" for state in states))
+    out = tmp_path / "objects.jsonl"
+    assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", f"autoware={out}"]) == 0
+    assert len(out.read_text().splitlines()) == 2
+
+
+def stops_for(message, least_confidence=0.05, kinds=(0, 1, 2, 3, 4, 5, 6)):
+    """Return the objects that Autoware's intersection module minds, of unknown kind as well."""
+    return [
+        one
+        for one in message["objects"]
+        if one["classification"][0]["label"] in kinds
+        and any(path["confidence"] >= least_confidence for path in one["kinematics"]["predicted_paths"])
+    ]
+
+
+def test_an_existence_of_a_twentieth_stops_nobody():
+    faint = replace(HIDDEN.entities[0], existence_probability=0.05, hidden_probability=0.05, sides=())
+    likely = replace(faint, existence_probability=0.9, hidden_probability=0.9)
+    cue = next(one for one in HIDDEN.cues if one.direction == faint.direction)
+    for entity, within, minded in ((faint, 0.04, 0), (likely, 0.04, 0), (likely, 0.6, 1)):
+        state = replace(HIDDEN, entities=(entity,), cues=(replace(cue, within={"3": within}),))
+        message = autoware_objects(state)
+        assert len(stops_for(message)) == minded
+        (path,) = message["objects"][0]["kinematics"]["predicted_paths"]
+        assert path["confidence"] == pytest.approx(within)
+    in_view = replace(PLACED, entities=(replace(PLACED.entities[0], existence_probability=0.04),))
+    assert not stops_for(autoware_objects(in_view)), "of one in view the existence alone counts"
 
 
 @settings(max_examples=30)
@@ -137,12 +289,33 @@ def test_who_is_only_heard_keeps_the_azimuth_and_its_deviation_in_the_lane(azimu
     assert np.linalg.eigvalsh(one.covariance).min() >= -1e-9
 
 
+def test_the_likeliest_class_comes_first_and_one_is_always_there():
+    doubted = replace(PLACED.entities[0], classification=PLACED.entities[0].classification[::-1])
+    (one,) = autoware_objects(replace(PLACED, entities=(doubted,)))["objects"]
+    assert [said["label"] for said in one["classification"]] == [1, 0]
+    nothing = replace(PLACED, entities=(replace(doubted, classification=()),))
+    assert autoware_objects(nothing)["objects"][0]["classification"] == [{"label": 0, "probability": 1.0}]
+
+
 def test_labels_and_sizes_are_those_of_the_likeliest_class():
     (placed,) = autoware_objects(PLACED)["objects"]
     assert placed["classification"] == [{"label": 1, "probability": 0.7}, {"label": 0, "probability": 0.3}]
     assert placed["shape"]["dimensions"]["x"] == 4.5
     speed = placed["kinematics"]["initial_twist_with_covariance"]["twist"]["linear"]["x"]
     assert speed == pytest.approx(4.0)
+
+
+class OdasStudio:
+    """The rule by which ODAS Studio's socket handler takes messages out of what arrives."""
+
+    def __init__(self):
+        self.rest, self.messages = "", []
+
+    def take(self, text):
+        *whole, self.rest = (self.rest + text).split("}\n{")
+        for part in whole:
+            opened = part if part.startswith("{") else "{" + part
+            self.messages.append(opened if "}" in opened[-3:-1] else opened + "}")
 
 
 def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
@@ -153,15 +326,16 @@ def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
             connection, _ = server.accept()
             with connection:
                 while data := connection.recv(4096):
-                    received.append(data)
+                    received.append(data.decode())
 
         listener = threading.Thread(target=serve)
         listener.start()
         assert main(["log", "replay", str(log), "--export", f"odas=127.0.0.1:{server.getsockname()[1]}"]) == 0
         listener.join(timeout=20.0)
-    # Packets are cut anywhere; a reader of ODAS splits the text where one object ends and the next begins.
-    parts = b"".join(received).decode().rstrip("\n").split("}\n{")
-    tracks = [json.loads("{" * (k > 0) + part + "}" * (k < len(parts) - 1)) for k, part in enumerate(parts)]
+    studio = OdasStudio()
+    for text in (*received, "{"):
+        studio.take(text)
+    tracks = [json.loads(one) for one in studio.messages]
     assert [one["timeStamp"] for one in tracks] == [state.seq for state in STATES]
     for one, state in zip(tracks, STATES, strict=True):
         assert len(one["src"]) == 4
@@ -171,13 +345,55 @@ def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
     assert tracks[0]["src"][0]["id"] == tracks[-1]["src"][0]["id"]
 
 
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=6), st.sets(st.integers(0, 3000), max_size=8))
+def test_odas_messages_are_whole_however_the_stream_is_cut(vehicles, cuts):
+    one, tracks = HIDDEN.entities[0], OdasTracks()
+    ticks = [
+        replace(HIDDEN, seq=tick, entities=tuple(replace(one, id=f"entity-{k}") for k in range(many)))
+        for tick, many in enumerate(vehicles)
+    ]
+    stream, studio, ends = "".join(map(tracks.message, ticks)) + "{", OdasStudio(), [0, *sorted(cuts), None]
+    for first, end in pairwise(ends):
+        studio.take(stream[first:end])
+    found = [json.loads(message) for message in studio.messages]
+    assert [message["timeStamp"] for message in found] == list(range(len(vehicles)))
+    sources = [sum(source["id"] > 0 for source in message["src"]) for message in found]
+    assert sources == [min(many, 4) for many in vehicles]
+
+
+# Listens at a free port, prints what the window of ODAS Studio would be sent, and ends with the connection.
+STUDIO_PROGRAM = """
+const net = require('net'), listen = net.Server.prototype.listen;
+net.Server.prototype.listen = function (port, then) { return listen.call(this, 0, '127.0.0.1', then); };
+const send = (name, text) => {
+  if (name === 'newTracking') console.log('got ' + JSON.stringify(JSON.parse(text)));
+  if (name === 'remote-offline') process.exit(0);
+};
+const studio = { mainWindow: { webContents: { send } }, odas: {} };
+require(require('path').resolve(process.argv[1], 'servers.js')).startTrackingServer(studio);
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("ODAS_STUDIO" not in os.environ, reason="ODAS_STUDIO names no checkout of odas_web")
+def test_the_handler_of_odas_studio_gets_every_message_but_the_last(log):
+    command = ["node", "-e", STUDIO_PROGRAM, os.environ["ODAS_STUDIO"]]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as node:
+        port = re.search(r'"port":(\d+)', node.stdout.readline())[1]
+        assert main(["log", "replay", str(log), "--export", f"odas=127.0.0.1:{port}"]) == 0
+        printed, _ = node.communicate(timeout=60.0)
+    got = [json.loads(line[4:]) for line in printed.splitlines() if line.startswith("got ")]
+    # It takes a message when the next begins.
+    assert [one["timeStamp"] for one in got] == [state.seq for state in STATES[:-1]]
+
+
 def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgotten():
     tracks, numbers = OdasTracks(), []
     with_entity = next(state for state in STATES if state.entities)
     for hop in range(200):
         one = replace(with_entity.entities[0], id=f"entity-{hop}", moving=True)
-        line = json.loads(tracks.line(replace(with_entity, entities=(one,))))
-        numbers.append(line["src"][0]["id"])
+        message = json.loads(tracks.message(replace(with_entity, entities=(one,))))
+        numbers.append(message["src"][0]["id"])
     assert numbers == list(range(1, 201)) and len(tracks._numbers) == 1
 
 

@@ -236,7 +236,7 @@ def ego_of(ego: EgoBelief) -> Ego:
     """Return the ego vehicle as it is published."""
     x, y, yaw = ego.pose.round(_DIGITS).tolist()
     covariance = tuple(map(tuple, ego.covariance.round(_DIGITS).tolist()))
-    return Ego((x, y), yaw, covariance, ego.speed_mps, ego.yaw_rate_rad_s)
+    return Ego((x, y), yaw, covariance, ego.speed_mps, ego.yaw_rate_rad_s, ego.localised)
 
 
 def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:

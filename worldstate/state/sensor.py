@@ -107,6 +107,8 @@ class Ego:
         Of (x, y, yaw).
     speed_mps, yaw_rate_rad_s : float
         Along its x axis and about its z axis, left positive.
+    localised : bool
+        Whether odometry has told the pose; else it is added up from where the first speed found the vehicle.
 
     Examples
     --------
@@ -119,6 +121,7 @@ class Ego:
     covariance: tuple[tuple[float, ...], ...]
     speed_mps: float
     yaw_rate_rad_s: float
+    localised: bool = field(default=False, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)

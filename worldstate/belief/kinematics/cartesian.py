@@ -15,13 +15,13 @@ drives in a time t the chord
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
 
 from worldstate.ground import FloatArray, wrap_angle
-from worldstate.ground.serialisation import Via
+from worldstate.ground.serialisation import ADDED, Via
 from worldstate.measurement import Odometry, Position
 
 from .motion import (
@@ -197,7 +197,7 @@ _SQUARE = Via(FloatArray, np.ravel, lambda row: row.reshape(3, 3))
 class EgoBelief:
     """Gaussian over the pose (x, y, yaw) in the map frame, and the twist that holds.
 
-    Shapes: pose (3,), covariance (3, 3).
+    Shapes: pose (3,), covariance (3, 3). It is `localised` once odometry has told a pose.
     """
 
     pose: Annotated[FloatArray, _ROW]
@@ -206,6 +206,7 @@ class EgoBelief:
     yaw_rate_rad_s: float
     speed_std_mps: float
     yaw_rate_std_rad_s: float
+    localised: bool = field(default=False, metadata=ADDED)
 
 
 def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
@@ -236,4 +237,4 @@ def corrected(ego: EgoBelief | None, told: Odometry) -> EgoBelief:
         pose = np.array([*at.position_m, at.yaw_rad])
         covariance = np.diag([at.position_std_m**2] * 2 + [at.yaw_std_rad**2])
     twist = told.speed_mps, told.yaw_rate_rad_s, told.speed_std_mps, told.yaw_rate_std_rad_s
-    return EgoBelief(pose, covariance, *twist)
+    return EgoBelief(pose, covariance, *twist, told.pose is not None or (ego is not None and ego.localised))
