@@ -5,8 +5,8 @@ from tempfile import TemporaryDirectory
 
 from tutorial_options import tutorial_options
 
-from worldstate import WorldState
-from worldstate.adapters import listen, open_source
+from worldstate import WorldState, listen
+from worldstate.adapters import open_source
 from worldstate.operations.figure_style import DECISION, HIDDEN, SIDE_DASHES, TRUTH, figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 

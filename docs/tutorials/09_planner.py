@@ -7,14 +7,13 @@ import numpy as np
 from tutorial_options import tutorial_options
 from worldstate_lab.planner.encounters import EgoVehicle
 
-from worldstate import WorldState
-from worldstate.adapters import listen, open_source
+from worldstate import WorldState, listen
+from worldstate.adapters import open_source
 from worldstate.operations.figure_style import CATEGORIES, figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 
 EGO, HOP_S, BEGINS_M = EgoVehicle(), 0.1, 20.0
-# Chance from which on a vehicle is assumed; .01 is a choice: `worldstate-lab planner` sets it on streams.
-THRESHOLDS = {"no knowledge": np.inf, "phantom": 0.0, "chance": 0.01}
+THRESHOLDS = {"no knowledge": np.inf, "phantom": 0.0, "chance": 0.01}  # .01 is a choice, `planner` sets it
 
 
 def chance(state: WorldState) -> float:
