@@ -116,7 +116,7 @@ def command_line() -> str:
     from worldstate.cli.main import PROGRAM
 
     title = "The command line"
-    lines = [title, "=" * len(title), "", "What every command keeps to is told in :doc:`/commands`.", ""]
+    lines = [title, "=" * len(title), "", "What every command keeps to is told in :doc:`/reference/commands`.", ""]
     for group in ("", *PROGRAM.groups):
         for name in PROGRAM.members(group):
             words = f"{group} {name}".strip()
@@ -127,9 +127,9 @@ def command_line() -> str:
 
 
 def write(app: "Sphinx") -> None:
-    """Write the pages below reference/, touching none that has not changed."""
-    folder = Path(app.srcdir) / "reference"
-    folder.mkdir(exist_ok=True)
+    """Write the pages below reference/api/, touching none that has not changed."""
+    folder = Path(app.srcdir) / "reference" / "api"
+    folder.mkdir(parents=True, exist_ok=True)
     exported = exports()
     home = homes(exported)
     app.reference_homes = home  # type: ignore[attr-defined]

@@ -356,7 +356,7 @@ def test_bearings_of_all_approaches_are_gated_together(streets):
 
 
 def test_the_method_of_the_documentation_joins_by_one_line(streets):
-    page = Path(__file__).resolve().parents[2] / "docs" / "evaluation.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "evidence" / "evaluation.md"
     (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     names: dict[str, type] = {}
     exec(compile(program, str(page), "exec"), names)

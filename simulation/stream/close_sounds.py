@@ -3,7 +3,7 @@
 Streets are rendered at junctions. What hears with one microphone has to hold for other places and recorders,
 too: here a vehicle passes or idles in the open, any other sound stands in a yard or a room, both over noise
 of a drawn colour and through a drawn frequency response. Fluctuations, tones and their spread are held to
-those of real recordings (docs/foreign_sounds.md).
+those of real recordings (docs/evidence/foreign_sounds.md).
 """
 
 from dataclasses import replace

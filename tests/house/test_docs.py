@@ -95,7 +95,7 @@ def test_files_that_a_page_names_exist(page):
 
 
 def test_the_programs_of_the_first_page_run(approach, tmp_path, monkeypatch, capsys):
-    text = (ROOT / "docs" / "first_program.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "guide" / "first_program.md").read_text(encoding="utf-8")
     (tmp_path / "out" / "demo").mkdir(parents=True)
     (tmp_path / "out" / "demo" / "recording").symlink_to(approach.folder.parents[2])
     monkeypatch.chdir(tmp_path)

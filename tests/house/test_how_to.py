@@ -1,4 +1,4 @@
-"""The recipes of docs/how_to.md run as they are printed, by section, on small files of their names."""
+"""The recipes of docs/guide/how_to.md run as they are printed, by section, on small files of their names."""
 
 import json
 import re
@@ -20,7 +20,7 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "adapters")]
 from passing_boxes import passing  # noqa: E402
 from test_detectors import FORMS, model_file  # noqa: E402
 
-PAGE = (ROOT / "docs" / "how_to.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "guide" / "how_to.md").read_text(encoding="utf-8")
 SECTIONS = dict(re.findall(r"^## (.*)\n([\s\S]*?)(?=^## |\Z)", PAGE, flags=re.MULTILINE))
 SIZE = 480, 320
 WIDTH_PX = 1936.0  # Of the camera that is assumed where none is given

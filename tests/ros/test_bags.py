@@ -529,7 +529,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, capsys):
 
 
 def test_the_program_of_the_page_runs(bag_of_approach, tmp_path, monkeypatch):
-    page = Path(__file__).resolve().parents[2] / "docs" / "ros.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "ros.md"
     (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     (tmp_path / "street_bag").symlink_to(bag_of_approach)
     monkeypatch.chdir(tmp_path)

@@ -182,7 +182,7 @@ def test_an_unknown_sound_is_refused_by_name():
 
 
 def test_the_documentation_lists_every_sound_with_its_level():
-    text = (Path(__file__).parents[2] / "docs/simulation.md").read_text()
+    text = (Path(__file__).parents[2] / "docs/evidence/simulation.md").read_text()
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
     for kind in SOUNDS.values():
         cells = [cell.strip() for cell in rows[kind.name].strip("|").split("|")]
