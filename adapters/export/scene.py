@@ -196,15 +196,14 @@ _HEIGHT_M = {"occluder": 0.0, "searched": 0.02, "cue": 0.04, "entity": 0.06}
 # Triangles of a sector span at most this.
 _STEP_RAD = math.radians(5.0)
 _CAR = Xyz(4.5, 1.8, 1.5)
-# The palette of the figures (Okabe and Ito).
-_GREY, _RED, _BLUE, _GREEN, _PURPLE, _ORANGE, _SKY = (
+# The palette of the figures, by meaning; grey is what hides. Decisions are lighter: viewers are dark.
+_GREY, _HIDDEN, _IN_VIEW, _SEARCHED, _DECISION, _HEARD = (
     (0.5, 0.5, 0.5),
     (0.835, 0.369, 0.0),
     (0.0, 0.447, 0.698),
     (0.0, 0.62, 0.451),
+    (0.5, 0.42, 0.9),
     (0.8, 0.475, 0.655),
-    (0.902, 0.624, 0.0),
-    (0.337, 0.706, 0.914),
 )
 
 
@@ -234,7 +233,7 @@ def srp_scene(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> S
     level = srp / max(float(np.median(srp)), np.finfo(np.float64).tiny)
     radii = SRP_M * np.clip(level, 0.0, 2.0)
     points = tuple(map(_at, azimuths_rad.tolist(), radii.tolist()))
-    line = SceneLine(0, points, Rgba(*_SKY, 1.0))
+    line = SceneLine(0, points, Rgba(*_HEARD, 1.0))
     removal = SceneRemoval(SceneTime.of_ns(state.stamp_ns))
     return SceneUpdate((removal,), (_item(state, "srp", lines=(line,)),))
 
@@ -287,7 +286,7 @@ def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:
 
 
 def _searched(state: WorldState, view: SearchedView) -> SceneItem:
-    color = Rgba(*(_PURPLE if view.found else _GREEN), 0.25)
+    color = Rgba(*_SEARCHED, 0.4 if view.found else 0.15)
     pairs = _pairs(found=view.found, miss_rate=view.miss_rate, clutter_rate=view.clutter_rate)
     shape = _sector(view.sector_rad, SEARCHED_M, color, "searched")
     return _item(state, f"searched {view.sensor}", metadata=pairs, triangles=(shape,))
@@ -297,12 +296,13 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
     """Draw the risk of a side, the denser the higher, and in words what comes within three seconds."""
     sector_rad = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
     raised = cue.advisory is not None
-    shape = _sector(sector_rad, CUE_M, Rgba(*(_RED if raised else _ORANGE), 0.05 + 0.5 * cue.risk), "cue")
+    color = Rgba(*(_DECISION if raised else _HIDDEN), 0.05 + 0.5 * cue.risk)
+    shape = _sector(sector_rad, CUE_M, color, "cue")
     said = f"{cue.direction}: risk {_short(cue.risk)}"
     if cue.within is not None and "3" in cue.within:
         said += f", in 3 s {_short(cue.within['3'])}"
     said += " ADVISORY" if raised else ""
-    text = _text(cue.azimuth_rad, CUE_M + 2.0, said, _RED if raised else _GREY)
+    text = _text(cue.azimuth_rad, CUE_M + 2.0, said, _DECISION if raised else _GREY)
     pairs = _pairs(risk=cue.risk, confidence=cue.confidence, advisory=raised, within=cue.within)
     return _item(state, f"cue {cue.direction}", metadata=pairs, triangles=(shape,), texts=(text,))
 
@@ -310,7 +310,7 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
 def _entity(state: WorldState, entity: Entity) -> SceneItem:
     """Draw where it is in nine of ten cases, and where it will be; a box only where a position is known."""
     hidden = entity.status == "hidden"
-    color = _RED if hidden else _BLUE
+    color = _HIDDEN if hidden else _IN_VIEW
     density = entity.existence_probability
     sector_rad = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
     shapes = (_sector(sector_rad, SECTOR_M, Rgba(*color, 0.05 + 0.3 * density), "entity"),)

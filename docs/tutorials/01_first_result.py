@@ -3,6 +3,7 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 from tutorial_options import tutorial_options
 
 from worldstate import WorldState, listen
@@ -31,11 +32,11 @@ def main(out: Path, size: str = "full") -> None:
             time_s = [state.stamp_ns / 1e9 for state in states]
             t0_s = open_source(Path(root) / row.folder).t0_s
             warned = []
-            for side, dashes in DASHES.items():
+            for y, (side, dashes) in zip((0.97, 0.9), DASHES.items(), strict=True):
                 axes.plot(time_s, [chance(s, side) for s in states], dashes, color=HIDDEN, label=side)
                 on = [any(c.advisory and c.direction == side for c in state.cues) for state in states]
                 warned += [f"{side} at {time_s[on.index(True)]:.1f} s"] if any(on) else []
-                axes.fill_between(time_s, 0.0, 1.0, where=on, color=DECISION, alpha=0.12, linewidth=0)
+                axes.plot(time_s, np.where(on, y, np.nan), dashes, color=DECISION, lw=3.0)
             came = f"from the {row.approach}" if row.approach != "none" else "no vehicle comes"
             if row.approach != "none" and t0_s is not None:
                 axes.axvline(t0_s, color=TRUTH, linestyle=":")

@@ -25,11 +25,11 @@ def main(out: Path, size: str = "full") -> None:
             states = list(listen(Path(root) / row.folder))
             time_s = np.array([state.stamp_ns / 1e9 for state in states])
             risk, speed = grid[:, number]
-            for side, dashes in zip(("left", "right"), SIDE_DASHES, strict=False):
+            for side, dashes, y in zip(("left", "right"), SIDE_DASHES, (0.97, 0.9), strict=False):
                 cues = [next(c for c in state.cues if c.direction == side) for state in states]
                 risk.plot(time_s, [cue.risk for cue in cues], dashes, color=HIDDEN, label=side)
                 on = [cue.advisory is not None for cue in cues]
-                risk.fill_between(time_s, 0.0, 1.0, where=on, color=DECISION, alpha=0.12, linewidth=0)
+                risk.plot(time_s, np.where(on, y, np.nan), dashes, color=DECISION, linewidth=3.0)
                 print(f"{site}, {approach}: {side} at most {max(c.risk for c in cues):.2f}, ", end="")
                 print(f"advisory in {sum(on)} of {len(on)} hops")
             if approach != "none":

@@ -46,7 +46,7 @@ def main(out: Path, size: str = "full") -> None:
             states = [one for one in listen(Path(root) / row.folder) if one.stamp_ns >= begins_ns]
             for (name, threshold), colour in zip(THRESHOLDS.items(), CATEGORIES, strict=False):
                 beyond_m, speed = drive(states, threshold)
-                axes.plot(beyond_m, 3.6 * speed, color=colour, label=name)
+                axes.plot(beyond_m, 3.6 * speed, "--" if name == "chance" else "-", color=colour, label=name)
                 slow_s = HOP_S * np.sum((speed < EGO.limit_mps - 0.1) & (beyond_m < 0.0))
                 there = beyond_m[round(BEGINS_M / EGO.limit_mps / HOP_S)]
                 print(f"{row.environment} {row.approach}: {name} {slow_s:.1f} s slowed, {there:+.0f} m at T0")

@@ -40,7 +40,7 @@ def write_street_figure(stages: Sequence[tuple[str, LearnedStreet]], path: Path)
     """
     columns = min(len(stages), _COLUMNS)
     rows = math.ceil(len(stages) / columns)
-    with figure_file(path, 4.6 * columns, 2.3 * rows) as figure:
+    with figure_file(path, 4.6 * columns, 1.9 * rows) as figure:
         for number, (title, street) in enumerate(stages, start=1):
             axes = figure.add_subplot(rows, columns, number)
             for occluder, arm in zip(context_of(street).occluders, street.arms, strict=True):
@@ -84,7 +84,7 @@ def write_pass_figure(
     passes: Sequence[PassLabel], path: Path, title: str, truth: Sequence[TrueTrack] = ()
 ) -> None:
     """Draw every pass seen from above, the ego at the origin and looking up."""
-    with figure_file(path, 8.5, 3.4) as figure:
+    with figure_file(path, 8.5, 2.8) as figure:
         axes = figure.add_subplot(title=title)
         draw_passes(axes, passes, truth)
         legend_beside(axes)

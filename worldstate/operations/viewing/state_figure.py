@@ -44,7 +44,7 @@ _NOTHING, _FOUND = 0.15, 0.4
 _LEGEND = (
     ("hidden vehicle, and risk", style.HIDDEN, 0.4),
     ("vehicle in view", style.IN_VIEW, 0.35),
-    ("advisory", style.DECISION, 0.4),
+    ("advisory", style.DECISION, 1.0),
     ("searched, nothing found", style.SEARCHED, _NOTHING),
     ("searched, found", style.SEARCHED, _FOUND),
     ("behind an occluder", "0.5", 0.2),
@@ -324,7 +324,9 @@ def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
     """Draw the risk, and say it on the cue's own side below the ego, where no sector lies."""
     raised = cue.advisory is not None
     sector = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
-    _wedge(axes, sector, CUE_M, style.DECISION if raised else style.HIDDEN, 0.05 + 0.5 * cue.risk)
+    _wedge(axes, sector, CUE_M, style.HIDDEN, 0.05 + 0.5 * cue.risk)
+    if raised:
+        _wedge(axes, sector, CUE_M, style.DECISION, 1.0, fill=False, lw=3.0, zorder=1.5)
     within = "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
     said = f"{cue.direction}{': ADVISORY' if raised else ''}\nrisk {cue.risk:.2f}{within}"
     left = cue.azimuth_rad > 0.0
@@ -358,12 +360,15 @@ def _draw_legend(axes: "Axes") -> None:
     axes.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncol=3)
 
 
-def _wedge(axes: "Axes", sector_rad: tuple[float, float], radius_m: float, color: Any, alpha: float) -> None:
+def _wedge(
+    axes: "Axes", sector_rad: tuple[float, float], radius_m: float, color: str, alpha: float, **drawn: Any
+) -> None:
     from matplotlib.patches import Wedge
 
     # Ahead is up: matplotlib's angles begin at the right, and turn to the left too.
     first, last = (math.degrees(azimuth) + 90.0 for azimuth in sector_rad)
-    axes.add_patch(Wedge((0.0, 0.0), radius_m, first, last, color=color, alpha=min(alpha, 1.0), lw=0))
+    drawn = {"color": color, "alpha": min(alpha, 1.0), "lw": 0, **drawn}
+    axes.add_patch(Wedge((0.0, 0.0), radius_m, first, last, **drawn))
 
 
 def _at(azimuth_rad: float, radius_m: float) -> tuple[float, float]:
