@@ -7,7 +7,7 @@ SHELL := /bin/sh
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo check test slow mutations lint schema docs matrix dist clean
+.PHONY: demo check test slow mutations lint schema docs locked audit matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -64,6 +64,18 @@ docs: $(VENV)/.docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html -d out/doctrees docs out/docs
 	@! grep -rnE '(src|srcset)="https?:|<link[^>]*href="https?:|url\(.?https?:|@import' out/docs --include='*.html' --include='*.css'
 	@echo out/docs/index.html
+
+# What is installed here becomes what CI tests; from an empty environment, `make clean` first, the newest.
+locked: $(VENV)/.test $(VENV)/.docs
+	head -2 locked.txt > out.locked
+	$(BIN)/pip freeze --exclude-editable | grep '==' >> out.locked
+	mv out.locked locked.txt
+
+# Known vulnerabilities of those versions; it needs an index of advisories, and says where none can be reached.
+audit:
+	$(PYTHON) -m venv out/audit
+	out/audit/bin/pip install -q --disable-pip-version-check pip-audit
+	out/audit/bin/pip-audit -r locked.txt --no-deps --disable-pip
 
 # Oldest and newest releases of what the library needs, on every Python from 3.11 to 3.13 that is here.
 matrix:

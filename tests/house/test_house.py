@@ -133,3 +133,14 @@ def test_everything_can_be_imported_at_once():
 def test_it_runs_as_a_module_and_names_its_version(command):
     done = subprocess.run([sys.executable, *command, "--version"], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["worldstate", worldstate.__version__]
+
+
+def test_the_lock_holds_every_requirement():
+    def plain(requirement: str) -> str:
+        return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
+
+    locked = {plain(line) for line in (ROOT / "locked.txt").read_text("utf-8").splitlines() if "==" in line}
+    project = PROJECT["project"]
+    extras = [one for name, one in project["optional-dependencies"].items() if name not in ("peers", "rerun")]
+    wanted = {plain(one) for group in (project["dependencies"], *extras) for one in group}
+    assert wanted - locked == {"worldstate"}

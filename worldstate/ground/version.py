@@ -1,3 +1,3 @@
 """The version, in one place: packaging, the command line and what is written to files read it here."""
 
-__version__ = "0.3.0.dev0"
+__version__ = "0.3.0"
