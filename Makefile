@@ -68,7 +68,7 @@ docs: $(VENV)/.docs
 # What is installed here becomes what CI tests; from an empty environment, `make clean` first, the newest.
 locked: $(VENV)/.test $(VENV)/.docs
 	head -2 locked.txt > out.locked
-	$(BIN)/pip freeze --exclude-editable | grep '==' >> out.locked
+	$(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | grep '==' >> out.locked
 	mv out.locked locked.txt
 
 # Known vulnerabilities of those versions; it needs an index of advisories, and says where none can be reached.

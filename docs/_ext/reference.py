@@ -116,7 +116,8 @@ def command_line() -> str:
     from worldstate.cli.main import PROGRAM
 
     title = "The command line"
-    lines = [title, "=" * len(title), "", "What every command keeps to is told in :doc:`/reference/commands`.", ""]
+    kept = "What every command keeps to is told in :doc:`/reference/commands`."
+    lines = [title, "=" * len(title), "", kept, ""]
     for group in ("", *PROGRAM.groups):
         for name in PROGRAM.members(group):
             words = f"{group} {name}".strip()

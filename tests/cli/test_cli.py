@@ -211,7 +211,8 @@ def test_own_array_and_sound_give_the_same_as_the_folder(approach, tmp_path, cap
 def test_the_help_names_every_exit_code(capsys):
     main(["--help"])
     text = capsys.readouterr().out.partition("exit codes:")[2].replace("\n", " ")
-    page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
+    root = Path(__file__).resolve().parents[2]
+    page = (root / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     for code in ("0", "1", "2", "130", "143"):
         assert f" {code} " in text
         assert re.search(rf"^\|.*\b{code}\b.*\|", page, flags=re.MULTILINE)

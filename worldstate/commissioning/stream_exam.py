@@ -274,8 +274,8 @@ def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
 
 
 # What OVAD's 56 microphones reach with the model that ships, in 621 loud approaches and ten hours without
-# hazards (seeds 9 to 13 of the exam; docs/evidence/commission.md). Its window model knows real windows of these
-# junctions.
+# hazards (seeds 9 to 13 of the exam; docs/evidence/commission.md). Its window model knows real windows of
+# these junctions.
 REFERENCE: Mapping[str, float] = {
     "detected": 0.915,
     "lead_s": 2.24,
