@@ -247,8 +247,8 @@ _FOLDS, _SITES_OF_SOUNDS = 5, 8  # More of either cost minutes
 _EVERY = 8  # Neighbouring hops share nineteen twentieths of their sound
 _FIGURES = 5  # Of a coefficient in the file, which is a fifth as long
 # Chosen on real clips, of which nothing is learned (docs/evidence/foreign_sounds.md): the least threshold at
-# which .15 of the hops of idling engines are called foreign, and log-odds of a signal over all that is foreign
-# at which .7 of those of sirens are told.
+# which .15 of the hops of idling engines are called foreign, and log-odds of a signal over all that is
+# foreign at which .7 of those of sirens are told.
 REAL_THRESHOLD, SIGNAL_NATS = 2.2, -3.0
 CHOSEN_FOR_GUARD = (
     f"guard's least threshold {REAL_THRESHOLD} and its signals at {SIGNAL_NATS} nats chosen on real clips: 82"
