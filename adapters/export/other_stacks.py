@@ -7,13 +7,14 @@ import json
 import math
 import socket
 import struct
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -300,15 +301,66 @@ def _set(part: Any, **values: float) -> None:
 
 @contextmanager
 def osi_trace(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes states to a single-channel trace: length, little endian, and message."""
+    """Lend a function that writes states to a trace: of one channel, or multi-channel where it ends in .mcap.
+
+    The name of the latter is extended to OSI's convention, of which the number of states is a part.
+    """
     check_extra("osi3")
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    many, states = path.suffix.lower() == ".mcap", count()
+    opened = _osi_mcap if many else _osi_lengths
+    with atomic_path(path) as temporary, temporary.open("wb") as file, opened(file) as write:
+        yield lambda state: write(osi_sensor_data(state, crossing_m), next(states))
+    if many:
+        path.rename(path.with_name(_osi_name(path.name, next(states))))
 
-        def write(state: WorldState) -> None:
-            message = osi_sensor_data(state, crossing_m).SerializeToString()
-            file.write(struct.pack("<I", len(message)) + message)
 
-        yield write
+@contextmanager
+def _osi_lengths(file: BinaryIO) -> Iterator[Callable[[Any, int], None]]:
+    """Lend a function that writes a message after its length, little endian."""
+
+    def write(data: Any, number: int) -> None:
+        message = data.SerializeToString()
+        file.write(struct.pack("<I", len(message)) + message)
+
+    yield write
+
+
+@contextmanager
+def _osi_mcap(file: BinaryIO) -> Iterator[Callable[[Any, int], None]]:
+    """Lend a function that writes a message to OSI's multi-channel trace."""
+    osi, protobuf = _osi_versions()
+    writer = optional("mcap.writer").Writer(file)
+    writer.start()
+    bounds = {f"{bound}_osi_version": osi for bound in ("min", "max")}
+    bounds |= {f"{bound}_protobuf_version": protobuf for bound in ("min", "max")}
+    writer.add_metadata("net.asam.osi.trace", {"version": osi} | bounds)
+    kind = optional("osi3.osi_sensordata_pb2").SensorData
+    schema = optional("mcap_protobuf.schema").register_schema(writer, kind)
+    about = {"osi_version": osi, "protobuf_version": protobuf}
+    told = {f"net.asam.osi.trace.channel.{key}": version for key, version in about.items()}
+    channel = writer.register_channel("SensorData", "protobuf", schema, told)
+
+    def write(data: Any, number: int) -> None:
+        stamp_ns = data.timestamp.seconds * 1_000_000_000 + data.timestamp.nanos
+        writer.add_message(channel, stamp_ns, data.SerializeToString(), stamp_ns, number)
+
+    yield write
+    writer.finish()
+
+
+def _osi_versions() -> tuple[str, str]:
+    """Return the versions of OSI and of protobuf."""
+    described = optional("osi3.osi_version_pb2")
+    version = described.DESCRIPTOR.GetOptions().Extensions[described.current_interface_version]
+    osi = f"{version.version_major}.{version.version_minor}.{version.version_patch}"
+    return osi, str(optional("google.protobuf").__version__)
+
+
+def _osi_name(name: str, states: int) -> str:
+    """Return a trace's name by OSI's convention: time, type, versions without dots, messages, own name."""
+    written = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    osi, protobuf = (version.replace(".", "") for version in _osi_versions())
+    return f"{written}_sd_{osi}_{protobuf}_{states}_{name}"
 
 
 def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:

@@ -65,6 +65,25 @@ def test_osi_reads_the_trace_and_finds_every_entity(log, tmp_path):
     assert found[-2].moving_object[0].header.tracking_id == last.header.tracking_id
 
 
+def test_osi_reads_its_mcap_under_the_name_that_it_names(log, tmp_path):
+    from google.protobuf import __version__ as protobuf
+    from osi3trace.osi_trace import OSITrace
+
+    assert main(["log", "replay", str(log), "--export", f"osi={tmp_path / 'street.mcap'}"]) == 0
+    (path,) = tmp_path.iterdir()
+    pattern = r"\d{8}T\d{6}Z_sd_3\d\d_" + protobuf.replace(".", "") + rf"_{len(STATES)}_street\.mcap"
+    assert re.fullmatch(pattern, path.name)
+    trace = OSITrace(str(path), type_name="SensorData")
+    assert list(trace) == [osi_sensor_data(state) for state in STATES]
+    (about,) = trace.get_file_metadata()
+    versions = {"version"} | {f"{end}_{of}_version" for end in ("min", "max") for of in ("osi", "protobuf")}
+    assert (about.name, set(about.metadata)) == ("net.asam.osi.trace", versions)
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in about.metadata.values())
+    channel = "net.asam.osi.trace.channel"
+    assert set(trace.get_channel_metadata()) == {f"{channel}.osi_version", f"{channel}.protobuf_version"}
+    trace.close()
+
+
 # Ranges that OSI's definitions name, by the field.
 OSI_RANGES = {
     "nanos": (0, 999_999_999), "seconds": (0, math.inf), "probability": (0.0, 1.0), "age": (0.0, math.inf),

@@ -39,7 +39,7 @@ def add_output_options(parser: argparse.ArgumentParser) -> "argparse._ArgumentGr
       mcap=FILE            snapshots and scene for Foxglove
       foxglove[=PORT]      the same on a websocket, in real time (8765)
       rerun=FILE           the same for the Rerun viewer
-      osi=FILE             a trace of ASAM OSI SensorData
+      osi=FILE             a trace of ASAM OSI SensorData; of NAME.mcap one in MCAP under OSI's file name
       autoware=FILE        Autoware's PredictedObjects, one a line
       odas=HOST:PORT       tracks as ODAS sends them; ODAS Studio listens at port 9000
       rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3 in that storage
