@@ -7,7 +7,7 @@ SHELL := /bin/sh
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo check test slow mutations lint schema docs locked audit matrix dist clean
+.PHONY: demo check test slow mutations lint schema figures docs locked audit matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -54,6 +54,10 @@ lint: $(VENV)/.test
 # After a change of the types of snapshots or scenes.
 schema: $(VENV)/.core
 	$(BIN)/python docs/_ext/json_schema.py
+
+# After `worldstate-lab ... --results docs/evidence/results.json`: the figures of the pages.
+figures:
+	$(PYTHON) docs/_ext/figures.py
 
 # Warnings are errors, and a page that would load something from the network is one too.
 $(VENV)/.docs: $(VENV)/bin/python pyproject.toml

@@ -104,3 +104,13 @@ def test_the_programs_of_the_first_page_run(approach, tmp_path, monkeypatch, cap
     printed = capsys.readouterr().out
     assert "hidden vehicle" in printed
     assert "alpha None" in printed
+
+
+def test_figures_are_those_that_the_laboratory_wrote():
+    import figures
+
+    texts = figures.pages()
+    assert [path.name for path, text in texts.items() if path.read_text("utf-8") != text] == []
+    # A figure without its number would not be found.
+    readme = texts[ROOT / "README.md"]
+    assert len(re.findall(r"[\d\]] <!-- [\w.]+ -->", readme)) == readme.count("<!--") >= 10
