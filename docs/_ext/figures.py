@@ -1,8 +1,8 @@
 """Figures of the pages, each taken by name from what the laboratory wrote: `make figures`.
 
-`docs/evidence/results.json` holds what `worldstate-lab ... --results` kept, `docs/evidence/figures.csv` gives a
-figure a name: the key of its command, where it stands in the report, and how it is written. On a page a name
-in a comment follows the figure: ``.983 <!-- standing.auroc -->``. Two pages cannot differ.
+`docs/evidence/results.json` holds what `worldstate-lab ... --results` kept, `docs/evidence/figures.csv` gives
+a figure a name: the key of its command, where it stands in the report, and how it is written. On a page a
+name in a comment follows the figure: ``.983 <!-- standing.auroc -->``. Two pages cannot differ.
 """
 
 import csv
@@ -45,13 +45,14 @@ def page_of_results(results: dict[str, Any]) -> str:
     """Return the page that lists every figure with its sample and command."""
     lines = [
         "# Results\n",
-        "Every figure of the other pages that has a name, with the command that made it. Intervals are 95 %.\n",
+        "Every figure that has a name on other pages, with the command that made it. Intervals are 95 %.\n",
         "| figure | value | sample | command | commit |",
         "|---|---|---|---|---|",
     ]
     for row in rows():
         made = results[row["key"]]
-        cells = row["what"], written(row, results), row["sample"], f"`{made['command']}`", str(made["commit"])[:8]
+        by = f"`{made['command']}`", str(made["commit"])[:8]
+        cells = row["what"], written(row, results), row["sample"], *by
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
