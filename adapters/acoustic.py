@@ -50,6 +50,8 @@ _DEAD, _CLIPPED = (0.5, 0.85), (0.1, 0.5)
 _LOUD_DB, _MOST_MASKED = (6.0, 15.0), 0.75
 # Above, nothing that is worth a reason.
 _SAID = 0.95
+# Why little is heard beside a sound that the guard calls foreign.
+FOREIGN = "a sound that the models do not know"
 # Of a bearing: with a larger one the whole side is searched for co-evidence instead of a sector. Up to there
 # nine of ten simulated vehicles in view lie in the sector that the camera is asked about.
 _COARSE_STD_RAD = math.radians(25.0)
@@ -254,13 +256,16 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if self._grounding is not None:
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         domain, kinds = self._recognised(frame)
+        share = unheard.heard
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
+            share = heard_beside(domain, share)
         # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
         reader = self._sequence
         sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
         return replace(
             unheard,
+            heard=share,
             signature=signature,
             bearing=bearing,
             approach=approach,
@@ -319,6 +324,16 @@ def heard_of(frame: AcousticFrame) -> Heard:
         left += [(falling(dead, _DEAD), "dead channels"), (falling(health.clipped, _CLIPPED), "clipped")]
     share, reason = min(left, key=itemgetter(0))
     return Heard(share, reason if share < _SAID else None, frame.excess_db)
+
+
+def heard_beside(foreign: Foreign, heard: Heard) -> Heard:
+    """Return how likely a hidden vehicle would have been noticed beside a sound that is not known.
+
+    As likely as the sound is not foreign: a model that was not made for it reads neither a vehicle nor
+    silence in it, and what was believed before is carried on.
+    """
+    share = heard.share / (1.0 + math.exp(min(foreign.log_odds, 700.0)))
+    return replace(heard, share=share, reason=FOREIGN)
 
 
 def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:

@@ -1,16 +1,19 @@
 """A guard in the acoustic adapter: foreign sounds say less, warning signals as much, snapshots say why."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.road_users import DomainGuard, Familiar, Foreign, WarningSignal
-from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.acoustic import FOREIGN, AcousticAdapter
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.errors import OutOfDomainError
+from worldstate.measurement.measurement import Heard
 from worldstate.state.world_state import WorldState
 
 RATE_HZ = 6000
@@ -23,6 +26,13 @@ class Alarmed:
 
     def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
         return SignatureEvidence(("left", "right"), (3.0, 0.0), -2.0, -1.0)
+
+
+class Silent:
+    """A model that hears that nothing is there, far beyond any guard's margin."""
+
+    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+        return SignatureEvidence(("left", "right"), (-6.0, -6.0), -2.0, 0.0)
 
 
 def guard() -> DomainGuard:
@@ -59,6 +69,9 @@ def test_only_foreign_sounds_lose_their_evidence_and_the_snapshot_says_so(kind: 
     less = [max(value - 2.0, 0.0) for value in said] if kind is Foreign else said
     assert min(said) >= 0.0
     assert heard == pytest.approx(less, abs=1e-6)
+    unknown = 1.0 / (1.0 + np.exp(last.domain.log_odds)) if isinstance(last.domain, Foreign) else 1.0
+    assert last.heard.share == pytest.approx(plain.heard.share * unknown)
+    assert (last.heard.reason == FOREIGN) == isinstance(last.domain, Foreign)
     world = WorldFilter()
     for one in measured:
         world = world.update(one)
@@ -66,6 +79,22 @@ def test_only_foreign_sounds_lose_their_evidence_and_the_snapshot_says_so(kind: 
     assert again.domain == last.domain
     if isinstance(last.domain, Foreign):
         assert again.to_dict()["domain"]["reason"] == "sounds like speech"
+
+
+def test_a_foreign_sound_is_not_taken_for_silence() -> None:
+    adapter = AcousticAdapter(ARRAY, RATE_HZ, Silent(), guard=guard())
+    foreign = [one for one in adapter.measure(sounds()[Foreign]) if isinstance(one.domain, Foreign)]
+    warned = WorldFilter()
+    for one in AcousticAdapter(ARRAY, RATE_HZ, Alarmed()).measure(sounds()[Familiar]):
+        warned = warned.update(one)
+    later = [replace(one, stamp_ns=warned.stamp_ns + 10**8 * (i + 1)) for i, one in enumerate(foreign[:5])]
+    carried, silent, waited = warned, warned, warned.predict_to(later[-1].stamp_ns)
+    for one in later:
+        carried = carried.update(one)
+        silent = silent.update(replace(one, heard=Heard()))
+    left = [one.belief.hypotheses[0] for one in (silent, carried, waited)]
+    assert left[0] < 0.5 * left[2]
+    assert left[1] == pytest.approx(left[2], rel=0.2)
 
 
 def test_a_guard_of_other_measures_is_refused() -> None:
