@@ -1,0 +1,62 @@
+"""`worldstate log view`: a log as one page to step through in a browser.
+
+Write one HTML file that needs no other file and no network: the street from above, azimuths, what decides an
+advisory with its threshold, the evidence piece by piece, what was heard and searched. The arrow keys step from
+snapshot to snapshot, space plays, home and end go to the ends.
+
+Examples
+--------
+  worldstate log view out/demo/states.jsonl
+  worldstate log view out.mcap --out street.html
+  worldstate log view hour.jsonl --between 1200 1500 --out minutes.html
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate import ground
+from worldstate.cli.common import output, progress
+
+if TYPE_CHECKING:
+    from worldstate.state import WorldState
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --out or --export mcap")
+    add("--out", type=Path, metavar="HTML", help="the page (default: LOG with .html in place of its ending)")
+    add("--between", type=float, nargs=2, metavar="S", help="from when to when, seconds on the states' clock")
+
+
+def run(arguments: argparse.Namespace) -> output.CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.operations.viewing.log_page import check_page, write_log_page
+
+    arguments.out = check_page(arguments.out or arguments.log.with_suffix(".html"))
+    output.check_outputs(arguments, "out")
+    with progress.progress_bar(f"reading {arguments.log.name}", None) as bar:
+        states = _between(arguments.log, arguments.between or (-9e9, 9e9), bar.advance)
+        page = write_log_page(states, arguments.out, title=arguments.log.name)
+    report = {"states": len(page["states"]), "remarks": page["remarks"], "written": str(arguments.out)}
+    return output.CommandResult(report)
+
+
+def _between(log: Path, span_s: Sequence[float], advance: Callable[[], None]) -> "Iterator[WorldState]":
+    """Yield the snapshots of this time; refuse a time without any."""
+    from worldstate.adapters.state_log import read_log
+
+    first_ns, last_ns = map(ground.nanoseconds, span_s)
+    stamps_ns, empty = list[int](), True
+    for _, state in read_log(log):
+        stamps_ns = [*stamps_ns[:1], state.stamp_ns]
+        if first_ns <= state.stamp_ns <= last_ns:
+            yield state
+            empty = False
+        advance()
+    if empty:
+        its = " to ".join(f"{ground.seconds(stamp_ns):.1f}" for stamp_ns in stamps_ns)
+        given = " to ".join(f"{at_s:g}" for at_s in span_s)
+        raise ground.InputFileError(log, f"--between: expected times of its snapshots, {its} s, got {given} s")
