@@ -1,8 +1,8 @@
 """`worldstate demo`: one occluded approach, simulated, heard and drawn.
 
 Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
-before any camera can see it. Prints in a sentence how early it was announced, and leaves
-timeline.png, states.jsonl and summary.json in the output folder.
+before any camera can see it. Prints in a sentence how early it was announced, and leaves timeline.png,
+states.jsonl, log.html to step through in a browser, and summary.json in the output folder.
 
 example: worldstate demo --out out/demo --seed 7
 """
@@ -59,15 +59,18 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.adapters.state_log import read_log
     from worldstate.operations.recordings.recording_report import announcement
+    from worldstate.operations.viewing.log_page import write_log_page
     from worldstate.operations.viewing.state_figure import drawn_run
 
-    out = output.output_folder(arguments.out, "timeline.png", "states.jsonl", "summary.json")
+    out = output.output_folder(arguments.out, "timeline.png", "states.jsonl", "log.html", "summary.json")
     folder = simulate_approach(out / "recording", arguments.seed)
     source = adapters.open_source(folder)
     title = f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}"
     with drawn_run(out / "timeline.png", source, title) as draw:
         report = listening.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
+    states = [state for _, state in read_log(out / "states.jsonl")]
+    truth = read_true_tracks(folder)
+    write_log_page(states, out / "log.html", title=title, t0_s=source.t0_s, truth=truth)
     output.write_report(out / "summary.json", report.to_dict())
-    states = (state for _, state in read_log(out / "states.jsonl"))
-    told = announcement(states, read_true_tracks(folder), "a van")
+    told = announcement(states, truth, "a van")
     return output.CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}", told])

@@ -1,8 +1,8 @@
 """`worldstate log view`: a log as one page to step through in a browser.
 
-Write one HTML file that needs no other file and no network: the street from above, azimuths, what decides an
-advisory with its threshold, the evidence piece by piece, what was heard and searched. The arrow keys step from
-snapshot to snapshot, space plays, home and end go to the ends.
+Write one HTML file that needs no other file and no network: the street from above, azimuths, what decides
+an advisory with its threshold, the evidence piece by piece, what was searched and heard. The arrow keys step
+from snapshot to snapshot, space plays, home and end go to the ends.
 
 Examples
 --------
@@ -59,4 +59,5 @@ def _between(log: Path, span_s: Sequence[float], advance: Callable[[], None]) ->
     if empty:
         its = " to ".join(f"{ground.seconds(stamp_ns):.1f}" for stamp_ns in stamps_ns)
         given = " to ".join(f"{at_s:g}" for at_s in span_s)
-        raise ground.InputFileError(log, f"--between: expected times of its snapshots, {its} s, got {given} s")
+        said = f"--between: expected times of its snapshots, {its} s, got {given} s"
+        raise ground.InputFileError(log, said)

@@ -1,4 +1,4 @@
-"""A state log as one page of HTML that needs no other file and no network, to be stepped through in a browser."""
+"""A state log as one page of HTML to step through in a browser, without another file or a network."""
 
 import json
 import math
@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TypeAlias, TypedDict
+
+import numpy as np
 
 from worldstate.abduction.road_users import Foreign
 from worldstate.adapters.datasets.ovad import TrueTrack
@@ -183,11 +185,10 @@ def _cue(one: RiskCue) -> Row:
 
 
 def _track(true: TrueTrack) -> list[Row]:
-    rows = zip(true.time_s, true.azimuth_rad, true.in_view, true.position_m.round(1), strict=True)
-    return [
-        {"t": round(float(t), 3), "azimuth": _degrees(azimuth), "in_view": bool(seen), "place": place.tolist()}
-        for t, azimuth, seen, place in rows
-    ]
+    azimuths = np.degrees(true.azimuth_rad).round(1)
+    columns = true.time_s.round(3), azimuths, true.in_view, true.position_m.round(1)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    return [dict(zip(("t", "azimuth", "in_view", "place"), row, strict=True)) for row in rows]
 
 
 def _sector(sector_rad: tuple[float, float]) -> Row:

@@ -1,0 +1,232 @@
+"""A log as one page: it says what the states say, stands alone, and opens in a browser without a fault."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from contextlib import contextmanager
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scripted_states import scripted_states
+
+from worldstate import WorldState
+from worldstate.adapters.datasets.ovad import TrueTrack
+from worldstate.cli.main import main
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations import figure_style
+from worldstate.operations.viewing import log_page
+from worldstate.operations.viewing.log_page import page_data, write_log_page
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+TIME_S = 0.1 * np.arange(40)
+TRUE = TrueTrack(TIME_S, 0.02 * np.arange(40), TIME_S > 2.0, np.zeros((40, 2)))
+HOSTILE = "</script><script src='https://example.org/x.js'></script><!--"
+
+
+@pytest.fixture(scope="module")
+def states():
+    return [replace(state, calibrated=True) for state in scripted_states()]
+
+
+class Elements(HTMLParser):
+    """The elements of a page, and the text of its data."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found, self.data = list[tuple[str, dict]](), ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        if self.found and self.found[-1][1].get("id") == "data":
+            self.data += data
+
+
+def written(states, tmp_path, **parts):
+    write_log_page(states, tmp_path / "log.html", **parts)
+    return (tmp_path / "log.html").read_text("utf-8")
+
+
+def test_the_page_holds_what_the_states_say(states, tmp_path):
+    rows = json.loads(Elements(written(states, tmp_path)).data)["states"]
+    assert [row["t"] for row in rows] == [pytest.approx(one.stamp_ns / 1e9, abs=1e-3) for one in states]
+    for row, state in zip(rows, states, strict=True):
+        for cue, true in zip(row["cues"], state.cues, strict=True):
+            evidence = true.evidence
+            assert cue["risk"] == pytest.approx(true.risk, abs=1e-3)
+            assert cue["evidence"]["compared"] == pytest.approx(evidence.compared_nats, abs=0.01)
+            assert cue["evidence"]["terms"] == pytest.approx(dict(evidence.terms_nats), abs=0.01)
+            assert row["thresholds"][cue["side"]] == pytest.approx(evidence.threshold_nats, abs=0.01)
+            since_ns = true.advisory and true.advisory.since_ns
+            assert cue["since"] == (since_ns and pytest.approx(since_ns / 1e9, abs=1e-3))
+        parts = [part for one in state.entities for part in one.on_each_side()]
+        drawn = {one["id"]: one for one in row["entities"]}
+        assert set(drawn) == {one.id[:8] for one in parts}
+        for one in parts:
+            assert drawn[one.id[:8]]["hidden"] == (one.status == "hidden")
+            assert drawn[one.id[:8]]["azimuth"] == pytest.approx(np.degrees(one.azimuth_rad), abs=0.06)
+            assert drawn[one.id[:8]]["existence"] == pytest.approx(one.existence_probability, abs=1e-3)
+        assert [(one["sensor"], one["found"]) for one in row["searched"]] == [
+            (one.sensor, one.found) for one in state.searched
+        ]
+        assert row["heard"] == pytest.approx({one.sensor: one.share for one in state.heard or ()}, abs=0.01)
+    assert rows[-1]["entities"][0]["place"] == [8.0, 4.4]
+
+
+def test_nothing_in_a_log_becomes_a_part_of_the_page(states, tmp_path):
+    plain = Elements(written(states, tmp_path))
+    named = [replace(state, entities=(replace(state.entities[0], id=HOSTILE),)) for state in states]
+    hostile = Elements(written(named, tmp_path, title=HOSTILE))
+    assert hostile.found == plain.found
+    assert json.loads(hostile.data)["title"] == HOSTILE
+
+
+def test_the_page_asks_for_nothing_outside_itself(states, tmp_path):
+    page = written(states, tmp_path)
+    links = [one[key] for _, one in Elements(page).found for key in ("src", "href") if key in one]
+    assert links == ["data:,"]
+    assert not re.search(r"https?:|//\w+\.|url\(|@import|fetch\(|XMLHttp|WebSocket|import\(", page)
+    policy = next(one["content"] for _, one in Elements(page).found if "http-equiv" in one)
+    assert policy.startswith("default-src 'none';")
+
+
+def test_what_was_run_uncalibrated_says_so_and_has_no_threshold(states):
+    data = page_data(replace(state, calibrated=False) for state in states)
+    assert "Not calibrated" in data["remarks"][0]
+    assert not any(row["thresholds"] for row in data["states"])
+    partly = page_data([states[0], *(replace(state, calibrated=False) for state in states[1:])])
+    assert f"{len(states) - 1} of {len(states)} snapshots are not calibrated" in partly["remarks"][0]
+    assert all(row["thresholds"] for row in partly["states"])
+    assert page_data(states)["remarks"] == []
+
+
+def test_a_long_log_is_thinned_evenly_and_says_so(states, monkeypatch):
+    monkeypatch.setattr(log_page, "MOST_STATES", 10)
+    many = [replace(states[0], stamp_ns=10**8 * k) for k in range(90)]
+    data = page_data(many)
+    assert [row["t"] for row in data["states"]] == pytest.approx(np.arange(0.0, 9.0, 0.8))
+    assert "One of 8 snapshots is shown of 90" in data["remarks"][-1]
+
+
+def test_the_colours_are_those_of_the_figures(states, tmp_path):
+    light = written(states, tmp_path).split("prefers-color-scheme")[0]
+    palette = Path(figure_style.__file__).read_text("utf-8").lower()
+    for name in ("hidden", "view", "searched", "heard", "decision"):
+        assert re.search(rf"--{name}: (#\w+);", light)[1] in palette
+
+
+def test_the_command_writes_a_part_of_a_log_beside_it(states, tmp_path, capsys):
+    log = tmp_path / "states.jsonl"
+    log.write_text("".join(state.to_json() + "\n" for state in states))
+    assert main(["log", "view", str(log), "--between", "0.25", "0.45", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["states"] == 2
+    assert (tmp_path / "states.html").is_file()
+    assert main(["log", "view", str(log), "--between", "50", "60"]) == 2
+    assert "expected times of its snapshots, 0.2 to 0.7 s, got 50 to 60 s" in capsys.readouterr().err
+    assert main(["log", "view", str(log), "--out", str(tmp_path / "a.png")]) == 2
+    assert "ending in .html" in capsys.readouterr().err
+
+
+def test_no_state_is_refused():
+    with pytest.raises(InvalidArgumentError, match="at least one snapshot"):
+        page_data([])
+
+
+class Browser:
+    """A headless Chromium that is spoken to through a pipe: messages of JSON, each ended by a zero byte."""
+
+    def __init__(self, write: int, read: int) -> None:
+        self.write, self.read, self.buffer, self.session = write, read, b"", {}
+        self.events: list[dict] = []
+        pages = self.call("Target.getTargets")["targetInfos"]
+        page = next(one["targetId"] for one in pages if one["type"] == "page")
+        attached = self.call("Target.attachToTarget", targetId=page, flatten=True)
+        self.session = {"sessionId": attached["sessionId"]}
+
+    def message(self) -> dict:
+        while b"\0" not in self.buffer:
+            got = os.read(self.read, 1 << 20)
+            assert got, "the browser ended"
+            self.buffer += got
+        first, self.buffer = self.buffer.split(b"\0", 1)
+        return json.loads(first)
+
+    def call(self, method: str, **params) -> dict:
+        asked = {"id": 1, "method": method, "params": params, **self.session}
+        os.write(self.write, json.dumps(asked).encode() + b"\0")
+        while "id" not in (answer := self.message()):
+            self.events.append(answer)
+        return answer["result"]
+
+    def open(self, path: Path) -> None:
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+        self.call("Page.navigate", url=path.as_uri())
+        while not any(one["method"] == "Page.loadEventFired" for one in self.events):
+            self.events.append(self.message())
+
+    def value(self, expression: str):
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        return answer["result"].get("value")
+
+    def press(self, key: str) -> None:
+        event = f"new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}})"
+        self.value(f"document.body.dispatchEvent({event})")
+
+
+@contextmanager
+def browser(folder: Path, size: str):
+    """Lend a browser whose descriptors 3 and 4 are ours."""
+    (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe"]
+    options += [f"--window-size={size}", f"--user-data-dir={folder}"]
+    shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
+    call = ["bash", "-c", shell, "-", CHROMIUM, *options, "about:blank"]
+    process = subprocess.Popen(call, pass_fds=(theirs_in, theirs_out), stderr=subprocess.DEVNULL)
+    try:
+        os.close(theirs_in)
+        os.close(theirs_out)
+        yield Browser(ours_out, ours_in)
+    finally:
+        process.terminate()
+        process.wait(20)
+        os.close(ours_in)
+        os.close(ours_out)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None or shutil.which("bash") is None, reason="there is no Chromium here")
+@pytest.mark.parametrize("size", ["1300,900", "500,900"])
+def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_path, size):
+    since_1970 = [replace(state, stamp_ns=state.stamp_ns + 1_700_000_000 * 10**9) for state in states]
+    pages = {
+        "whole": (states, {"truth": (TRUE,), "t0_s": 0.4, "title": HOSTILE}),
+        "uncalibrated": ([replace(state, calibrated=False) for state in states], {}),
+        "since": (since_1970, {}),
+        "empty": ([WorldState(0, 0)], {}),
+    }
+    dashes = "document.querySelectorAll('#charts path[stroke-dasharray=\"6 4\"]').length"
+    with browser(tmp_path / "profile", size) as page:
+        for name, (shown, parts) in pages.items():
+            path = tmp_path / f"{name}.html"
+            write_log_page(shown, path, **parts)
+            page.events.clear()
+            page.open(path)
+            assert page.value(dashes) == (2 if name in ("whole", "since") else 0)
+            assert page.value("document.documentElement.scrollWidth <= innerWidth")
+            last = len(shown) - 1
+            for key, at in (("Home", 0), ("ArrowRight", 1), ("End", last), ("ArrowLeft", last - 1)):
+                page.press(key)
+                assert page.value("+document.getElementById('slider').value") == min(max(at, 0), last)
+            page.press(" ")
+            kinds = [one["method"] for one in page.events]
+            assert not {"Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"} & set(kinds)
+            asked = [one["params"] for one in page.events if one["method"] == "Network.requestWillBeSent"]
+            assert [one["request"]["url"] for one in asked] == [path.as_uri()]
