@@ -116,10 +116,9 @@ def test_a_long_log_is_thinned_evenly_and_says_so(states, monkeypatch):
 
 
 def test_the_colours_are_those_of_the_figures(states, tmp_path):
-    light = written(states, tmp_path).split("prefers-color-scheme")[0]
-    palette = Path(figure_style.__file__).read_text("utf-8").lower()
-    for name in ("hidden", "view", "searched", "heard", "decision"):
-        assert re.search(rf"--{name}: (#\w+);", light)[1] in palette
+    light = dict(re.findall(r"--(\w+): (#\w+);", written(states, tmp_path).split("prefers-color-scheme")[0]))
+    for name in ("HIDDEN", "IN_VIEW", "SEARCHED", "HEARD", "DECISION"):
+        assert light[name.lower().removeprefix("in_")] == getattr(figure_style, name).lower()
 
 
 def test_the_command_writes_a_part_of_a_log_beside_it(states, tmp_path, capsys):

@@ -17,7 +17,7 @@ from worldstate.ground import InputFileError, InvalidArgumentError, seconds
 from worldstate.operations.recordings.evidence_report import common_lines
 from worldstate.state import Entity, RiskCue, WorldState
 
-# A snapshot with two entities is 1 kB: five to ten minutes of hops are shown whole, and a page has 6 MB at most.
+# A snapshot with two entities is 1 kB: five to ten minutes are shown whole, and a page has 6 MB at most.
 MOST_STATES = 3000
 # A street has fewer; of a fault that gives birth to many the likeliest are enough to see it.
 _MOST_ENTITIES = 16
