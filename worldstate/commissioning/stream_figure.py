@@ -81,14 +81,15 @@ def _draw_spectrogram(axes: "Axes", stream: WrittenStream) -> None:
 
 
 def _draw_events(axes: "Axes", stream: WrittenStream) -> None:
-    rows = [*FLOWS, *sorted({one.sound.kind for one in stream.sounds})]
+    had = {one.event.flow for one in stream.vehicles}
+    rows = [*(flow for flow in FLOWS if flow in had), *sorted({one.sound.kind for one in stream.sounds})]
     for one in stream.vehicles:
         _draw_event(axes, one, rows.index(one.event.flow))
     for sound in stream.sounds:
         span = (sound.start_s, sound.end_s - sound.start_s)
         axes.broken_barh([span], (rows.index(sound.sound.kind) - 0.35, 0.7), color="0.7", lw=0)
     axes.set(yticks=range(len(rows)), yticklabels=[row.replace("_", " ") for row in rows])
-    axes.tick_params(axis="y", labelsize=7)
+    axes.tick_params(axis="y", labelsize=9)
     axes.set(xlabel="time (s); pink: in earshot, blue: in view, tick: first line of sight")
     axes.set_ylim(len(rows) - 0.4, -0.6)
 
