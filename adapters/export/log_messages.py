@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -13,25 +14,32 @@ from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 
+from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.files.file_io import GrowingFile, atomic_path
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
+from worldstate.ground.typing import Float32Array
 from worldstate.state.world_state import WorldState, snapshot_schema
 
 from . import scene
 
 SNAPSHOT_TOPIC, SCENE_TOPIC = "/worldstate/snapshot", "/worldstate/scene"
 SRP_TOPIC, IMAGE_TOPIC = "/worldstate/srp", "/camera/image"
+SOUND_TOPIC, FRAME_TOPIC = "/microphones/sound", "/tf"
 # OVAD's images, 1936 pixels wide, are shown in a third of a screen: halved they take 77 kB in a log, not 245.
 _WIDEST_PX, _QUALITY = 1000, 80
-Told: TypeAlias = WorldState | scene.SceneUpdate | scene.CompressedImage
+Told: TypeAlias = (
+    WorldState | scene.SceneUpdate | scene.CompressedImage | scene.RawAudio | scene.FrameTransform
+)
 # The name that a viewer knows each by.
 _SCHEMA_NAMES: dict[type, str] = {
     WorldState: "worldstate.Snapshot",
     scene.SceneUpdate: "foxglove.SceneUpdate",
     scene.CompressedImage: "foxglove.CompressedImage",
+    scene.RawAudio: "foxglove.RawAudio",
+    scene.FrameTransform: "foxglove.FrameTransform",
 }
 
 
@@ -69,7 +77,7 @@ LogSink: TypeAlias = Callable[[LogMessage], None]
 
 
 def state_messages(state: WorldState) -> Iterator[LogMessage]:
-    """Yield a snapshot as `WorldState.to_json` writes it, and the scene that it describes.
+    """Yield a snapshot as `WorldState.to_json` writes it, its scene, and with odometry its frame in the map.
 
     Examples
     --------
@@ -78,6 +86,12 @@ def state_messages(state: WorldState) -> Iterator[LogMessage]:
     """
     yield LogMessage(SNAPSHOT_TOPIC, state.stamp_ns, state)
     yield LogMessage(SCENE_TOPIC, state.stamp_ns, scene.scene_update(state))
+    if state.ego is not None:
+        stamp, half_rad = scene.SceneTime.of_ns(state.stamp_ns), 0.5 * state.ego.yaw_rad
+        turned = scene.Rotation(z=math.sin(half_rad), w=math.cos(half_rad))
+        place = scene.Xyz(*state.ego.position_m)
+        frame = scene.FrameTransform(stamp, "map", state.frame_id, place, turned)
+        yield LogMessage(FRAME_TOPIC, state.stamp_ns, frame)
 
 
 def srp_message(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> LogMessage:
@@ -107,6 +121,36 @@ def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterato
             yield image_message(start_ns + nanoseconds(shown[0] / video.frame_rate_hz), jpeg.tobytes())
 
     return image_before
+
+
+@contextmanager
+def recorded_sound(sound: SoundInput, start_ns: int = 0) -> Iterator[Callable[[int], Iterator[LogMessage]]]:
+    """Lend what yields the sound of one microphone up to a stamp, asked in order of time; of files only."""
+    if not isinstance(sound, Path | tuple):
+        yield lambda stamp_ns: iter(())
+        return
+    with open_sound(sound, strict=False) as audio:
+        rate_hz, taken = audio.sample_rate_hz, 0
+        blocks = audio.blocks(rate_hz // 10)
+        heard = next(channel for channel in range(audio.channels) if channel not in audio.silent_channels)
+
+        def sound_until(stamp_ns: int) -> Iterator[LogMessage]:
+            nonlocal taken
+            while (begins_ns := start_ns + nanoseconds(taken / rate_hz)) < stamp_ns:
+                block = next(blocks, None)
+                if block is None:
+                    return
+                taken += len(block)
+                yield sound_message(begins_ns, block[:, heard], rate_hz)
+
+        yield sound_until
+
+
+def sound_message(stamp_ns: int, samples: Float32Array, rate_hz: int) -> LogMessage:
+    """Return a block of sound, full scale 1, that begins at the stamp."""
+    whole = np.clip(np.rint(32768.0 * samples), -32768, 32767).astype("<i2")
+    text = base64.b64encode(whole.tobytes()).decode("ascii")
+    return LogMessage(SOUND_TOPIC, stamp_ns, scene.RawAudio(scene.SceneTime.of_ns(stamp_ns), text, rate_hz))
 
 
 def image_message(stamp_ns: int, jpeg: bytes) -> LogMessage:
@@ -145,7 +189,7 @@ def _drawn(rr: ModuleType, topic: str, value: Told) -> Iterator[tuple[str, objec
         yield topic, rr.TextDocument(value.to_json(), media_type="application/json")
     elif isinstance(value, scene.CompressedImage):
         yield topic, rr.EncodedImage(contents=base64.b64decode(value.data), media_type="image/jpeg")
-    else:
+    elif isinstance(value, scene.SceneUpdate):
         yield topic, rr.Clear(recursive=True)
         for item in value.entities:
             place = f"{topic}/{item.id.replace(' ', '/')}"

@@ -189,6 +189,28 @@ class CompressedImage:
     format: str = "jpeg"
 
 
+@dataclass(frozen=True, slots=True)
+class RawAudio:
+    """A block of sound of one microphone, 16 bits a sample, as `foxglove.RawAudio`."""
+
+    timestamp: SceneTime
+    data: Base64
+    sample_rate: Count
+    number_of_channels: Count = 1
+    format: str = "pcm-s16"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransform:
+    """Where a frame is in another one, as `foxglove.FrameTransform`."""
+
+    timestamp: SceneTime
+    parent_frame_id: str
+    child_frame_id: str
+    translation: Xyz
+    rotation: Rotation
+
+
 # How far a sector is drawn. Sound gives no distance: the radius only tells the layers apart.
 SECTOR_M, SEARCHED_M, CUE_M, SRP_M = 30.0, 15.0, 24.0, 12.0
 # Of the sectors that are drawn in one plane the later lie higher, or a viewer lets them flicker.
@@ -318,7 +340,8 @@ def _entity(state: WorldState, entity: Entity) -> SceneItem:
     coming = tuple(_forecast(*ahead, color) for ahead in (entity.forecast or {}).values())
     cubes: tuple[SceneSolid, ...] = ()
     if entity.position_m is not None:
-        cubes = (SceneSolid(Placed(Xyz(*entity.position_m)), _CAR, Rgba(*color, 0.2 + 0.8 * density)),)
+        middle_m = Xyz(*entity.position_m[:2], 0.5 * _CAR.z)
+        cubes = (SceneSolid(Placed(middle_m), _CAR, Rgba(*color, 0.2 + 0.8 * density)),)
     pairs = _pairs(
         status=entity.status,
         existence_probability=entity.existence_probability,

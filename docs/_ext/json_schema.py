@@ -9,7 +9,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
-from worldstate.adapters.export.scene import CompressedImage, SceneUpdate
+from worldstate.adapters.export.scene import CompressedImage, FrameTransform, RawAudio, SceneUpdate
 from worldstate.ground.serialisation import Check, Hint, Layout
 from worldstate.state import WorldState
 
@@ -95,6 +95,8 @@ SHIPPED: dict[str, type] = {
     "snapshot": WorldState,
     "foxglove.SceneUpdate": SceneUpdate,
     "foxglove.CompressedImage": CompressedImage,
+    "foxglove.RawAudio": RawAudio,
+    "foxglove.FrameTransform": FrameTransform,
 }
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from importlib.resources import files
 
 import cv2
@@ -13,9 +14,14 @@ from google.protobuf import descriptor_pb2, descriptor_pool, json_format, messag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from scripted_states import scripted_states
+from scripted_states import EGO, scripted_states
 
-from worldstate.adapters.export.log_messages import image_message, srp_message, state_messages
+from worldstate.adapters.export.log_messages import (
+    image_message,
+    sound_message,
+    srp_message,
+    state_messages,
+)
 from worldstate.adapters.export.scene import scene_update
 from worldstate.cli.main import main
 from worldstate.state import SearchedView, WorldState
@@ -70,6 +76,7 @@ def test_every_message_holds_to_the_schema_of_its_channel(logged):
         "/worldstate/scene",
         "/worldstate/srp",
         "/camera/image",
+        "/microphones/sound",
     }
     # One of each topic: all are made by the same types.
     for schema, message in {topic: one for topic, *one in found}.values():
@@ -77,7 +84,7 @@ def test_every_message_holds_to_the_schema_of_its_channel(logged):
         jsonschema.Draft202012Validator.check_schema(described)
         jsonschema.Draft202012Validator(described).validate(json.loads(message.data))
     shipped = json.loads(files("worldstate").joinpath("data/snapshot.schema.json").read_text("utf-8"))
-    assert shipped in [json.loads(schema.data) for _, schema, _ in found[:4]]
+    assert shipped in [json.loads(schema.data) for topic, schema, _ in found if topic.endswith("snapshot")]
 
 
 def test_an_image_is_the_frame_of_its_time(logged):
@@ -87,6 +94,27 @@ def test_an_image_is_the_frame_of_its_time(logged):
         jpeg = json_format.base64.b64decode(json.loads(message.data)["data"])
         grey = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).mean()
         assert grey == pytest.approx(40 + message.log_time / 1e7, abs=4.0)
+
+
+def test_the_sound_of_a_log_is_that_of_a_microphone_at_its_time(recording, logged):
+    blocks = [message for topic, _, message in messages(logged[0]) if topic == "/microphones/sound"]
+    assert [message.log_time for message in blocks] == [k * 10**8 for k in range(15)]
+    said = [json.loads(message.data) for message in blocks]
+    assert {(one["format"], one["sample_rate"], one["number_of_channels"]) for one in said} == {
+        ("pcm-s16", 48_000, 1)
+    }
+    heard = np.frombuffer(b"".join(json_format.base64.b64decode(one["data"]) for one in said), "<i2")
+    written, _ = soundfile.read(recording / "out_multi.wav")
+    assert heard / 32768.0 == pytest.approx(written[:, 0], abs=0.51 / 32768.0)
+
+
+def test_the_frame_of_a_scene_stands_in_the_map_by_odometry():
+    frame = list(state_messages(STATES[0]))[2].value
+    assert (frame.parent_frame_id, frame.child_frame_id) == ("map", "base_link")
+    assert (frame.translation.x, frame.translation.y) == EGO.position_m
+    assert 2.0 * math.atan2(frame.rotation.z, frame.rotation.w) == pytest.approx(EGO.yaw_rad)
+    without = [message.topic for message in state_messages(replace(STATES[0], ego=None))]
+    assert without == ["/worldstate/snapshot", "/worldstate/scene"]
 
 
 def of_foxglove(name):
@@ -117,12 +145,16 @@ def as_protobuf_json(value, key=""):
 
 def test_foxglove_parses_every_field_by_its_own_definitions():
     pytest.importorskip("foxglove")
-    scene_class, image_class = of_foxglove("SceneUpdate"), of_foxglove("CompressedImage")
+    names = "SceneUpdate", "CompressedImage", "FrameTransform"
+    scene_class, image_class, frame_class = map(of_foxglove, names)
     srp = np.linspace(1.0, 2.0, AZIMUTHS.size)
     for state in STATES:
         for message in (*list(state_messages(state))[1:], srp_message(state, AZIMUTHS, srp)):
-            text = json.dumps(as_protobuf_json(json.loads(message.data)))
-            json_format.Parse(text, scene_class())
+            kind = {"foxglove.FrameTransform": frame_class}.get(message.schema_name, scene_class)
+            json_format.Parse(json.dumps(as_protobuf_json(json.loads(message.data))), kind())
+    sound = json.loads(sound_message(10**9, np.array([0.5, -1.0, 2.0], np.float32), 8000).data)
+    samples = json_format.Parse(json.dumps(as_protobuf_json(sound)), of_foxglove("RawAudio")()).data
+    assert np.frombuffer(samples, "<i2").tolist() == [16384, -32768, 32767]
     image = json.loads(image_message(1_500_000_000, b"\xff\xd8\xff").data)
     assert json_format.Parse(json.dumps(as_protobuf_json(image)), image_class()).data == b"\xff\xd8\xff"
 
@@ -136,7 +168,7 @@ def test_a_scene_shows_who_is_there_where_was_looked_and_the_risk():
     assert "ADVISORY" not in drawn[0]["cue right"].texts[0].text
     placed = STATES[-1].entities[0]
     box = drawn[-1][f"entity {placed.id}"].cubes[0].pose.position
-    assert (box.x, box.y, box.z) == placed.position_m
+    assert (box.x, box.y, box.z) == (*placed.position_m[:2], 0.75), "it stands on the road"
     assert len(drawn[-1][f"entity {placed.id}"].lines) == 1 + len(placed.forecast)
 
 
@@ -166,6 +198,7 @@ def test_the_layout_shows_topics_that_are_written(logged):
     panels = json.loads(layout)["configById"]
     written = {topic for topic, _, _ in messages(logged[0])}
     shown = {*panels["3D!worldstate"]["topics"], panels["Image!camera"]["imageMode"]["imageTopic"]}
+    shown.add(panels["Audio!sound"]["topic"])
     plots = [path["value"] for name in panels for path in panels[name].get("paths", ())]
     assert shown | {plot.split(".")[0] for plot in plots} == written
 

@@ -1,6 +1,7 @@
 """--export: viewers, logs and other stacks that a command sends world-states to, hop by hop."""
 
 import argparse
+import itertools
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -165,19 +166,21 @@ def _stack(name: str, target: str, crossing_m: float) -> "Stack":
 def exported_hops(
     arguments: argparse.Namespace, source: "adapters.Source", crossing_m: float, *, live: bool = False
 ) -> "Iterator[Callable[[adapters.Step], None]]":
-    """Lend a function that exports a hop of a recording: state, power over azimuth, the camera's image."""
+    """Lend a function that exports a hop of a recording: state, power over azimuth, image and sound."""
     with open_exports(arguments, crossing_m=crossing_m, live=live) as exports:
         if not exports.viewers:
             yield lambda step: exports.state(step.state)
             return
-        from worldstate.adapters.export.log_messages import camera_images, srp_message
+        from worldstate.adapters.export.log_messages import camera_images, recorded_sound, srp_message
 
         image_before = camera_images(source.audio_path.parent, source.start_ns)
+        with recorded_sound(source.sound, source.start_ns) as sound_until:
 
-        def export_hop(step: "adapters.Step") -> None:
-            for message in image_before(step.state.stamp_ns):
-                exports.message(message)
-            exports.state(step.state)
-            exports.message(srp_message(step.state, step.frame.azimuths_rad, step.frame.srp))
+            def export_hop(step: "adapters.Step") -> None:
+                stamp_ns = step.state.stamp_ns
+                for message in itertools.chain(sound_until(stamp_ns), image_before(stamp_ns)):
+                    exports.message(message)
+                exports.state(step.state)
+                exports.message(srp_message(step.state, step.frame.azimuths_rad, step.frame.srp))
 
-        yield export_hop
+            yield export_hop
