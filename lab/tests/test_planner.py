@@ -16,6 +16,7 @@ from worldstate_lab.planner.encounters import (
 from worldstate_lab.planner.planner_exam import (
     CHANCE,
     FULL,
+    MEMORY,
     PHANTOM,
     UNAWARE,
     draw_corners,
@@ -23,6 +24,7 @@ from worldstate_lab.planner.planner_exam import (
     every_planner,
     planner_figures,
     safe_threshold,
+    unseen_from_m,
 )
 
 from worldstate.commissioning.heard_stream import HeardStream
@@ -69,7 +71,8 @@ EVERY = (stream(), stream("SA1"), stream(entries_s=()))
 @pytest.mark.parametrize("ego", [EgoVehicle(), FROM_STANDING])
 def test_who_knows_brakes_for_vehicles_alone_and_who_knows_nothing_hits_them(ego: EgoVehicle) -> None:
     corners = draw_corners(EVERY, 40, ego, np.random.default_rng(1))
-    figures = planner_figures(corners, every_planner(corners, 0.5, 0.5, ego), np.random.default_rng(2))
+    planners = every_planner(corners, 0.5, 0.5, ego)
+    figures = planner_figures(corners, planners, np.random.default_rng(2))
     nobody, phantom, full, chance = (figures[name] for name in (UNAWARE, PHANTOM, FULL, CHANCE))
     assert nobody["loud_collisions"] > 0 and nobody["empty_needless_s"] == 0.0
     assert [one["loud_collisions"] + one["quiet_collisions"] for one in (phantom, full, chance)] == [0, 0, 0]
@@ -78,6 +81,41 @@ def test_who_knows_brakes_for_vehicles_alone_and_who_knows_nothing_hits_them(ego
     assert chance["loud_recorded"] == 6 and chance["quiet_recorded"] == 2
     assert 0.9 < chance["less_at_0.05_low"] <= chance["less_at_0.05"] <= chance["less_at_0.05_high"] <= 1.0
     assert phantom["less_at_0.2"] == 0.0
+    # Sight only grows as the car nears: what lies behind its edge may have come from farther behind it.
+    for remembered, assumed in zip(planners[MEMORY], planners[PHANTOM], strict=True):
+        np.testing.assert_array_equal(remembered.front_m, assumed.front_m)
+
+
+def remembered(sight_m: np.ndarray, driven_m: float) -> np.ndarray:
+    """Return how near a vehicle may be that was never in sight, step by step."""
+    found = [sight_m[:1]]
+    for now in sight_m[1:, None]:
+        found.append(unseen_from_m(found[-1], now, driven_m))
+    return np.concatenate(found)
+
+
+@settings(deadline=None)
+@given(st.integers(1, 40), st.floats(0.1, 10.0), st.integers(0, 2**32 - 1))
+def test_no_unseen_vehicle_within_the_limit_is_nearer_than_memory_allows(
+    steps: int, limit_m: float, seed: int
+) -> None:
+    rng, step = np.random.default_rng(seed), np.arange(steps)
+    sight_m = rng.uniform(1.0, 200.0, steps)
+    nearest = remembered(sight_m, limit_m)
+    assert (nearest >= sight_m).all()  # never nearer than the plain phantom
+    driven = np.cumsum(rng.uniform(0.0, limit_m, steps))
+    unseen = (sight_m + driven).max() - driven  # as near as it can be without having been seen
+    assert (unseen >= nearest - 1e-9).all()
+    # And at the limit there is one that is as near at the end and was behind the edge all the time.
+    tight = nearest[-1] + limit_m * (step[-1] - step)
+    assert (tight >= sight_m - 1e-9).all()
+
+
+def test_memory_of_a_view_that_a_lorry_shuts_ends_when_a_vehicle_can_have_come_so_far() -> None:
+    # 40 m seen, then 5 m: at 7 m/s the 35 m between take five seconds.
+    time_s = np.arange(0.0, 8.0, 0.05)
+    nearest = remembered(np.where(time_s == 0.0, 40.0, 5.0), 7.0 * 0.05)
+    np.testing.assert_allclose(nearest, np.maximum(40.0 - 7.0 * time_s, 5.0), atol=1e-9)
 
 
 def test_a_chance_that_says_nothing_of_those_who_come_is_not_trusted() -> None:

@@ -1,9 +1,10 @@
 """`worldstate-lab planner`: what a planner gains that reads the chances of the state at a blind corner.
 
 A simulated car nears blind corners in a closed loop while the states of recorded streams are replayed; their
-vehicles cross as they did and do not mind it. Three planners drive the same car under the same stopping law:
-one knows nothing and brakes for what it sees, one assumes a vehicle behind both corners at every time, and
-one assumes it only from a chance of the state on, which is set on streams of other seeds (`--set-on`).
+vehicles cross as they did and do not mind it. Four planners drive the same car under the same stopping law:
+one knows nothing and brakes for what it sees, one assumes a vehicle behind both corners at every time, one
+remembers what was in sight and assumes it where a vehicle may be unseen, and one assumes it only from a
+chance of the state on, which is set on streams of other seeds (`--set-on`).
 Printed are collisions, braking that no vehicle made necessary, and time.
 
 Examples

@@ -50,11 +50,14 @@ class Drives:
         return np.where(self.needed, 0.0, self.braking_s)
 
 
-def drive_through(encounters: Encounters, threshold: float, ego: EgoVehicle) -> Drives:
+def drive_through(
+    encounters: Encounters, threshold: float, ego: EgoVehicle, *, remembers: bool = False
+) -> Drives:
     """Drive through all encounters, braking for vehicles that it sees or assumes.
 
     One is assumed at the limit just behind what can be seen of a side while the chance that a vehicle comes
-    into view from there within `HORIZON_S` is not below the threshold: always at 0, never at infinity.
+    into view from there within `HORIZON_S` is not below the threshold: always at 0, never at infinity. If it
+    remembers, the vehicle is assumed no nearer than where one may be that has never been in sight.
     """
     assumed = encounters.within[..., HORIZONS_S.index(HORIZON_S)] >= threshold
     n = len(encounters)
@@ -63,7 +66,7 @@ def drive_through(encounters: Encounters, threshold: float, ego: EgoVehicle) -> 
     collided, braking, hardest, took = np.zeros(n, bool), np.zeros(n), np.zeros(n), np.full(n, np.nan)
     first_seen = np.full(encounters.side.shape, STEPS * 2)
     late = round(ego.reaction_s / STEP_S)
-    fronts = np.empty((n, STEPS))
+    fronts, reach = np.empty((n, STEPS)), np.zeros((n, 2))
     for step in range(STEPS):
         fronts[:, step] = x
         sight = sight_m(encounters, x - ego.eye_m)
@@ -75,7 +78,8 @@ def drive_through(encounters: Encounters, threshold: float, ego: EgoVehicle) -> 
         free = np.minimum(ego.acceleration_mps2, (ego.limit_mps - v) / STEP_S)
         # A view that has just opened has told nothing yet.
         then = sight_m(encounters, fronts[:, max(step - late, 0)] - ego.eye_m)
-        for_hidden = _for_assumed(encounters, ego, x, v, then, assumed[:, hop])
+        reach = unseen_from_m(reach, then, ego.limit_mps * STEP_S) if remembers else then
+        for_hidden = _for_assumed(encounters, ego, x, v, reach, assumed[:, hop])
         for_seen = _for_seen(encounters, ego, x, v, step, step - first_seen >= late)
         chosen = np.clip(np.minimum(np.minimum(for_hidden, for_seen), free), -ego.full_mps2, None)
         chosen = np.maximum(chosen, -v / STEP_S)
@@ -97,6 +101,23 @@ def sight_m(encounters: Encounters, eye_m: FloatArray) -> FloatArray:
     before = (encounters.corner_ahead_m - eye_m)[:, None]
     reach = (encounters.lane_m - eye_m[:, None]) / np.maximum(before, 1e-3)
     return np.where(before > 0.0, np.minimum(encounters.corner_m * reach, _FAR_M), _FAR_M)
+
+
+def unseen_from_m(before_m: FloatArray, sight_m: FloatArray, driven_m: float) -> FloatArray:
+    r"""Return how near a vehicle may be that was never in sight, one step after it was `before_m`.
+
+    .. math:: R(t) = \max(S(t), R(t - \Delta t) - v \Delta t) = \max_{t' \le t} S(t') - v (t - t')
+
+    S is how far the lane is seen and v the fastest speed. R is attained by a vehicle at v that was at the
+    edge of sight at the maximising t'. While S grows R is S: what is just behind the edge came from farther
+    behind it, unseen.
+
+    Examples
+    --------
+    >>> unseen_from_m(np.array([40.0, 40.0]), np.array([5.0, 45.0]), driven_m=7.0)
+    array([33., 45.])
+    """
+    return np.maximum(sight_m, before_m - driven_m)
 
 
 def _for_assumed(
@@ -174,10 +195,11 @@ def _needed(encounters: Encounters, ego: EgoVehicle) -> BoolArray:
 
 
 Of = TypeVar("Of")
-UNAWARE, PHANTOM, FULL, CHANCE, LOUD = (
+UNAWARE, PHANTOM, FULL, MEMORY, CHANCE, LOUD = (
     "no knowledge",
     "phantom",
     "phantom, full brakes",
+    "memory",
     "chance",
     "chance, loud",
 )
@@ -228,9 +250,11 @@ def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
     return kept
 
 
-def drives_of(corners: Corners, threshold: float, ego: EgoVehicle) -> CornerDrives:
+def drives_of(
+    corners: Corners, threshold: float, ego: EgoVehicle, *, remembers: bool = False
+) -> CornerDrives:
     """Return the drives of the planner that assumes vehicles from a chance on."""
-    return CornerDrives(*(drive_through(one, threshold, ego) for one in corners))
+    return CornerDrives(*(drive_through(one, threshold, ego, remembers=remembers) for one in corners))
 
 
 def every_planner(corners: Corners, chance: float, loud: float, ego: EgoVehicle) -> dict[str, CornerDrives]:
@@ -239,6 +263,7 @@ def every_planner(corners: Corners, chance: float, loud: float, ego: EgoVehicle)
         UNAWARE: drives_of(corners, np.inf, ego),
         PHANTOM: drives_of(corners, 0.0, ego),
         FULL: drives_of(corners, 0.0, replace(ego, comfortable_mps2=ego.full_mps2)),
+        MEMORY: drives_of(corners, 0.0, ego, remembers=True),
         CHANCE: drives_of(corners, chance, ego),
         LOUD: drives_of(corners, loud, ego),
     }
@@ -300,6 +325,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLOURS = dict(zip((UNAWARE, FULL, PHANTOM, CHANCE, LOUD), CATEGORIES, strict=False))
+_COLOURS[MEMORY] = _COLOURS[PHANTOM]  # Both drive alike where sight only grows
 _TOLD = {UNAWARE: "no knowledge", PHANTOM: "phantom at every corner", FULL: "phantom, full brakes"}
 _ARM_M, _BEHIND_M, _BEYOND_M = 13.0, 9.0, 2.0
 
