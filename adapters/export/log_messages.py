@@ -1,21 +1,20 @@
-"""What a viewer or a log is given of a hop, and where it goes: MCAP files, Rerun, Foxglove on a websocket."""
+"""What a viewer or a log is given of a hop, and where it goes: MCAP files, Rerun."""
 
 import base64
 import json
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO, TypeAlias
+from typing import BinaryIO, TypeAlias
 
 import numpy as np
 
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.files.file_io import GrowingFile, atomic_path
-from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
+from worldstate.ground import FloatArray, InputFileError, nanoseconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
 from worldstate.state.world_state import WorldState, snapshot_schema
@@ -291,40 +290,3 @@ def read_snapshot_lines(path: Path) -> Iterator[str]:
         ) as error:  # zstandard, lz4 and struct each have errors of their own for damaged bytes
             if not (found and isinstance(error, cut_short)):
                 raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
-
-
-@contextmanager
-def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int]]:
-    """Lend a function that sends messages to connected viewers, and the port; 0 takes a free one.
-
-    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound;
-    not so where `paced` is False: microphones that run set the pace themselves.
-    """
-    foxglove = optional("foxglove")
-    # A context of its own: the global one keeps its channels for all servers of the process.
-    context = foxglove.Context()
-    try:
-        server = foxglove.start_server(name="worldstate", port=port, context=context)
-    except (RuntimeError, OverflowError) as error:
-        problem = f"expected a free port, got {port} ({error})"
-        raise InvalidArgumentError(f"--export foxglove: {problem}") from error
-    channels: dict[str, Any] = {}
-    begun_s: float | None = None
-
-    def send(message: LogMessage) -> None:
-        nonlocal begun_s
-        stamp_s = seconds(message.stamp_ns)
-        begun_s = time.monotonic() - stamp_s if begun_s is None else begun_s
-        if paced:
-            time.sleep(max(begun_s + stamp_s - time.monotonic(), 0.0))
-        if message.topic not in channels:
-            schema = foxglove.Schema(name=message.schema_name, encoding="jsonschema", data=message.schema)
-            channels[message.topic] = foxglove.Channel(
-                message.topic, schema=schema, message_encoding="json", context=context
-            )
-        channels[message.topic].log(message.data, log_time=message.stamp_ns)
-
-    try:
-        yield send, server.port
-    finally:
-        server.stop()
