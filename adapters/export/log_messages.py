@@ -2,6 +2,8 @@
 
 import base64
 import json
+import os
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ import numpy as np
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.files.file_io import GrowingFile, atomic_path
 from worldstate.ground import FloatArray, InputFileError, nanoseconds
+from worldstate.ground.errors import MissingExtraError
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
 from worldstate.state.world_state import WorldState, snapshot_schema
@@ -275,6 +278,7 @@ def read_snapshot_lines(path: Path) -> Iterator[str]:
     Of a file that was not finished those are read whose chunk is whole.
     """
     reader, cut_short = optional("mcap.reader").NonSeekingReader, optional("mcap.exceptions").EndOfFile
+    check_chunks(path)
     with path.open("rb") as file:
         found = False
         try:
@@ -290,3 +294,46 @@ def read_snapshot_lines(path: Path) -> Iterator[str]:
         ) as error:  # zstandard, lz4 and struct each have errors of their own for damaged bytes
             if not (found and isinstance(error, cut_short)):
                 raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
+
+
+# Of an MCAP file: its magic number, the head of every record, and that of a chunk up to its compression.
+_MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
+
+
+def check_chunks(path: Path) -> None:
+    """Refuse an MCAP file with a chunk that fills the memory, by what its head and its data say of its size.
+
+    Neither the reader of MCAP nor that of bags has a bound.
+    """
+    with path.open("rb") as file:
+        end, at = file.seek(0, os.SEEK_END), _MAGIC_BYTES
+        while at + _RECORD.size <= end:
+            file.seek(at)
+            kind, length = _RECORD.unpack(file.read(_RECORD.size))
+            if kind == _CHUNK and (size := _decoded_bytes(file.read(min(length, 64)))) > _LARGEST_RECORD:
+                problem = f"expected chunks of at most {_LARGEST_RECORD >> 20} MiB, got one of {size >> 20}"
+                raise InputFileError(path, problem)
+            at += _RECORD.size + length
+
+
+def _decoded_bytes(head: bytes) -> int:
+    """Return how long a chunk is when it is decoded; 0 where it has no whole head."""
+    if len(head) < _CHUNK_HEAD.size:
+        return 0
+    _, _, claimed, _, named = _CHUNK_HEAD.unpack_from(head)
+    name, data = head[_CHUNK_HEAD.size :][:named], head[_CHUNK_HEAD.size + named + 8 :]
+    try:
+        if name == b"zstd":
+            told = int(optional("zstandard").get_frame_parameters(data).content_size)
+            # The largest number stands for a frame that does not tell.
+            return max(claimed, told if told < _UNKNOWN else 0)
+        if name == b"lz4":
+            return max(claimed, int(optional("lz4.frame").get_frame_info(data)["content_size"]))
+    except MissingExtraError:
+        raise
+    except Exception:  # a damaged frame, which the reader refuses with an error of its own
+        return int(claimed)
+    return int(claimed)
+
+
+_UNKNOWN = (1 << 64) - 1
