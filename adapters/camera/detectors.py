@@ -3,13 +3,15 @@
 The output of a model is of YOLO's form.
 """
 
+import io
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, OwnPartError
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
@@ -201,6 +203,8 @@ class OnnxDetector:
         An open model; `open_onnx` opens one from a file.
     labels : tuple of str
         Names of the classes in the order of the model, at least one.
+    name : str
+        Of the model, for messages.
 
     Raises
     ------
@@ -221,13 +225,13 @@ class OnnxDetector:
     (('car',), [[22.0, 27.0, 42.0, 37.0]])
     """
 
-    def __init__(self, session: Any, labels: tuple[str, ...]) -> None:
+    def __init__(self, session: Any, labels: tuple[str, ...], name: str = "model") -> None:
         if not labels:
             raise InvalidArgumentError("labels: expected at least one class name")
         inputs = session.get_inputs()
         if len(inputs) != 1 or len(inputs[0].shape) != 4:
             raise InvalidArgumentError("model: expected one input of shape (1, 3, height, width)")
-        self._labels, self._session = labels, session
+        self._labels, self._session, self._name = labels, session, name
         self._input = str(inputs[0].name)
         sides = inputs[0].shape[2:]
         self._size = tuple(side if isinstance(side, int) and side > 0 else SIDE_PX for side in sides)
@@ -249,11 +253,16 @@ class OnnxDetector:
         ------
         InvalidArgumentError
             If the frame is no colour image or the model's output is not of YOLO's form.
+        OwnPartError
+            If the model fails.
         """
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise InvalidArgumentError(f"frame: expected a colour image, got {frame.dtype} {frame.shape}")
         tensor, scale = self._letterbox(frame)
-        outputs = self._session.run(None, {self._input: tensor})
+        try:
+            outputs = self._session.run(None, {self._input: tensor})
+        except Exception as error:  # onnxruntime raises bare classes of its own
+            raise OwnPartError(self._name, error) from error
         boxes, scores, classes = decode_yolo(outputs[0], len(self._labels))
         limits = np.array([frame.shape[1], frame.shape[0]] * 2, dtype=np.float64)
         return self._best(np.clip(boxes / scale, 0.0, limits), scores, classes)
@@ -316,10 +325,12 @@ def open_onnx(path: str | Path, labels: tuple[str, ...]) -> OnnxDetector:
         raise InputFileError(name, f"expected an ONNX model ({error.strerror})") from error
     onnxruntime = optional("onnxruntime")
     try:
-        session = onnxruntime.InferenceSession(str(name), providers=["CPUExecutionProvider"])
-        return OnnxDetector(session, labels)
+        with redirect_stdout(io.StringIO()):  # it prints that it tries again
+            session = onnxruntime.InferenceSession(str(name), providers=["CPUExecutionProvider"])
+        return OnnxDetector(session, labels, str(name))
     except Exception as error:  # onnxruntime raises bare classes of its own
-        raise InputFileError(name, f"expected an ONNX detector, it does not open: {error}") from error
+        told = " ".join(str(error).split())
+        raise InputFileError(name, f"expected an ONNX detector, it does not open: {told}") from error
 
 
 def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, FloatArray, IntArray]:

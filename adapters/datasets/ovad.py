@@ -5,7 +5,6 @@
 Where the vehicles of a simulated recording really were stands in its ``truth.json``.
 """
 
-import json
 import logging
 import re
 from collections import Counter
@@ -19,7 +18,7 @@ from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.array_match import array_difference, microphone_order
-from worldstate.adapters.files.file_io import read_rows
+from worldstate.adapters.files.file_io import read_json, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
@@ -306,10 +305,10 @@ def read_true_tracks(folder: Path) -> tuple[TrueTrack, ...]:
     if not path.is_file():
         return ()
     try:
-        truth = json.loads(path.read_text(encoding="utf-8"))
+        truth: Any = read_json(path, "the truth of a simulated recording")
         vehicles = [rows for rows in (truth["frames"], *truth.get("others", ())) if rows]
         return tuple(map(_track, vehicles))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputFileError(path, f"expected the truth of a simulated recording: {error!r}") from error
 
 

@@ -1,23 +1,25 @@
-"""What a viewer or a log is given of a hop, and where it goes: MCAP files, Rerun, Foxglove on a websocket."""
+"""What a viewer or a log is given of a hop, and where it goes: MCAP files, Rerun."""
 
 import base64
 import json
 import math
-import time
+import os
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO, TypeAlias
+from typing import BinaryIO, TypeAlias
 
 import numpy as np
 
 from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.files.file_io import GrowingFile, atomic_path
-from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, nanoseconds, seconds
+from worldstate.ground import FloatArray, InputFileError, nanoseconds
+from worldstate.ground.errors import MissingExtraError
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Float32Array
@@ -320,6 +322,7 @@ def read_snapshot_lines(path: Path) -> Iterator[str]:
     Of a file that was not finished those are read whose chunk is whole.
     """
     reader, cut_short = optional("mcap.reader").NonSeekingReader, optional("mcap.exceptions").EndOfFile
+    check_chunks(path)
     with path.open("rb") as file:
         found = False
         try:
@@ -337,38 +340,45 @@ def read_snapshot_lines(path: Path) -> Iterator[str]:
                 raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
 
 
-@contextmanager
-def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int]]:
-    """Lend a function that sends messages to connected viewers, and the port; 0 takes a free one.
+# Of an MCAP file: its magic number, the head of every record, and that of a chunk up to its compression.
+_MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
 
-    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound;
-    not so where `paced` is False: microphones that run set the pace themselves.
+
+def check_chunks(path: Path) -> None:
+    """Refuse an MCAP file with a chunk that fills the memory, by what its head and its data say of its size.
+
+    Neither the reader of MCAP nor that of bags has a bound.
     """
-    foxglove = optional("foxglove")
-    # A context of its own: the global one keeps its channels for all servers of the process.
-    context = foxglove.Context()
-    try:
-        server = foxglove.start_server(name="worldstate", port=port, context=context)
-    except (RuntimeError, OverflowError) as error:
-        problem = f"expected a free port, got {port} ({error})"
-        raise InvalidArgumentError(f"--export foxglove: {problem}") from error
-    channels: dict[str, Any] = {}
-    begun_s: float | None = None
+    with path.open("rb") as file:
+        end, at = file.seek(0, os.SEEK_END), _MAGIC_BYTES
+        while at + _RECORD.size <= end:
+            file.seek(at)
+            kind, length = _RECORD.unpack(file.read(_RECORD.size))
+            if kind == _CHUNK and (size := _decoded_bytes(file.read(min(length, 64)))) > _LARGEST_RECORD:
+                problem = f"expected chunks of at most {_LARGEST_RECORD >> 20} MiB, got one of {size >> 20}"
+                raise InputFileError(path, problem)
+            at += _RECORD.size + length
 
-    def send(message: LogMessage) -> None:
-        nonlocal begun_s
-        stamp_s = seconds(message.stamp_ns)
-        begun_s = time.monotonic() - stamp_s if begun_s is None else begun_s
-        if paced:
-            time.sleep(max(begun_s + stamp_s - time.monotonic(), 0.0))
-        if message.topic not in channels:
-            schema = foxglove.Schema(name=message.schema_name, encoding="jsonschema", data=message.schema)
-            channels[message.topic] = foxglove.Channel(
-                message.topic, schema=schema, message_encoding="json", context=context
-            )
-        channels[message.topic].log(message.data, log_time=message.stamp_ns)
 
+def _decoded_bytes(head: bytes) -> int:
+    """Return how long a chunk is when it is decoded; 0 where it has no whole head."""
+    if len(head) < _CHUNK_HEAD.size:
+        return 0
+    _, _, told_bytes, _, named = _CHUNK_HEAD.unpack_from(head)
+    claimed = int(told_bytes)
+    name, data = head[_CHUNK_HEAD.size :][:named], head[_CHUNK_HEAD.size + named + 8 :]
     try:
-        yield send, server.port
-    finally:
-        server.stop()
+        if name == b"zstd":
+            told = int(optional("zstandard").get_frame_parameters(data).content_size)
+            # The largest number stands for a frame that does not tell.
+            return max(claimed, told if told < _UNKNOWN else 0)
+        if name == b"lz4":
+            return max(claimed, int(optional("lz4.frame").get_frame_info(data)["content_size"]))
+    except MissingExtraError:
+        raise
+    except Exception:  # a damaged frame, which the reader refuses with an error of its own
+        return claimed
+    return claimed
+
+
+_UNKNOWN = (1 << 64) - 1

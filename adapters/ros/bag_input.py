@@ -12,6 +12,7 @@ import numpy as np
 
 from worldstate.adapters.audio import sound_file
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
+from worldstate.adapters.export.log_messages import check_chunks
 from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -120,6 +121,8 @@ def open_bag(path: Path) -> Iterator[BagReader]:
     from rosbags.highlevel import AnyReader
 
     with refused_as_bag(path):
+        for file in path.glob("*.mcap") if path.is_dir() else [path] * (path.suffix == ".mcap"):
+            check_chunks(file)
         # Bags of before ROS 2 Iron hold no definitions; then those that ship here count.
         reader = AnyReader([path], default_typestore=store)
         reader.open()
@@ -139,7 +142,7 @@ def refused_as_bag(path: Path) -> Iterator[None]:
     # A damaged bag fails in SQLite, YAML, struct, zstd or numpy, each with errors of its own; a length
     # that was spoiled asks for more memory than there is.
     except Exception as error:
-        said = str(error) or type(error).__name__
+        said = " ".join(str(error).split()) or type(error).__name__
         if "rofile" in said:  # An MCAP file of another program, such as `run --export mcap=FILE`
             said += "; `worldstate log replay` reads files of snapshots"
         raise InputFileError(path, f"expected a bag of ROS 2 that can be read ({said:.200})") from error

@@ -1,14 +1,19 @@
 """What passes over recordings gave: kept whole, by content, and made again where it is damaged."""
 
 import os
+from dataclasses import replace
 
 import hypothesis.extra.numpy as npst
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worldstate_lab.trials import pass_cache
+from worldstate_lab.trials.classification import windows_origin
 from worldstate_lab.trials.pass_cache import PassCache, fingerprint
 
+from worldstate.adapters.datasets.feature_extraction import LabelledWindow
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_table import HopTable, load_named, load_streams, save_named
 
@@ -115,16 +120,47 @@ def test_a_fingerprint_is_of_the_content_and_of_nothing_else(tmp_path):
     assert len(seen) == 5
 
 
-def test_unchanged_files_are_not_read_again(tmp_path):
+def test_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
+    memo, place = tmp_path / "memo", recording(tmp_path / "one")
+    before = fingerprint(place, memo)
+    monkeypatch.setattr(pass_cache, "content_hash", lambda path: never())
+    assert fingerprint(place, memo) == before
+
+
+def test_other_content_of_the_same_size_and_time_is_seen(tmp_path):
     memo, place = tmp_path / "memo", recording(tmp_path / "one")
     before = fingerprint(place, memo)
     sound = place / "out_multi.wav"
     state = sound.stat()
-    # Same size and time with other content: only reading would tell.
     sound.write_text("X" * state.st_size)
     os.utime(sound, ns=(state.st_atime_ns, state.st_mtime_ns))
-    assert fingerprint(place, memo) == before
-    assert fingerprint(place, tmp_path / "new") != before
+    assert fingerprint(place, memo) != before
+
+
+def test_tables_of_another_pass_under_the_name_are_made_again(tmp_path):
+    cache = PassCache(tmp_path)
+    cache.tables("sound", 1, some_tables)
+    [mine] = tmp_path.rglob("*.npz")
+    cache.tables("sound", 2, dict)
+    [other] = set(tmp_path.rglob("*.npz")) - {mine}
+    for suffixes in ([".npz"], [".npz", ".sum"]):
+        for suffix in suffixes:
+            mine.with_suffix(suffix).write_bytes(other.with_suffix(suffix).read_bytes())
+        with pytest.warns(UserWarning, match="made again"):
+            assert_same(cache.tables("sound", 1, some_tables), some_tables())
+
+
+def test_windows_are_named_by_their_sound_and_not_by_its_place(tmp_path):
+    def origin(folder, **changed):
+        window = LabelledWindow("1", "left", "SA1", "r", 70, tmp_path / folder / "out_multi.wav", 3.0)
+        return windows_origin([replace(window, **changed)], ovad_array(), tmp_path / "memo")
+
+    for folder in ("one", "other"):
+        recording(tmp_path / folder)
+    assert origin("one") == origin("other")
+    seen = {origin("one"), origin("one", label="right"), origin("one", end_s=4.0)}
+    (tmp_path / "one" / "out_multi.wav").write_text("changed")
+    assert len(seen | {origin("one")}) == 4
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"out_multi.wav": "0"}', "\xff"])

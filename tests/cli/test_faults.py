@@ -1,6 +1,5 @@
 """Faults of files, disks and users: one line and exit code 2, nothing destroyed, nothing left behind."""
 
-import json
 import os
 import resource
 import signal
@@ -12,16 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from damaged_files import damaged, write_inputs
 
-from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.operations.recordings.hop_table import HopTable, save_tables
 from worldstate.simulation.dataset.dataset import LogRow, write_log
-from worldstate.state import WorldState
 
 COMMAND = (sys.executable, "-m", "worldstate.cli.main")
 RECORDING = "set/SA1/left/1_00_0000"
@@ -149,47 +145,11 @@ def test_bytes_that_are_no_sound_are_one_line(command, suffix, tmp_path, capsys)
     assert str(sound) in refusal([*command.split(), str(sound), *out], tmp_path, capsys)
 
 
-def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return bytes as a bad disk or a bad hand leaves them: changed, cut, doubled or filled with zeros."""
-    at, end = sorted(rng.integers(0, len(data) + 1, 2).tolist())
-    kind = rng.integers(4)
-    if kind == 0:
-        changed = bytearray(data)
-        for place in rng.integers(0, len(data), 4):
-            changed[place] = rng.integers(256)
-        return bytes(changed)
-    return (data[:at], data[:end] + data[at:], data[:at] + bytes(end - at) + data[end:])[kind - 1]
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """Small inputs of every kind, each of which its command reads."""
     folder = tmp_path_factory.mktemp("whole")
-    rng = np.random.default_rng(1)
-    soundfile.write(folder / "sound.wav", rng.normal(0, 0.1, (9000, 4)), 8000, "PCM_16")
-    array = MicrophoneArray(np.array([[0.0, y, 0.0] for y in (-0.3, -0.1, 0.1, 0.3)]))
-    write_array_xml(folder / "array.xml", array)
-    (folder / "array.csv").write_text("x,y,z\n0,0.1,0\n0,-0.1,0\n0.1,0,0\n")
-    (folder / "array.json").write_text("[[0, 0.1, 0], [0, -0.1, 0], [0.1, 0, 0]]")
-    save_model(folder / "model.json", read_model())
-    columns = {
-        "time_s": 1.0 + 0.1 * np.arange(30), "log_likelihoods": np.zeros((30, 4)),
-        "answer": np.zeros(30, np.int64), "miss_rate": np.ones(30), "clutter_rate": np.zeros(30),
-        "approach": np.full(30, np.nan),
-        "seen": np.zeros(30, bool), "there": np.zeros(30, bool),
-    }  # fmt: skip
-    save_tables(folder / "streams.npz", [HopTable(columns, name="a")])
-    labels = np.array(["none", "left", "front", "right"])
-    table = FeatureTable(rng.random((4, 60)), labels, labels, np.repeat("SA1", 4), labels, (None, 7, 7, 7))
-    write_features(folder / "table.csv", table)
-    (folder / "ids.csv").write_text("ID\nnone\n")
-    frame = {"boxes": [[0, 0, 10, 20]], "scores": [0.9], "classes_str": ["car"]}
-    (folder / "boxes.json").write_text(json.dumps({"detections_per_frame": [frame, frame]}))
-    result = {"image_id": 0, "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}
-    (folder / "coco.json").write_text(json.dumps([result]))
-    write_log(folder, [LogRow("1_00_0002", "SA1", "left", 70)])
-    states = [WorldState(stamp_ns, 0).to_json() for stamp_ns in (0, 10**8, 2 * 10**8)]
-    (folder / "states.jsonl").write_text("\n".join(states) + "\n")
+    write_inputs(folder)
     return folder
 
 

@@ -10,7 +10,9 @@ import time
 import pytest
 from scripted_states import scripted_states
 
-from worldstate.adapters.export.log_messages import live_server, state_messages
+from worldstate.adapters.export import foxglove_server
+from worldstate.adapters.export.foxglove_server import OriginGate, live_server
+from worldstate.adapters.export.log_messages import state_messages
 from worldstate.ground.errors import InvalidArgumentError
 
 pytest.importorskip("foxglove")
@@ -19,18 +21,20 @@ pytest.importorskip("foxglove")
 class Client:
     """As much of RFC 6455 and of the protocol foxglove.sdk.v1 as takes to subscribe and listen."""
 
-    def __init__(self, port):
+    def __init__(self, port, *fields):
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=20.0)
         key = base64.b64encode(os.urandom(16)).decode()
         self.socket.sendall(
             f"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
-            f"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n".encode()
+            f"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n".encode()
+            + "".join(f"{one}\r\n" for one in [*fields, ""]).encode()
         )
         head = b""
         while not head.endswith(b"\r\n\r\n"):
             head += self.socket.recv(1)
-        assert b"101" in head.split(b"\r\n")[0]
+        if b"101" not in head.split(b"\r\n")[0]:
+            raise ConnectionRefusedError(head)
 
     def send(self, value):
         data, mask = json.dumps(value).encode(), b"\0\0\0\0"
@@ -106,3 +110,67 @@ def test_a_port_that_is_taken_is_named():
         port = taken.getsockname()[1]
         with pytest.raises(InvalidArgumentError, match=f"free port, got {port}"), live_server(port):
             pass
+
+
+@pytest.mark.parametrize(
+    ("fields", "taken"),
+    [
+        ([], True),
+        (["Origin: http://localhost:8080"], True),
+        (["Origin: https://app.foxglove.dev"], True),
+        (["origin: https://evil.example"], False),
+        (["Origin: null"], False),
+        (["Origin: http://localhost", "Origin: https://evil.example"], False),
+        (["Origin: https://app.foxglove.dev.evil.example"], False),
+    ],
+)
+def test_a_page_of_the_web_sees_nothing_unless_its_origin_is_named(fields, taken):
+    with live_server(0, origins=["https://app.foxglove.dev"]) as (_, port):
+        if taken:
+            assert Client(port, *fields).receive()["op"] == "serverInfo"
+        else:
+            with pytest.raises(ConnectionRefusedError, match="403"):
+                Client(port, *fields)
+
+
+def test_what_is_no_websocket_is_refused_and_places_are_few():
+    with live_server(0) as (_, port):
+        with socket.create_connection(("127.0.0.1", port), 20.0) as page:
+            page.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert b"403" in page.recv(100)
+        viewers = [Client(port) for _ in range(foxglove_server.MOST_VIEWERS)]
+        with pytest.raises(ConnectionRefusedError):
+            Client(port)
+        viewers.pop().socket.close()
+        until_s = time.monotonic() + 10.0
+        while not viewers[foxglove_server.MOST_VIEWERS - 1 :] and time.monotonic() < until_s:
+            try:
+                viewers.append(Client(port))
+            except ConnectionRefusedError:
+                time.sleep(0.05)
+        assert len(viewers) == foxglove_server.MOST_VIEWERS
+
+
+def test_a_viewer_that_takes_nothing_holds_nobody_up_and_is_let_go(monkeypatch):
+    monkeypatch.setattr(foxglove_server, "STALLED_S", 0.5)
+    gates = []
+    monkeypatch.setattr(
+        foxglove_server, "OriginGate", lambda *given: gates.append(OriginGate(*given)) or gates[0]
+    )
+    state = scripted_states()[0]
+    with live_server(0, paced=False) as (send, port):
+        client = Client(port)
+        client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        for message in state_messages(state):
+            send(message)
+        ids = [one["id"] for said in (client.receive(), client.receive()) for one in said.get("channels", ())]
+        subscriptions = [{"id": 7 + one, "channelId": one} for one in ids]
+        client.send({"op": "subscribe", "subscriptions": subscriptions})
+        begun_s, slowest_s = time.monotonic(), 0.0
+        while not gates[0].stalled and time.monotonic() < begun_s + 20.0:
+            sent_s = time.monotonic()
+            for message in state_messages(state):
+                send(message)
+            slowest_s = max(slowest_s, time.monotonic() - sent_s)
+        assert gates[0].stalled == 1
+        assert slowest_s < 0.4

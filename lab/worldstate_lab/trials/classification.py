@@ -12,6 +12,7 @@ from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.feature_extraction import (
     FRONT,
     FRONT_LATER_S,
+    LabelledWindow,
     extract_features,
     feature_table,
     sample_windows,
@@ -20,7 +21,9 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, read_featur
 from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_array, ovad_domain
 from worldstate.adapters.files.model_file import save_model
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.training.site_references import with_site_references
 from worldstate.operations.training.training import TrainingSettings, fit_ensemble, train_model
@@ -29,7 +32,7 @@ from worldstate.simulation.scene.presets import DEFAULT_PRESET, preset
 from worldstate_lab.features.published_classifier import PublishedClassifier
 from worldstate_lab.streets.simulated_windows import LAYOUT, simulated_window_pair
 
-from .pass_cache import origin_of
+from .pass_cache import fingerprint, origin_of
 from .trial import TakeList, Trial
 
 # Hidden left and hidden right among the explanations.
@@ -185,12 +188,22 @@ def windows_from_recordings(takes: TakeList, folder: Path) -> tuple[FeatureTable
     if not names:
         return None
     found = [window for window in sample_windows(takes.root)[0] if window.path.parent.name in names]
-    path = folder / f"windows-{origin_of([str(takes.root.absolute()), sorted(names)])}.csv"
+    array = choose_array(takes.root)
+    path = folder / f"windows-{windows_origin(found, array, folder / 'fingerprints')}.csv"
     if not path.is_file():
-        array = choose_array(takes.root)
         write_features(path, feature_table(found, list(extract_features(found, array)), array))
     table = read_features(path)
     return table, f"{len(table)} windows of {len(names)} recordings that are not tested"
+
+
+def windows_origin(windows: Sequence[LabelledWindow], array: MicrophoneArray, memo: Path) -> str:
+    """Name what the features of windows depend on: sound, place in it, label and array, in 32 characters."""
+    marks = {path: fingerprint(path, memo) for path in {window.path for window in windows}}
+    listed = [
+        (one.window_id, one.label, one.environment, one.t0_frame, one.end_s, marks[one.path])
+        for one in windows
+    ]
+    return origin_of([listed, array.positions_m.tolist()])
 
 
 def windows_from_simulation(
@@ -225,8 +238,9 @@ def model_from_windows(windows: FeatureTable, folder: Path, seed: int) -> Path:
     ships has heard other ones.
     """
     table = windows.group("static")
-    marks: list[object] = [VERSION, seed, sorted(table.recording_keys.tolist()), float(table.features.sum())]
-    path = folder / f"trained-{origin_of(marks)[:8]}.json"
+    # Beside the numbers, what each row is told to be.
+    told = [table.labels.tolist(), table.recording_keys.tolist(), encode(table.domain)]
+    path = folder / f"trained-{origin_of([VERSION, seed, told, table.features.tolist()])}.json"
     if not path.is_file():
         settings = TrainingSettings(seed=seed, repeats=1)
         save_model(path, train_model(table, settings, dataset="training windows", group="static"))

@@ -55,7 +55,7 @@ RECORDING_NAMES = (AUDIO_NAME, *DETECTION_NAMES, VIDEO_NAME, TRUTH_NAME)
 def fingerprint(place: Path, memo: Path) -> str:
     """Name the content of a recording, a folder in OVAD's layout or one file, in 32 characters.
 
-    Hashes of files by path, size and time of change are kept in the folder `memo`.
+    Hashes of files by path, size, time of change and inode are kept in the folder `memo`.
 
     Examples
     --------
@@ -100,8 +100,9 @@ def _known(path: Path) -> dict[str, str]:
 
 def _stamp(path: Path) -> str:
     # Taken before the file is read: one that changes meanwhile has another stamp, and is read again.
+    # The time of the last writing can be set by anyone who copies, that of the change of the inode cannot.
     state = path.stat()
-    return f"{path.name} {state.st_size} {state.st_mtime_ns}"
+    return f"{path.name} {state.st_size} {state.st_mtime_ns} {state.st_ctime_ns} {state.st_ino}"
 
 
 def content_hash(path: Path) -> str:
@@ -132,16 +133,29 @@ class PassCache:
     ) -> Mapping[str, HopTable]:
         """Return what `make` gave for this `key`, anything ready for JSON that the tables depend on."""
         path = self.folder / pass_name / f"{origin_of(key)}.npz"
+        sealed = path.with_suffix(".sum")
         if path.is_file():
             try:
+                _check_seal(path, sealed)
                 return load_named(path, "tables of a pass")
             except InputFileError as error:
                 warnings.warn(f"{error}; made again", stacklevel=2)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_named(path, make())
+        write_text(sealed, _seal(path))
         # As read, also where just made: JSON makes lists of tuples in `about`, and an interrupted run that
         # goes on shall give what an uninterrupted one does.
         return load_named(path, "tables of a pass")
+
+
+def _seal(path: Path) -> str:
+    return f"{path.stem} {content_hash(path)}\n"
+
+
+def _check_seal(path: Path, sealed: Path) -> None:
+    """Refuse tables that are not those that were written under this name: they may read all the same."""
+    if not sealed.is_file() or sealed.read_bytes() != _seal(path).encode():
+        raise InputFileError(path, f"expected what {sealed.name} was written for")
 
 
 Item = TypeVar("Item")

@@ -51,6 +51,8 @@ def add_output_options(parser: argparse.ArgumentParser) -> "argparse._ArgumentGr
     group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     told = "send states to a viewer, a log or another stack; repeated"
     group.add_argument("--export", action="append", default=[], metavar="NAME=TARGET", help=told)
+    told = "let web pages of this origin see the websocket, such as https://app.foxglove.dev; repeated"
+    group.add_argument("--origin", action="append", default=[], metavar="URL", help=told)
     return group
 
 
@@ -109,9 +111,7 @@ def open_exports(
         exports = Exports()
         for name, target in _asked(arguments):
             if name in _VIEWERS:
-                exports.viewers.append(
-                    opened.enter_context(_viewer(name, target, live, most_bytes(arguments)))
-                )
+                exports.viewers.append(opened.enter_context(_viewer(name, target, live, arguments)))
             else:
                 exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m)))
         yield exports
@@ -123,23 +123,25 @@ def most_bytes(arguments: argparse.Namespace) -> int | None:
     return None if most_mib is None else int(in_range("--rotate-mib", most_mib, 1, 1 << 30)) << 20
 
 
-def _viewer(name: str, target: str, live: bool, full: int | None) -> "AbstractContextManager[LogSink]":
+def _viewer(
+    name: str, target: str, live: bool, arguments: argparse.Namespace
+) -> "AbstractContextManager[LogSink]":
     from worldstate.adapters.export.log_messages import growing_mcap, mcap_file, rerun_file
 
     if name == "foxglove":
-        return _websocket(target, paced=not live)
+        return _websocket(target, not live, arguments.origin)
     if name == "mcap" and live:
-        return growing_mcap(Path(target), full)
+        return growing_mcap(Path(target), most_bytes(arguments))
     return mcap_file(Path(target)) if name == "mcap" else rerun_file(Path(target))
 
 
 @contextmanager
-def _websocket(port: str, paced: bool) -> "Iterator[LogSink]":
-    from worldstate.adapters.export.log_messages import live_server
+def _websocket(port: str, paced: bool, origins: list[str]) -> "Iterator[LogSink]":
+    from worldstate.adapters.export.foxglove_server import live_server
 
     if not port.isdecimal():
         raise InvalidArgumentError(f"--export foxglove: expected a port, got {port}")
-    with live_server(int(port), paced=paced) as (send, found):
+    with live_server(int(port), paced=paced, origins=origins) as (send, found):
         print(f"Foxglove: open connection ws://127.0.0.1:{found}", file=sys.stderr)
         yield send
 

@@ -1,0 +1,237 @@
+"""Foxglove on a websocket: who may connect, and what a viewer costs that does not take what it is sent."""
+
+import io
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from http.client import parse_headers
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+from worldstate.ground import InvalidArgumentError, seconds
+from worldstate.ground.extras import optional
+
+from .log_messages import LogMessage, LogSink
+
+HOST = "127.0.0.1"
+MOST_VIEWERS = 8
+# Messages that wait for a viewer: three seconds of hops. The oldest makes room for the newest.
+MOST_WAITING = 100
+# A viewer that takes nothing for so long is disconnected.
+STALLED_S = 10.0
+_HEAD_S, _HEAD_BYTES, _BLOCK_BYTES, _POLL_S = 5.0, 1 << 13, 1 << 16, 0.2
+_REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+
+
+def is_trusted(origin: str | None, named: Collection[str] = ()) -> bool:
+    """Whether a program of this machine asks, a page that it serves, or one of the origins that are named.
+
+    A page of the web has an origin with its host, a page in a sandbox the origin ``null``; programs have
+    none, or one of their own scheme.
+
+    Examples
+    --------
+    >>> is_trusted(None), is_trusted("http://localhost:8080"), is_trusted("file://")
+    (True, True, True)
+    >>> is_trusted("https://app.foxglove.dev"), is_trusted("null"), is_trusted("http://localhost.evil.example")
+    (False, False, False)
+    >>> is_trusted("https://app.foxglove.dev", ["https://app.foxglove.dev"])
+    True
+    """
+    if origin is None or origin in named:
+        return True
+    try:
+        parts = urlsplit(origin)
+    except ValueError:
+        return False
+    if parts.scheme in ("http", "https"):
+        return parts.hostname in ("localhost", "127.0.0.1", "::1")
+    return bool(parts.scheme)
+
+
+class OriginGate:
+    """Takes viewers at a port, and joins those that may see the states to a server behind it.
+
+    Foxglove's server takes every origin, and a browser lets any page connect to a port of its machine.
+
+    Parameters
+    ----------
+    port : int
+        Where viewers connect; 0 takes a free one.
+    server : (str, int)
+        Host and port of the server.
+    origins : collection of str
+        Of web pages that may connect, such as ``https://app.foxglove.dev``.
+
+    Attributes
+    ----------
+    refused : int
+        Connections that were refused: of another origin, no websocket, or one too many.
+    stalled : int
+        Viewers that were disconnected because they took nothing.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the port is none, or taken.
+    """
+
+    def __init__(self, port: int, server: tuple[str, int], origins: Collection[str] = ()) -> None:
+        try:
+            self._listening = socket.create_server((HOST, port))
+        except (OSError, OverflowError) as error:
+            problem = f"expected a free port, got {port} ({error})"
+            raise InvalidArgumentError(f"--export foxglove: {problem}") from error
+        self.port = int(self._listening.getsockname()[1])
+        self.refused = self.stalled = 0
+        self._server, self._origins = server, frozenset(origins)
+        self._places, self._stopped = threading.Semaphore(MOST_VIEWERS), threading.Event()
+        self._thread = threading.Thread(target=self._accept, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+        self._listening.close()
+
+    def _accept(self) -> None:
+        self._listening.settimeout(_POLL_S)
+        while not self._stopped.is_set():
+            try:
+                viewer, _ = self._listening.accept()
+            except OSError:  # nobody came, or who came has gone
+                continue
+            if self._places.acquire(blocking=False):
+                threading.Thread(target=self._serve, args=(viewer,), daemon=True).start()
+            else:
+                self._refuse(viewer)
+                viewer.close()
+
+    def _serve(self, viewer: socket.socket) -> None:
+        try:
+            with viewer, suppress(OSError):
+                viewer.settimeout(_HEAD_S)
+                head = _head(viewer)
+                if not _may_connect(head, self._origins):
+                    self._refuse(viewer)
+                    return
+                with socket.create_connection(self._server, _HEAD_S) as server:
+                    server.sendall(head)
+                    self._join(viewer, server)
+        finally:
+            self._places.release()
+
+    def _refuse(self, viewer: socket.socket) -> None:
+        self.refused += 1
+        with suppress(OSError):
+            viewer.sendall(_REFUSED)
+
+    def _join(self, viewer: socket.socket, server: socket.socket) -> None:
+        """Pass on what both send until one of them ends."""
+        viewer.settimeout(STALLED_S)
+        server.settimeout(STALLED_S)
+        asks = threading.Thread(target=_pass_on, args=(viewer, server, self._stopped), daemon=True)
+        asks.start()
+        try:
+            _pass_on(server, viewer, self._stopped)
+        except TimeoutError:
+            self.stalled += 1
+        _hang_up(viewer)
+        asks.join()
+
+
+def _pass_on(source: socket.socket, target: socket.socket, stopped: threading.Event) -> None:
+    """Pass on what a socket sends until it ends or the run does; raise TimeoutError where it is not taken."""
+    with suppress(ConnectionError):
+        while not stopped.is_set():
+            try:
+                block = source.recv(_BLOCK_BYTES)
+            except TimeoutError:  # it has nothing to say
+                continue
+            if not block:
+                break
+            target.sendall(block)
+    _hang_up(target)
+
+
+def _hang_up(one: socket.socket) -> None:
+    with suppress(OSError):
+        one.shutdown(socket.SHUT_RDWR)
+
+
+def _head(viewer: socket.socket) -> bytes:
+    """Return what a viewer asks with, up to the empty line; a viewer that sends none is left."""
+    head = b""
+    while not head.endswith(b"\r\n\r\n"):
+        block = viewer.recv(1)
+        if not block or len(head) >= _HEAD_BYTES:
+            raise ConnectionError
+        head += block
+    return head
+
+
+def _may_connect(head: bytes, named: Collection[str]) -> bool:
+    fields = parse_headers(io.BytesIO(head.partition(b"\r\n")[2]))
+    origins = fields.get_all("Origin", [None])
+    upgrade = fields.get("Upgrade", "").lower() == "websocket"
+    return upgrade and all(is_trusted(origin, named) for origin in origins)
+
+
+@contextmanager
+def live_server(
+    port: int, *, paced: bool = True, origins: Collection[str] = ()
+) -> Iterator[tuple[LogSink, int]]:
+    """Lend a function that sends messages to connected viewers, and the port; 0 takes a free one.
+
+    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound;
+    not so where `paced` is False: microphones that run set the pace themselves. A viewer never holds a
+    message back: what it does not take is dropped. For `origins` see `OriginGate`.
+    """
+    # A context of its own: the global one keeps its channels for all servers of the process.
+    context = optional("foxglove").Context()
+    server, host = _hidden_server(context)
+    channels: dict[str, Any] = {}
+    begun_s: float | None = None
+
+    def send(message: LogMessage) -> None:
+        nonlocal begun_s
+        stamp_s = seconds(message.stamp_ns)
+        begun_s = time.monotonic() - stamp_s if begun_s is None else begun_s
+        if paced:
+            time.sleep(max(begun_s + stamp_s - time.monotonic(), 0.0))
+        if message.topic not in channels:
+            channels[message.topic] = _channel(message, context)
+        channels[message.topic].log(message.data, log_time=message.stamp_ns)
+
+    try:
+        with OriginGate(port, (host, server.port), origins) as gate:
+            yield send, gate.port
+    finally:
+        server.stop()
+
+
+def _hidden_server(context: Any) -> tuple[Any, str]:
+    """Start Foxglove's server at an address that only the gate knows; return both.
+
+    Linux has 2^24 addresses of this machine: with the port too many for a page to try. Where there is one
+    only, the port alone is unknown.
+    """
+    start = partial(optional("foxglove").start_server, name="worldstate", port=0, context=context)
+    host = "127." + ".".join(str(secrets.randbelow(254) + 1) for _ in range(3))
+    try:
+        return start(host=host, message_backlog_size=MOST_WAITING), host
+    except RuntimeError:
+        return start(host=HOST, message_backlog_size=MOST_WAITING), HOST
+
+
+def _channel(message: LogMessage, context: Any) -> Any:
+    foxglove = optional("foxglove")
+    schema = foxglove.Schema(name=message.schema_name, encoding="jsonschema", data=message.schema)
+    return foxglove.Channel(message.topic, schema=schema, message_encoding="json", context=context)

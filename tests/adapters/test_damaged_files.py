@@ -1,0 +1,246 @@
+"""Whatever a file holds is read or refused by name: no other error, no gigabyte, no wait."""
+
+import io
+import os
+import resource
+import shutil
+import signal
+import struct
+import traceback
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import zstandard
+from damaged_files import RATE_HZ, spoilt, write_inputs
+
+from worldstate.adapters.audio.sound_file import open_audio, open_sound
+from worldstate.adapters.camera.detections import read_any_detections
+from worldstate.adapters.camera.detectors import open_onnx
+from worldstate.adapters.camera.pinhole import read_camera
+from worldstate.adapters.datasets.feature_extraction import read_labels
+from worldstate.adapters.datasets.feature_table import read_features, read_ids
+from worldstate.adapters.datasets.ovad import OvadDataset, read_true_tracks
+from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.checkpoint_file import read_checkpoint
+from worldstate.adapters.files.context_file import read_context
+from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.files.odometry_file import read_odometry
+from worldstate.adapters.ros.bag_input import read_bag
+from worldstate.adapters.state_log import read_log, read_state_near
+from worldstate.adapters.vehicle.car_file import read_camera_setup, read_car
+from worldstate.ground.errors import WorldstateError
+from worldstate.operations.labelling.street_passes import read_street
+from worldstate.operations.recordings.hop_table import load_streams
+
+# Seconds of the processor; where nothing is computed, the alarm comes after six times as many.
+MOST_BYTES, MOST_S = 1 << 30, 10
+FEW, MANY = 5, 300
+BOMB_MIB, MCAP = 1500, b"\x89MCAP0\r\n"
+
+
+def sound(path: Path) -> None:
+    with open_audio(path) as audio:
+        assert sum(map(len, audio.blocks())) > 0
+
+
+def bag(path: Path) -> None:
+    with open_sound(read_bag(path).sound) as audio:
+        assert sum(map(len, audio.blocks())) >= RATE_HZ
+
+
+def log(path: Path) -> None:
+    assert list(read_log(path))
+
+
+def detector(path: Path) -> None:
+    open_onnx(path, ("car",)).detect(np.zeros((24, 32, 3), np.uint8))
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    **dict.fromkeys(("array.xml", "array.csv", "array.json"), read_array),
+    "camera.json": lambda path: (read_camera(path), read_camera_setup(path)),
+    "car.json": read_car,
+    **dict.fromkeys(("boxes.json", "coco.json"), read_any_detections),
+    "yolo/000000.txt": lambda path: read_any_detections(path.parent, size_px=(640, 480)),
+    "model.json": read_model,
+    "belief.json": read_checkpoint,
+    "street.json": read_street,
+    "context.json": read_context,
+    "odometry.csv": read_odometry,
+    "truth.json": lambda path: read_true_tracks(path.parent),
+    "table.csv": read_features,
+    "ids.csv": read_ids,
+    "labels.csv": lambda path: read_labels(path, path.parent),
+    "DataLog.csv": lambda path: OvadDataset(path.parent),
+    "streams.npz": load_streams,
+    "sound.wav": sound,
+    "states.jsonl": lambda path: (log(path), read_state_near(path, 10**8)),
+    "states.mcap": log,
+    **dict.fromkeys(("log_mcap/log_mcap.mcap", "log_db3/log_db3.db3"), log),
+    "bag_mcap/bag_mcap.mcap": bag,
+    "bag_db3/bag_db3.db3": lambda path: bag(path.parent),
+    "bag_db3/metadata.yaml": lambda path: bag(path.parent),
+    "detector.onnx": detector,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    write_inputs(folder)
+    write_detector(folder / "detector.onnx")
+    return folder
+
+
+def write_detector(path: Path) -> None:
+    """Write a model that finds one car in every image."""
+    make, kind = onnx.helper, onnx.TensorProto.FLOAT
+    image = make.make_tensor_value_info("images", kind, [1, 3, 32, 32])
+    result = make.make_tensor_value_info("output0", kind, [1, 5, 1])
+    car = np.array([[[16.0], [16.0], [20.0], [10.0], [0.9]]], np.float32)
+    none = onnx.numpy_helper.from_array(np.zeros(1, np.float32), "none")
+    nodes = [
+        make.make_node("ReduceMean", ["images"], ["mean"], keepdims=0),
+        make.make_node("Mul", ["mean", "none"], ["zero"]),
+        make.make_node("Add", ["car", "zero"], ["output0"]),
+    ]
+    given = [none, onnx.numpy_helper.from_array(car, "car")]
+    graph = make.make_graph(nodes, "fixed", [image], [result], given)
+    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8), path)
+
+
+def read_each(name: str, folder: Path, seeds: range) -> int:
+    """Read a file once for each seed, each time spoilt in another way; return how many were refused."""
+    data, refused = (folder / name).read_bytes(), 0
+    READERS[name](folder / name)
+    for seed in seeds:
+        (folder / name).write_bytes(spoilt(name, data, np.random.default_rng(seed)))
+        try:
+            limited()
+            READERS[name](folder / name)
+        except WorldstateError as error:
+            refused += 1
+            assert "\n" not in str(error), (seed, str(error))
+        except BaseException as error:
+            raise AssertionError(f"seed {seed}") from error
+    return refused
+
+
+def limited() -> None:
+    """Let the system end this process after the time that a file may take, from now on."""
+    signal.setitimer(signal.ITIMER_PROF, MOST_S)
+    signal.alarm(6 * MOST_S)
+
+
+def in_child(work: Callable[[], int], report: Path) -> None:
+    """Work in a process of its own, whose memory is measured and which the system ends when it hangs."""
+    child = os.fork()
+    if not child:
+        try:
+            for ended in (signal.SIGALRM, signal.SIGPROF):
+                signal.signal(ended, signal.SIG_DFL)
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            resource.setrlimit(resource.RLIMIT_AS, (16 * MOST_BYTES, 16 * MOST_BYTES))
+            refused = work()
+            taken = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
+            assert taken < MOST_BYTES, f"{taken >> 20} MiB"
+            report.write_text(f"{refused}")
+            os._exit(0)
+        except BaseException:
+            report.write_text(traceback.format_exc())
+            os._exit(1)
+    _, status = os.waitpid(child, 0)
+    assert status == 0, report.read_text() if report.exists() else f"ended by signal {os.WTERMSIG(status)}"
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("times", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+def test_a_damaged_file_is_read_or_refused(name, times, whole, tmp_path):
+    shutil.copytree(whole, folder := tmp_path / "files")
+    in_child(lambda: read_each(name, folder, range(times)), report := tmp_path / "report")
+    assert int(report.read_text()) >= times // 4
+
+
+def zeros_zip(path: Path) -> None:
+    """Write npz whose one array says that it is short, and is followed by 3 GB of zeros."""
+    head = io.BytesIO()
+    np.lib.format.write_array(head, np.zeros(3), version=(1, 0))
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("a.npy", "w", force_zip64=True) as member,
+    ):
+        member.write(head.getvalue())
+        for _ in range(3 * BOMB_MIB):
+            member.write(bytes(1 << 20))
+
+
+def long_zip(path: Path) -> None:
+    """Write npz whose one array says that it has 10^12 numbers."""
+    head = io.BytesIO()
+    shape = {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
+    np.lib.format.write_array_header_1_0(head, shape)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", head.getvalue())
+
+
+def many_zip(path: Path) -> None:
+    """Write npz with a hundred thousand members."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for number in range(100_000):
+            archive.writestr(f"{number}.npy", b"")
+
+
+def chunk_bomb(path: Path, claimed: int | None = None) -> None:
+    """Write MCAP with one chunk of 1.5 GB, which may say that it is smaller."""
+    writing = zstandard.ZstdCompressor().compressobj(size=BOMB_MIB << 20)
+    data = b"".join([writing.compress(bytes(1 << 20)) for _ in range(BOMB_MIB)] + [writing.flush()])
+    size = BOMB_MIB << 20 if claimed is None else claimed
+    record = struct.pack("<QQQII", 0, 0, size, 0, 4) + b"zstd" + struct.pack("<Q", len(data)) + data
+    head = struct.pack("<BQ", 1, 8) + bytes(8)
+    path.write_bytes(MCAP + head + struct.pack("<BQ", 6, len(record)) + record)
+
+
+def constant_bomb(path: Path) -> None:
+    """Write a model that fills 40 GB, 4 x 10^10 numbers being asked of one node."""
+    make, kind = onnx.helper, onnx.TensorProto
+    image = make.make_tensor_value_info("images", kind.FLOAT, [1, 3, 32, 32])
+    shape = onnx.numpy_helper.from_array(np.array([1, 100_000, 100_000], np.int64), "shape")
+    result = make.make_tensor_value_info("output0", kind.FLOAT, None)
+    nodes = [make.make_node("ConstantOfShape", ["shape"], ["output0"])]
+    graph = make.make_graph(nodes, "large", [image], [result], [shape])
+    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8), path)
+
+
+BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
+    "zeros.npz": (zeros_zip, load_streams),
+    "long.npz": (long_zip, load_streams),
+    "many.npz": (many_zip, load_streams),
+    "chunk.mcap": (chunk_bomb, log),
+    "secret.mcap": (lambda path: chunk_bomb(path, 1000), log),
+    "chunk_bag.mcap": (chunk_bomb, bag),
+    "secret_bag.mcap": (lambda path: chunk_bomb(path, 1000), bag),
+    "lists.json": (lambda path: path.write_text("[" + "[]," * 20_000_000 + "[]]"), read_any_detections),
+    "line.jsonl": (lambda path: path.write_bytes(b"[" * (1 << 28)), log),
+    "deep.xml": (lambda path: path.write_text("<a>" * 300_000), read_array),
+    "constant.onnx": (constant_bomb, detector),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_small_file_that_grows_is_refused(name, tmp_path):
+    write, read = BOMBS[name]
+    write(tmp_path / name)
+
+    def refused() -> int:
+        limited()
+        with pytest.raises(WorldstateError, match=name):
+            read(tmp_path / name)
+        return 1
+
+    in_child(refused, tmp_path / "report")
