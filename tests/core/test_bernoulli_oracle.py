@@ -1,6 +1,8 @@
 """Existence of a target that is found half the time, and goes or is half hidden: Stone Soup's and ours."""
 
+import runpy
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,3 +173,11 @@ def test_ten_empty_scans_of_a_lane_half_hidden_leave_what_the_hidden_half_may_ho
     # Stock, ten scans that find nothing change nothing.
     np.testing.assert_array_equal(half_hidden(Stock), 0.5)
     assert law[-1] == pytest.approx(1.0 / 3.0, abs=1e-3)
+
+
+def test_the_example_prints_what_stands_on_the_page(capsys):
+    pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
+    docs = Path(__file__).resolve().parents[2] / "docs"
+    runpy.run_path(str(docs / "examples" / "stone_soup.py"), run_name="__main__")
+    page = (docs / "guide" / "from_stone_soup_and_odas.md").read_text(encoding="utf-8")
+    assert f"```text\n{capsys.readouterr().out}```" in page

@@ -113,7 +113,7 @@ def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
 
 
 def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch):
-    page = Path(__file__).resolve().parents[2] / "docs" / "guide" / "live.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "live_details.md"
     (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     (tmp_path / "mics.csv").write_text((street / "mics.csv").read_text())
     lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
@@ -132,7 +132,7 @@ def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch)
         assert latency_s > 0.0
 
     given = {"publish": publish, "detector": SimpleNamespace(detect=lambda image: found)}
-    exec(compile(program, "live.md", "exec"), given)
+    exec(compile(program, "live_details.md", "exec"), given)
     assert len(published) == 10, "at 8 kHz the last hop waits for later sound"
     assert [view.sensor for view in published[-1].searched] == ["camera"]
 

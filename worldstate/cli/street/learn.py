@@ -68,8 +68,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         _draw(arguments, [before, *stages], street)
     arms, heard = {arm.direction: _figures(arm) for arm in street.arms}, street.patterns.sides() is not None
     found = {"out": str(arguments.out), "n_passes": len(stages), "arms": arms, "sides_heard": heard}
-    lines = [f"{len(stages)} passes", *(_line(arm) for arm in street.arms), _heard(street)]
-    return output.CommandResult(found, lines=lines)
+    lines = [*(_line(arm) for arm in street.arms), _heard(street)]
+    return output.CommandResult(found, {key: found[key] for key in ("out", "n_passes")}, lines)
 
 
 def _check(arguments: argparse.Namespace) -> None:
