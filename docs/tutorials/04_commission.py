@@ -8,7 +8,7 @@ from worldstate.commissioning.heard_stream import CommissionSettings, quick_sett
 from worldstate.commissioning.stream_exam import exam_figures, write_exam_figure
 
 array = MicrophoneArray([(x, y, 0.0) for x in (0.1, -0.1) for y in (0.1, -0.1)])
-settings = quick_settings(CommissionSettings(onsets_per_hour=20.0, bandwidth_hz=1000.0))
+settings = quick_settings(CommissionSettings(onsets_per_hour=20.0))
 model = commission(array, settings, Path("out/tutorials/streams"))  # what was heard once is kept there
 examined = exam_of(array, model, settings, Path("out/tutorials/streams"))
 print(f"fit for use: {model.provenance.fit_for_use}")

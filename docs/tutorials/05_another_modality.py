@@ -2,7 +2,7 @@
 
 from worldstate import Measurement, NotUsable, SignatureEvidence, Unqueried, WorldFilter
 
-# Log-likelihoods, nats: a hidden vehicle on the left makes the wall brighter by 3 +- 1, anything else by 0 +- 1.
+# Nats: the wall is brighter by 3 +- 1 with a hidden vehicle on the left, else by 0 +- 1.
 world, states, no_sound = WorldFilter(), [], NotUsable("not measured by light")
 for brighter in (0.1, -0.4, 1.2, 2.6, 3.3, 2.9, 3.4, 2.7, 3.1, 2.8, 0.3, -0.2, 0.1, 0.4, -0.3):
     hidden, other = -0.5 * (brighter - 3.0) ** 2, -0.5 * brighter**2
