@@ -233,8 +233,9 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
     place = array.centred_m[:, [across, up]]
     with style.figure_file(path, 7.5, 6.0) as figure:
         axes = figure.add_subplot()
-        axes.scatter(place[:, 0], place[:, 1], s=_AREA, color="0.85", lw=0)
-        axes.scatter([], [], s=_LEGEND_AREA, color="0.85", lw=0, label="well")
+        for points, area, label in ((place, _AREA, None), (place[:0], _LEGEND_AREA, "well")):
+            x, y = points.T
+            axes.scatter(x, y, s=area, color="white", edgecolors="0.6", lw=0.8, label=label)
         drawn: Counter[int] = Counter()
         for fault in sorted({verdict.fault for verdict in health.verdicts}):
             channels = [verdict.channel for verdict in health.verdicts if verdict.fault == fault]
