@@ -35,5 +35,8 @@ def announced(messages: int) -> WorldState:
 if __name__ == "__main__":
     for state in (radar_alone(10), announced(10)):
         (car,) = state.entities
-        print(car.status, round(car.existence_probability, 2), "time to visible", car.time_to_visible_s)
-        print("  at", car.position_m, "m with", car.velocity_mps, "m/s, covariance", car.covariance)
+        x_m, y_m, _ = car.position_m or (math.nan,) * 3
+        print(f"{car.status}, exists with {car.existence_probability:.2f}, at ({x_m:.1f}, {y_m:.1f}) m")
+        if car.time_to_visible_s is not None:
+            low, _, high = car.time_to_visible_s
+            print(f"  in view in {low:.1f} to {high:.1f} s")

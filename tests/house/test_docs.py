@@ -67,7 +67,7 @@ def test_objects_that_a_page_links_are_exported(page):
 
 
 PROGRAMS = {one.name: one for one in (PROGRAM, LABORATORY)}
-CALL = r"(?:`|^    |&& )(worldstate(?:-lab)?) ([a-z][^`\n&]*)"
+CALL = r"(?:`|^    |^\$ |&& )(worldstate(?:-lab)?) ([a-z][^`\n&]*)"
 
 
 @cache
@@ -92,18 +92,6 @@ def test_files_that_a_page_names_exist(page):
         page.read_text(encoding="utf-8"),
     )
     assert [name for name in named if not (ROOT / name).exists()] == []
-
-
-def test_the_programs_of_the_first_page_run(approach, tmp_path, monkeypatch, capsys):
-    text = (ROOT / "docs" / "guide" / "first_program.md").read_text(encoding="utf-8")
-    (tmp_path / "out" / "demo").mkdir(parents=True)
-    (tmp_path / "out" / "demo" / "recording").symlink_to(approach.folder.parents[2])
-    monkeypatch.chdir(tmp_path)
-    for number, program in enumerate(re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)):
-        exec(compile(program, f"program {number}", "exec"), {})
-    printed = capsys.readouterr().out
-    assert "hidden vehicle" in printed
-    assert "alpha None" in printed
 
 
 def test_figures_are_those_that_the_laboratory_wrote():

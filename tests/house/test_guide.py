@@ -1,0 +1,116 @@
+"""The pages of docs/guide run as they are printed, and what they print is what stands on them.
+
+A `console` block holds commands after `$ ` and their output below them, a `python` block a program whose
+output stands in the `text` block after it; `...` stands for any text. A `code-block` with a caption is the
+file of that name. Commands run from top to bottom in a folder that holds what `worldstate demo` leaves.
+"""
+
+import contextlib
+import doctest
+import io
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from worldstate.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted((ROOT / "docs" / "guide").glob("*.md"))
+# The fixture has done what `worldstate demo` does, in seven seconds of processor time.
+PREPARED = ("worldstate demo ",)
+# A quick `model make` takes two minutes of processor time, and the commands after it need its model.
+SLOW = ("model_for_an_array",)
+FENCE = re.compile(
+    r"^```(console|python|text|\{code-block\})(?: \w+\n:caption: (\S+)\n)?\n(.*?)^```$", re.M | re.S
+)
+COMMAND = re.compile(r"^\$ ((?:.*\\\n)*.*)\n((?:(?!\$ ).*\n)*)", re.M)
+
+
+def steps(text: str) -> Iterator[tuple[str, str, str]]:
+    """Yield the steps of a page: kind, text, and what it prints (of a file its name)."""
+    blocks = FENCE.findall(text)
+    for (kind, name, body), (after, _, printed) in zip(blocks, [*blocks[1:], ("", "", "")], strict=True):
+        if kind == "console":
+            yield from (("console", *found) for found in COMMAND.findall(body))
+        elif kind == "python":
+            yield kind, body, printed if after == "text" else ""
+        elif name:
+            yield "file", body.removeprefix("\n"), name
+
+
+def output_of(kind: str, text: str, printed: str) -> str:
+    """Do one step in the current folder; return what it printed."""
+    if kind == "file":
+        Path(printed).write_text(text, encoding="utf-8")
+        return printed
+    words = [] if kind == "python" else shlex.split(text.replace("\\\n", ""), comments=True)
+    if words and words[0] != "worldstate":
+        words[:1] = [sys.executable] if words[0] == "python" else words[:1]
+        return subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
+        if kind == "python":
+            exec(compile(text, "program of the page", "exec"), {"__name__": "__main__"})
+        # A refusal on a page is shown as such.
+        elif (code := main(words[1:])) and not printed.startswith("worldstate: "):
+            raise AssertionError(f"{text} ended with {code}: {out.getvalue()}")
+    return out.getvalue()
+
+
+def without_margins(text: str) -> str:
+    # A slow machine is told how far a command has come.
+    text = re.sub(r"^worldstate: .* % after \d+ s\n", "", text, flags=re.M)
+    return "\n".join(line.rstrip() for line in text.strip("\n").splitlines()) + "\n"
+
+
+def expect_as_printed(step: tuple[str, str, str]) -> None:
+    got, printed = without_margins(output_of(*step)), without_margins(step[2])
+    alike = printed == got or doctest.OutputChecker().check_output(printed, got, doctest.ELLIPSIS)
+    assert alike, f"{step[1]}\nprinted\n{got}\nand the page has\n{printed}"
+
+
+@pytest.fixture(scope="session")
+def desk(approach, tmp_path_factory) -> Path:
+    """Return a folder with the demo's recording and the examples of this repository."""
+    folder = tmp_path_factory.mktemp("guide")
+    shutil.copytree(approach.folder.parents[2], folder / "out" / "demo" / "recording")
+    shutil.copytree(ROOT / "docs" / "examples", folder / "docs" / "examples")
+    return folder
+
+
+def marked(page: Path) -> object:
+    return pytest.param(page, id=page.stem, marks=[pytest.mark.slow] * (page.stem in SLOW))
+
+
+@pytest.mark.parametrize("page", [*map(marked, PAGES)])
+def test_a_page_runs_and_prints_what_stands_on_it(page, desk, tmp_path, monkeypatch):
+    shutil.copytree(desk, tmp_path / "desk", copy_function=os.link)
+    monkeypatch.chdir(tmp_path / "desk")
+    for step in steps(page.read_text(encoding="utf-8")):
+        if not step[1].startswith(PREPARED):
+            expect_as_printed(step)
+
+
+@pytest.mark.slow
+def test_the_demo_prints_what_stands_on_the_first_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    expect_as_printed(next(steps((ROOT / "docs" / "guide" / "first_program.md").read_text(encoding="utf-8"))))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_teaches_one_task_briefly(page):
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 120
+    assert [line for line in lines if len(line) > 140 and not line.startswith("|")] == []
+    assert sum(bool(re.match(r"\|[-| ]+\|$", line)) for line in lines) <= 1
+    assert not [line for line in lines if line.startswith("    worldstate ")], "expected a console block"
+
+
+def test_the_guide_is_short():
+    assert len(PAGES) <= 14
