@@ -19,7 +19,7 @@ from worldstate.ground.values import NotUsable
 
 FILTER = {f"{name}_{n}" for name in ("update", "state") for n in (1, 20, 64, 600)}
 BATCHES = {"numpy_batch_1", "numpy_batch_20"}
-WHOLE = "front_end", "everything", "evidence", "feature_chain"
+WHOLE = "front_end", "everything", "evidence", "feature_chain", "sound_to_state"
 
 
 def test_the_files_of_a_hop_are_those_that_it_executes(capsys):

@@ -8,9 +8,10 @@ example: worldstate-lab bench
 """
 
 import argparse
+import io
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from itertools import pairwise
@@ -18,11 +19,16 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.camera.detections import DetectionFrame
+from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.listener import Listener
+from worldstate.adapters.live.live_listening import LiveStep
+from worldstate.adapters.live.live_sound import block_samples
 from worldstate.adapters.source import open_source
+from worldstate.cli.common.live_view import view_of
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
@@ -30,7 +36,7 @@ from worldstate.frontend.array.microphone_array import ovad_array, roof_array_56
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.checks import in_range
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, ImageArray
 from worldstate.ground.values import nanoseconds
 from worldstate_lab.benchmarks.hop_costs import (
     FRONT_END,
@@ -62,6 +68,8 @@ SETTINGS = {
     "stages": "56 channels, 47,998 Hz, Hann 512, hop 256, 18 or 19 new frames a hop; STFT bins 1-18; SRP "
     "bins 3-18, 181 azimuths; feature bins 1-15, 30 azimuths x 2 halves; "
     "tone 20-400 Hz, 1 s at 1231 Hz, every hop",
+    "sound_to_state": "the whole chain from the last 25 ms of a hop to its snapshot as JSON, with an image "
+    "of 968 x 304 px in which a car moves, by background subtraction, and what the terminal shows",
     "published_chain": "per hop: scipy.signal.stft of the file, channel by channel, its cost shared among "
     "the hops; pyroomacoustics SRP, 30 azimuths, 50-1500 Hz (bins 1-15), on each half of one second; against "
     "stft + phat + feature",
@@ -142,7 +150,8 @@ def _one_round(street: Float32Array) -> Mapping[str, Milliseconds]:
     ours = {name: times[WARM_UP_HOPS:] for name, times in ours.items()}
     installed = find_spec("pyroomacoustics") is not None
     peer = {"published_chain": published_chain_times(street)} if installed else {}
-    return ours | evidence_times(heard) | peer | tracker_times(np.random.default_rng(1))
+    live = {"sound_to_state": live_times(hops)}
+    return ours | evidence_times(heard) | live | peer | tracker_times(np.random.default_rng(1))
 
 
 def _hops(sound: Float32Array) -> list[Float32Array]:
@@ -160,6 +169,28 @@ def processed(
         heard.extend(front_end.process(samples))
 
     return [partial(process, samples) for samples in hops], heard
+
+
+def live_times(hops: Sequence[Float32Array]) -> Milliseconds:
+    """Time `worldstate live` with a camera and the terminal's view, from the last block of a hop on."""
+    listener, detector = Listener(open_source("microphones", array=ovad_array()), RATE_HZ), MotionDetector()
+    screen, street = Console(file=io.StringIO(), force_terminal=True), np.full((304, 968, 3), 90, np.uint8)
+    times: Milliseconds = []
+    for number, hop in enumerate(hops, start=1):
+        early, last = np.split(hop, [-block_samples(RATE_HZ)])
+        for _ in listener.steps(early):  # none ends in it
+            pass
+        image = street.copy()
+        image[100:250, 10 * number % 800 :][:, :150] = 220
+
+        def one_hop(number: int = number, last: Float32Array = last, image: ImageArray = image) -> None:
+            listener.look(nanoseconds(0.1 * number - 0.05), detector.detect(image))
+            for step in listener.steps(last):
+                step.state.to_json()
+                screen.print(view_of(LiveStep(step, 0.0, 0, 0.0)))
+
+        times.append(elapsed_ms(one_hop))
+    return times[WARM_UP_HOPS:]
 
 
 def executed_files(street: Float32Array) -> list[str]:
