@@ -1,6 +1,7 @@
 """Foxglove on a websocket: who may connect, and what a viewer costs that does not take what it is sent."""
 
 import io
+import logging
 import secrets
 import socket
 import threading
@@ -17,6 +18,7 @@ from worldstate.ground.extras import optional
 
 from .log_messages import LogMessage, LogSink
 
+_LOG = logging.getLogger(__name__)
 HOST = "127.0.0.1"
 MOST_VIEWERS = 8
 # Messages that wait for a viewer: three seconds of hops. The oldest makes room for the newest.
@@ -100,6 +102,9 @@ class OriginGate:
         self._stopped.set()
         self._thread.join()
         self._listening.close()
+        if self.refused or self.stalled:
+            told = "websocket: %d connections were refused, %d viewers took nothing"
+            _LOG.warning(told, self.refused, self.stalled)
 
     def _accept(self) -> None:
         self._listening.settimeout(_POLL_S)

@@ -4,17 +4,20 @@ A place is as measured, or in the crossing lane where only the azimuth is known.
 """
 
 import json
+import logging
 import math
 import socket
 import struct
+import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 
@@ -436,16 +439,94 @@ class OdasTracks:
 
 
 @contextmanager
-def odas_socket(address: str) -> Iterator[Callable[[WorldState], None]]:
-    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's message."""
+def odas_socket(address: str, *, live: bool = False) -> Iterator[Callable[[WorldState], None]]:
+    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's message.
+
+    A listener that is slow is waited for, and one that leaves is an error; not so in a `live` run, where a
+    `LiveSender` drops what is not taken.
+    """
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise InvalidArgumentError(f"--export odas: expected HOST:PORT, got {address}")
-    tracks = OdasTracks()
+    tracks, target = OdasTracks(), (host, int(port))
     try:
-        connection = socket.create_connection((host, int(port)), timeout=10.0)
+        connection = socket.create_connection(target, TAKEN_S)
     except OSError as error:
         # It has no file name, by which the command would name it.
         raise InvalidArgumentError(f"--export odas: expected a listener at {address} ({error})") from error
-    with connection:
-        yield lambda state: connection.sendall(tracks.message(state).encode())
+    if live:
+        with LiveSender(target, connection) as sender:
+            yield lambda state: sender.put(tracks.message(state).encode())
+    else:
+        with connection:
+            yield lambda state: connection.sendall(tracks.message(state).encode())
+
+
+_LOG = logging.getLogger(__name__)
+# A listener that takes nothing for so long is disconnected; one that has gone is asked for as often as this.
+TAKEN_S, AGAIN_S = 10.0, 1.0
+# Two seconds of hops: older states are of no use.
+MOST_WAITING = 20
+
+
+class LiveSender:
+    """Send messages in a thread of its own, so that no listener holds a run up or ends it.
+
+    Parameters
+    ----------
+    target : (str, int)
+        Host and port to connect to again after the listener left.
+    connection : socket
+        To it.
+
+    Attributes
+    ----------
+    dropped : int
+        Messages that were not taken.
+    """
+
+    def __init__(self, target: tuple[str, int], connection: socket.socket) -> None:
+        self._target, self._connection = target, connection
+        self._waiting, self.dropped = deque[bytes](), 0
+        self._changed, self._stopped = threading.Condition(), threading.Event()
+        self._thread = threading.Thread(target=self._send, daemon=True)
+
+    def put(self, message: bytes) -> None:
+        """Hand a message over; the oldest one makes room."""
+        with self._changed:
+            if len(self._waiting) == MOST_WAITING:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append(message)
+            self._changed.notify()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Give what waits a second to be taken."""
+        with self._changed:
+            self._stopped.set()
+            self._changed.notify()
+        self._thread.join(AGAIN_S)
+        self._connection.close()
+        if self.dropped:
+            _LOG.warning("%s:%d did not take %d messages", *self._target, self.dropped)
+
+    def _send(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._stopped.is_set())
+                if not self._waiting:
+                    return
+                message = self._waiting.popleft()
+            try:
+                self._connection.sendall(message)
+            except OSError:  # the listener has gone, or has half a message
+                self.dropped += 1
+                self._connection.close()
+                if self._stopped.wait(AGAIN_S):
+                    return
+                with suppress(OSError):
+                    self._connection = socket.create_connection(self._target, TAKEN_S)

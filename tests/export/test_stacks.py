@@ -7,7 +7,9 @@ import re
 import socket
 import subprocess
 import threading
+import time
 import uuid
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 
@@ -17,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_states import EGO, scripted_states
 
+from worldstate.adapters.export import other_stacks
 from worldstate.adapters.export.other_stacks import (
     OdasTracks,
     autoware_objects,
@@ -335,6 +338,38 @@ class OdasStudio:
         for part in whole:
             opened = part if part.startswith("{") else "{" + part
             self.messages.append(opened if "}" in opened[-3:-1] else opened + "}")
+
+
+def test_a_listener_that_leaves_does_not_end_a_live_run(monkeypatch):
+    monkeypatch.setattr(other_stacks, "AGAIN_S", 0.05)
+    server = socket.create_server(("127.0.0.1", 0))
+    address = f"127.0.0.1:{server.getsockname()[1]}"
+    with server, other_stacks.odas_socket(address, live=True) as send:
+        first, _ = server.accept()
+        send(HIDDEN)
+        assert first.recv(10)
+        first.close()
+        server.settimeout(0.1)
+        until_s, again = time.monotonic() + 20.0, None
+        while again is None and time.monotonic() < until_s:
+            send(HIDDEN)
+            with suppress(TimeoutError):
+                again, _ = server.accept()
+        send(HIDDEN)
+        again.settimeout(20.0)
+        assert again.recv(10)
+        again.close()
+
+
+def test_a_listener_that_takes_nothing_holds_nobody_up():
+    server = socket.create_server(("127.0.0.1", 0))
+    target = server.getsockname()
+    with server, other_stacks.LiveSender(target, socket.create_connection(target, 10.0)) as sender:
+        begun_s = time.monotonic()
+        for _ in range(100):
+            sender.put(bytes(1 << 20))
+        assert time.monotonic() - begun_s < 5.0
+        assert sender.dropped >= 50
 
 
 def test_odas_studio_gets_tracks_that_keep_their_numbers(log):

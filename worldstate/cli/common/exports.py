@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,7 +114,7 @@ def open_exports(
             if name in _VIEWERS:
                 exports.viewers.append(opened.enter_context(_viewer(name, target, live, arguments)))
             else:
-                exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m)))
+                exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m, live)))
         yield exports
 
 
@@ -146,7 +147,7 @@ def _websocket(port: str, paced: bool, origins: list[str]) -> "Iterator[LogSink]
         yield send
 
 
-def _stack(name: str, target: str, crossing_m: float) -> "Stack":
+def _stack(name: str, target: str, crossing_m: float, live: bool) -> "Stack":
     from worldstate.adapters.export import other_stacks
     from worldstate.adapters.own_parts import ExporterPart, load_part, own_exporter
     from worldstate.adapters.ros.bag_writer import state_bag
@@ -154,7 +155,7 @@ def _stack(name: str, target: str, crossing_m: float) -> "Stack":
     own: dict[str, ExporterPart] = {
         "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m),
         "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m),
-        "odas": other_stacks.odas_socket,
+        "odas": partial(other_stacks.odas_socket, live=live),
         "rosbag": lambda path: state_bag(Path(path), crossing_m),
         "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),
     }
