@@ -8,6 +8,7 @@ file of that name. Commands run from top to bottom in a folder that holds what `
 import contextlib
 import doctest
 import io
+import logging
 import os
 import re
 import shlex
@@ -45,6 +46,19 @@ def steps(text: str) -> Iterator[tuple[str, str, str]]:
             yield "file", body.removeprefix("\n"), name
 
 
+@contextlib.contextmanager
+def everything_printed() -> Iterator[io.StringIO]:
+    """Lend what is printed, and logged warnings: a terminal shows these, pytest takes them away."""
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
+        logged = logging.StreamHandler(out)
+        logged.setLevel(logging.WARNING)
+        logging.getLogger().addHandler(logged)
+        try:
+            yield out
+        finally:
+            logging.getLogger().removeHandler(logged)
+
+
 def output_of(kind: str, text: str, printed: str) -> str:
     """Do one step in the current folder; return what it printed."""
     if kind == "file":
@@ -54,7 +68,7 @@ def output_of(kind: str, text: str, printed: str) -> str:
     if words and words[0] != "worldstate":
         words[:1] = [sys.executable] if words[0] == "python" else words[:1]
         return subprocess.run(words, check=True, capture_output=True, text=True).stdout
-    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
+    with everything_printed() as out:
         if kind == "python":
             exec(compile(text, "program of the page", "exec"), {"__name__": "__main__"})
         # A refusal on a page is shown as such.
