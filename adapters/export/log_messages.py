@@ -5,7 +5,7 @@ import json
 import os
 import struct
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +17,6 @@ import numpy as np
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.files.file_io import GrowingFile, atomic_path
 from worldstate.ground import FloatArray, InputFileError, nanoseconds
-from worldstate.ground.errors import MissingExtraError
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.serialisation import encode
 from worldstate.state.world_state import WorldState, snapshot_schema
@@ -322,18 +321,14 @@ def _decoded_bytes(head: bytes) -> int:
         return 0
     _, _, claimed, _, named = _CHUNK_HEAD.unpack_from(head)
     name, data = head[_CHUNK_HEAD.size :][:named], head[_CHUNK_HEAD.size + named + 8 :]
-    try:
+    told = 0
+    with suppress(Exception):  # of a damaged frame, which the reader refuses
         if name == b"zstd":
             told = int(optional("zstandard").get_frame_parameters(data).content_size)
-            # The largest number stands for a frame that does not tell.
-            return max(claimed, told if told < _UNKNOWN else 0)
-        if name == b"lz4":
-            return max(claimed, int(optional("lz4.frame").get_frame_info(data)["content_size"]))
-    except MissingExtraError:
-        raise
-    except Exception:  # a damaged frame, which the reader refuses with an error of its own
-        return int(claimed)
-    return int(claimed)
+        elif name == b"lz4":
+            told = int(optional("lz4.frame").get_frame_info(data)["content_size"])
+    return max(int(claimed), told if told < _UNTOLD else 0)
 
 
-_UNKNOWN = (1 << 64) - 1
+# The size of a frame that has none.
+_UNTOLD = (1 << 64) - 1
