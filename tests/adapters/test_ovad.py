@@ -9,7 +9,13 @@ import soundfile
 from released_data import FOLDER
 
 from worldstate.adapters.datasets.feature_table import read_ids
-from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
+from worldstate.adapters.datasets.ovad import (
+    DETECTION_NAMES,
+    OvadDataset,
+    Recording,
+    choose_array,
+    read_true_tracks,
+)
 from worldstate.ground.errors import InputFileError
 
 HEADER = "ID,Environment,Class,T0"
@@ -147,3 +153,25 @@ def test_refuses_what_is_no_table(tmp_path: Path, data: bytes) -> None:
 def test_refuses_a_missing_log(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="DataLog"):
         OvadDataset(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("target", ["{name}", "/dev/zero", "/", "missing", "/proc/self/mem", "DataLog.csv"])
+def test_links_in_a_data_set_lead_to_files_that_read_or_to_a_refusal(target, tmp_path):
+    """A link to itself, to a device, a folder, nothing, the memory of the process, a file of another kind."""
+    folder = tmp_path / "SA1" / "left" / "1_00_0002"
+    folder.mkdir(parents=True)
+    (tmp_path / "DataLog.csv").write_text("ID,Environment,Class,T0\n1_00_0002,SA1,left,70\n")
+    for name in ("out_multi.wav", "camera_baseline_results.json", "truth.json", "array.xml"):
+        where = tmp_path if target == "DataLog.csv" else Path()
+        (folder / name).symlink_to(where / target.format(name=name))
+    (recording,) = OvadDataset(tmp_path).recordings
+    for read in (
+        recording.open_audio,
+        recording.read_detections,
+        lambda: read_true_tracks(folder),
+        lambda: choose_array(folder),
+    ):
+        try:
+            read()
+        except InputFileError as error:
+            assert str(folder) in str(error)
