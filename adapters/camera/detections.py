@@ -1,4 +1,4 @@
-"""Detections of a camera frame by frame: the detector's interface, and OVAD, COCO, YOLO, MOTChallenge files."""
+"""Detections of a camera image by image: the detector's interface, OVAD, COCO, YOLO, MOTChallenge files."""
 
 import math
 import re
