@@ -146,6 +146,7 @@ def _write_boxes(folder: Path) -> None:
     (folder / "boxes.json").write_text(json.dumps({"detections_per_frame": [frame, frame]}))
     result = {"image_id": 0, "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}
     (folder / "coco.json").write_text(json.dumps([result]))
+    (folder / "mot.txt").write_text("1,-1,1,2,3,4,.5,-1,-1,-1\n3,-1,1,2,3,4,.9,-1,-1,-1\n")
     (folder / "yolo").mkdir()
     (folder / "yolo" / "000000.txt").write_text("2 0.5 0.5 0.1 0.2 0.9\n3 0.4 0.5 0.1 0.2 0.8\n")
 

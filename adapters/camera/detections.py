@@ -1,4 +1,4 @@
-"""Detections of a camera frame by frame: the detector's interface, and files of OVAD, COCO and YOLO."""
+"""Detections of a camera image by image: the detector's interface, OVAD, COCO, YOLO, MOTChallenge files."""
 
 import math
 import re
@@ -28,6 +28,8 @@ COCO_CATEGORIES: Mapping[int, str] = {
 YOLO_CLASSES: Mapping[int, str] = {
     0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck",
 }  # fmt: skip
+# Of MOTChallenge's ground truth; -1 stands for what a line does not state.
+MOT_CLASSES: Mapping[float, str] = {-1: "car", 1: "person", 3: "car", 4: "bicycle", 5: "motorcycle"}
 MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
 _FRAME_NUMBER = re.compile(r"(\d{1,9})\.txt$", re.ASCII)
 
@@ -375,9 +377,9 @@ def read_any_detections(
 ) -> DetectionLog:
     """Read detections of whichever form stands at `path`.
 
-    A folder holds YOLO text, a JSON list COCO results, a JSON object with ``"images"`` such results beside
-    the images that were looked at, another one OVAD's detections per frame. An image without a box was
-    searched, and nothing was there: COCO results alone do not tell those after the last box.
+    A folder holds YOLO text, a file ``.txt`` MOTChallenge text, a JSON list COCO results, a JSON object with
+    ``"images"`` such results beside the images that were looked at, another one OVAD's detections per frame.
+    An image without a box was searched in vain: COCO results and text do not tell those after the last box.
 
     Parameters
     ----------
@@ -388,7 +390,7 @@ def read_any_detections(
     size_px : tuple of int, optional
         Width and height of the image, which YOLO text is relative to.
     n_images : int, optional
-        The detector looked at the images 0 to `n_images` - 1, where COCO results or YOLO text do not tell.
+        The detector looked at the first `n_images` images, where COCO results or text do not tell.
 
     Returns
     -------
@@ -415,6 +417,8 @@ def read_any_detections(
         if size_px is None:
             raise InputFileError(name, "expected the size of the image beside YOLO text")
         return read_yolo_text(name, size_px, frame_rate_hz, n_images)
+    if name.suffix.lower() == ".txt":
+        return read_mot_text(name, frame_rate_hz, n_images)
     document = read_json(name, "a detections file", MAX_BYTES)
     if isinstance(document, list) or (isinstance(document, dict) and "images" in document):
         return coco_log(name, document, frame_rate_hz, n_images)
@@ -478,12 +482,63 @@ def _yolo_row(line: str, size_px: tuple[int, int]) -> Row:
         x, y, width, height, score = map(float, numbers if len(numbers) == 5 else [*numbers, "1"])
     except ValueError as error:
         raise InvalidArgumentError(problem) from error
-    sizes_fit = max(abs(x), abs(y)) < MAX_NUMBER and 0.0 <= width < MAX_NUMBER and 0.0 <= height < MAX_NUMBER
-    if not (sizes_fit and 0.0 <= score <= 1.0 and name.isascii() and name.isdecimal() and len(name) < 6):
+    named = name.isascii() and name.isdecimal() and len(name) < 6
+    if not (named and _in_bounds(x, y, width, height, score)):
         raise InvalidArgumentError(problem)
     centre, half = (x * size_px[0], y * size_px[1]), (width * size_px[0] / 2, height * size_px[1] / 2)
     box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
     return box, score, YOLO_CLASSES.get(int(name), name)
+
+
+def _in_bounds(x: float, y: float, width: float, height: float, score: float) -> bool:
+    small = all(abs(value) < MAX_NUMBER for value in (x, y, width, height))
+    return small and min(width, height) >= 0.0 and 0.0 <= score <= 1.0
+
+
+def read_mot_text(path: str | Path, frame_rate_hz: float = 10.0, n_images: int | None = None) -> DetectionLog:
+    """Read MOTChallenge text: lines ``frame, id, left, top, width, height, conf, x, y, z``, frames from 1.
+
+    What follows `conf` may be left out; `id`, x, y, z are not used. A `conf` of -1 is not stated and counts
+    as 1. A line of nine values is ground truth, with class and visibility after `conf`, and a box of
+    visibility 0 gets the score 0. Other boxes are cars.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "det.txt").write_text("2,-1,10,20,50,120,0.9,-1,-1,-1")
+    ...     log = read_mot_text(Path(folder, "det.txt"), n_images=3)
+    >>> [len(frame) for frame in log.frames], log.frames[1].boxes_px.tolist()
+    ([0, 1, 0], [[10.0, 20.0, 60.0, 140.0]])
+    """
+    name = Path(path)
+    text = read_text(name, "MOTChallenge text", MAX_BYTES)
+    if text.count("\n") > MAX_FRAMES * 10:
+        raise InputFileError(name, f"expected at most {MAX_FRAMES * 10} lines")
+    rows: dict[int, list[Row]] = {}
+    with refused_as_file(name):
+        for number, line in enumerate(text.split("\n"), 1):
+            if line.strip():
+                frame, row = _mot_row(line, f"line {number}")
+                rows.setdefault(frame - 1, []).append(row)
+    return _log(name, rows, frame_rate_hz, n_images)
+
+
+def _mot_row(line: str, where: str) -> tuple[int, Row]:
+    expected = f"frame, id, left, top, width, height, conf with frames 1 to {MAX_FRAMES} and conf in [0, 1]"
+    problem = f"{where}: expected {expected}, got {line[:60]!r}"
+    try:
+        # The challenge counts pixels from 1 and most trackers from 0, which is less than boxes jitter by.
+        frame, _, left, top, width, height, conf, *more = map(float, line.split(",", 10))
+    except ValueError as error:
+        raise InvalidArgumentError(problem) from error
+    score, numbers = 1.0 if conf == -1 else conf, all(abs(value) < MAX_NUMBER for value in more)
+    numbered = 1 <= frame <= MAX_FRAMES and frame.is_integer() and len(more) <= 3
+    if not (numbered and numbers and _in_bounds(left, top, width, height, score)):
+        raise InvalidArgumentError(problem)
+    kind, visibility = more if len(more) == 2 else (-1.0, -1.0)
+    box = left, top, left + width, top + height
+    return int(frame), (box, score if visibility else 0.0, MOT_CLASSES.get(kind, f"{kind:g}"))
 
 
 def _log(

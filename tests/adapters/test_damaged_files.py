@@ -64,7 +64,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     **dict.fromkeys(("array.xml", "array.csv", "array.json"), read_array),
     "camera.json": lambda path: (read_camera(path), read_camera_setup(path)),
     "car.json": read_car,
-    **dict.fromkeys(("boxes.json", "coco.json"), read_any_detections),
+    **dict.fromkeys(("boxes.json", "coco.json", "mot.txt"), read_any_detections),
     "yolo/000000.txt": lambda path: read_any_detections(path.parent, size_px=(640, 480)),
     "model.json": read_model,
     "belief.json": read_checkpoint,

@@ -13,6 +13,7 @@ from worldstate.adapters.camera import detectors
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.detections import (
     read_any_detections,
+    read_mot_text,
     read_yolo_text,
 )
 from worldstate.adapters.camera.detectors import (
@@ -212,7 +213,7 @@ def test_a_file_that_is_no_model_is_a_typed_error(tmp_path):
         OnnxDetector(Spy(shape=(1, 3)), ("car",))
 
 
-def test_the_same_boxes_from_three_kinds_of_file(tmp_path):
+def test_the_same_boxes_from_four_kinds_of_file(tmp_path):
     rows = [[], [[10.0, 20.0, 60.0, 140.0]], [[0.0, 0.0, 64.0, 40.0], [320.0, 200.0, 640.0, 400.0]]]
     frames = [{"boxes": r, "scores": [0.5] * len(r), "classes_str": ["car"] * len(r)} for r in rows]
     (tmp_path / "ovad.json").write_text(json.dumps({"detections_per_frame": frames}))
@@ -231,7 +232,10 @@ def test_the_same_boxes_from_three_kinds_of_file(tmp_path):
         ]
         if lines:
             (tmp_path / "yolo" / f"street_{i:05d}.txt").write_text("\n".join(lines))
-    for name in ("ovad.json", "coco.json", "yolo"):
+    corners = [(i, *b) for i, row in enumerate(rows, 1) for b in row]
+    mot = [f"{i},-1,{x},{y},{right - x},{bottom - y},0.5,-1,-1,-1" for i, x, y, right, bottom in corners]
+    (tmp_path / "mot.txt").write_text("\n".join(mot))
+    for name in ("ovad.json", "coco.json", "yolo", "mot.txt"):
         log = read_any_detections(tmp_path / name, 10.0, (WIDTH, HEIGHT))
         assert log.stamps_ns.tolist() == [0, 100_000_000, 200_000_000]
         for frame, row in zip(log.frames, rows, strict=True):
@@ -257,7 +261,8 @@ def test_damaged_coco_results_are_a_typed_error(text, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "line", ["car 0 0 1 1", "2 0 0 1", "2 0 0 1 nan", "2 0 0 -1 1", "2 0 0 1 1 1.5", "2 0 0 1 1 1 1"]
+    "line",
+    ["car 0 0 1 1", "2 0 0 1", "2 0 0 1 nan", "2 0 nan 1 1", "2 0 0 -1 1", "2 0 0 1 1 1.5", "2 0 0 1 1 1 1"],
 )
 def test_damaged_yolo_text_is_a_typed_error(line, tmp_path):
     (tmp_path / "a_0.txt").write_text(line)
@@ -265,6 +270,63 @@ def test_damaged_yolo_text_is_a_typed_error(line, tmp_path):
         read_yolo_text(tmp_path, (64, 48))
     with pytest.raises(InputFileError, match="size"):
         read_any_detections(tmp_path)
+
+
+tracks = st.dictionaries(
+    st.tuples(st.integers(1, 20), st.integers(1, 5)),  # a frame has an id once
+    st.tuples(*[st.floats(-1e4, 1e4)] * 2, *[st.floats(0.0, 1e4)] * 2, st.floats(0.0, 1.0)),
+    max_size=20,
+)
+
+
+@given(tracks=tracks, looks=st.integers(20, 25))
+def test_what_a_tracker_writes_is_read_frame_by_frame(tracks, looks, tmp_path_factory):
+    """Frames count from 1 and stand in order, ids are of no use here, and frames without a line are looks."""
+    path = tmp_path_factory.getbasetemp() / "sequence.txt"
+    lines = [", ".join(map(repr, (*key, *box, -1, -1, -1))) for key, box in sorted(tracks.items())]
+    path.write_text("".join(line + "\r\n" for line in lines))
+    log = read_any_detections(path, 30.0, n_images=looks)
+    assert len(log) == looks
+    assert log.stamps_ns[[0, 15]].tolist() == [0, 500_000_000]
+    for number, frame in enumerate(log.frames, 1):
+        expected = [box for (at, _), box in sorted(tracks.items()) if at == number]
+        assert frame.boxes_px.tolist() == [[x, y, x + w, y + h] for x, y, w, h, _ in expected]
+        assert frame.scores.tolist() == [score for *_, score in expected]
+    told = max((number for number, _ in tracks), default=0)
+    assert len(read_any_detections(path)) == told
+    with pytest.raises(InputFileError, match=r"images by its boxes"):
+        read_any_detections(path, n_images=told - 1)
+
+
+def test_ground_truth_in_mot_text_has_classes_and_vehicles_that_nobody_sees(tmp_path):
+    rows = ["1,1,0,0,9,9,1,3,0.5", "1,2,0,0,9,9,1,1,1", "1,3,0,0,9,9,0,3,1", "1,4,0,0,9,9,1,3,0"]
+    (tmp_path / "gt.txt").write_text("\n".join([*rows, "1,5,0,0,9,9,1,8,1", "1,6,0,0,9,9,-1,-1,-1,-1"]))
+    frame = read_mot_text(tmp_path / "gt.txt").frames[0]
+    assert frame.labels == ("car", "person", "car", "car", "8", "car")
+    # The third one is not to be considered, the fourth one is hidden, and the last line states no confidence.
+    assert frame.scores.tolist() == [1.0, 1.0, 0.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["0,1,0,0,9,9,1,-1,-1,-1", "1.5,1,0,0,9,9,1,-1,-1,-1", "100001,1,0,0,9,9,1,-1,-1,-1",
+     "nan,1,0,0,9,9,1,-1,-1,-1", "1,1,nan,0,9,9,1,-1,-1,-1", "1,1,0,inf,9,9,1,-1,-1,-1",
+     "1,1,0,0,-9,9,1,-1,-1,-1", "1,1,0,0,9,9,67.5,-1,-1,-1", "1,1,0,0,9,9,1,nan,-1,-1", "1,1,0,0,9,9",
+     "1,1,0,0,9,9,1,-1,-1,-1,5", "frame,id,x,y,w,h,conf", "1 1 0 0 9 9 1 -1 -1 -1", "2 0.5 0.5 0.1 0.2 0.9"],
+)  # fmt: skip
+def test_damaged_mot_text_is_a_typed_error_that_names_the_line(line, tmp_path):
+    (tmp_path / "det.txt").write_text("1,1,0,0,9,9,1,-1,-1,-1\n" + line)
+    with pytest.raises(InputFileError, match=r"det\.txt.*line 2: expected frame, id, .* got '"):
+        read_any_detections(tmp_path / "det.txt")
+
+
+def test_mot_text_is_bounded(tmp_path):
+    (tmp_path / "a.txt").write_text("\n" * 1_000_001)
+    with pytest.raises(InputFileError, match="at most 1000000 lines"):
+        read_mot_text(tmp_path / "a.txt")
+    (tmp_path / "a.txt").write_text("1,1,0,0,9,9,1\n" * 1001)
+    with pytest.raises(InputFileError, match="at most 1000 boxes a frame"):
+        read_mot_text(tmp_path / "a.txt")
 
 
 def test_a_folder_without_frames_and_a_missing_file_are_refused(tmp_path):

@@ -19,7 +19,7 @@ MOST_KIB = 1_000_000_000 // 1024
 MEASURE = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
-from worldstate.adapters.camera.detections import read_any_detections
+from worldstate.adapters.camera.detections import read_any_detections, read_mot_text
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
@@ -50,6 +50,10 @@ def json_list(piece: str, size: int, values: int | None = None) -> bytes:
     return repeated(piece, wanted, "[", "0]")
 
 
+def mot_rows() -> bytes:
+    return "".join(f"{i // 10 + 1},-1,{i}.5,2.5,{i}.25,4.5,.5,-1,-1\n" for i in range(999_990)).encode()
+
+
 def keys(count: int) -> bytes:
     return json.dumps({f"{i:x}": i + 300 for i in range(count)}).encode()
 
@@ -63,6 +67,8 @@ FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "as many lists as may be": ("read_any_detections", lambda: json_list("[],", 64 * MIB, 4_000_000)),
     "as many keys as may be": ("read_any_detections", lambda: keys(1_900_000)),
     "wide text": ("read_any_detections", lambda: ('["\N{GRINNING FACE}' + "a" * (60 * MIB) + '"]').encode()),
+    "as many rows as may be": ("read_mot_text", mot_rows),
+    "wide rows": ("read_mot_text", lambda: ("\N{GRINNING FACE}" + "1," * (31 * MIB)).encode()),
     "empty objects": ("read_model", lambda: json_list("{},", 16 * MIB, 4_000_000)),
     "numbers": ("read_checkpoint", lambda: json_list("1.5,", 16 * MIB)),
     "short ids": ("read_ids", lambda: repeated("a\n", 16 * MIB, "ID\n")),

@@ -24,10 +24,11 @@ MOVING = "motion", "knn"
 def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     """Declare --array, --car and the camera of a recording.
 
-    --detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the
-    number of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the
-    first sample of the sound, ten a second; classes have COCO's numbers (car is 3) and YOLO's (car is 2). Up
-    to the last image with a box, one that lists nothing was searched in vain; of later ones --images tells,
+    --detections takes OVAD's JSON, a COCO results list (JSON), MOTChallenge text (.txt) or a folder of YOLO
+    text. In the three last the number of an image ("image_id", frame, or the number that the name of a text
+    file ends in) counts from 0, MOTChallenge's from 1, at the first sample of the sound, ten a second;
+    classes have COCO's numbers (car is 3) and YOLO's (car is 2), and MOTChallenge's boxes are cars. Up to
+    the last image with a box, one that lists nothing was searched in vain; of later ones --images tells,
     or the "images" of a COCO object {"images": [{"id": 0}, ...], "annotations": [results]}.
     """
     add_array_options(parser)
@@ -36,7 +37,7 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("camera")
     told = "what its detector reported; NAME=PATH of a camera of --car, repeated: all these are asked"
     group.add_argument("--detections", type=Path, action="append", default=[], metavar="PATH", help=told)
-    told = "the detector looked at so many images, those without a box included (COCO results, YOLO text)"
+    told = "the detector looked at so many images, those without a box included (COCO results, text)"
     group.add_argument("--images", type=int, metavar="N", help=told)
     add_lens_options(parser, group)
 

@@ -5,9 +5,9 @@ blur, darkness, sensor noise and the three together are staged on clean video, f
 detector has to find the reference boxes again (IoU >= 0.3). False detections are counted apart, as clutter.
 
 INPUT is a video, or a data set or recording folder in the OVAD layout with ueye_stereo_vid.mp4 beside the
-sound. Its detections are the reference; for a video give --reference: OVAD's or COCO's JSON or a folder of
-YOLO text. Without any, what the detector itself reports on clean frames is the reference, and its miss rate
-on those is zero by definition.
+sound. Its detections are the reference; for a video give --reference: OVAD's or COCO's JSON, MOTChallenge
+text or a folder of YOLO text. Without any, what the detector itself reports on clean frames is the
+reference, and its miss rate on those is zero by definition.
 
 The file also holds the scale by which d is read from this camera's own images.
 
