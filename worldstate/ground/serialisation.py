@@ -1,6 +1,7 @@
 """One reader and one writer of frozen dataclasses, derived from their fields and type hints."""
 
 import json
+import re
 import sys
 import types
 from collections.abc import Callable, Mapping
@@ -21,6 +22,7 @@ Read: TypeAlias = Callable[[Any], Any]
 Plan: TypeAlias = tuple[Write, Read]
 
 MOST_CHARACTERS = 64 << 20
+_HALF = re.compile("[\ud800-\udfff]")
 # A list of two characters takes 80 bytes when decoded, so what bounds the memory is how many there are.
 MOST_VALUES = 4_000_000
 MOST_ITEMS = 1_000_000
@@ -190,9 +192,9 @@ def decode_json(text: str, where: str) -> object:
         raise InvalidArgumentError(f"{where}: expected at most {MOST_VALUES} values, got {values}")
     try:
         value: object = json.loads(text, parse_constant=_refuse_constant)
-        if "\\u" in text or not text.isascii():
-            # Half a surrogate pair has no bytes: it would fail where it is printed or written.
-            json.dumps(value, ensure_ascii=False).encode()
+        # Half a surrogate pair has no bytes: it would fail where it is printed or written.
+        if _HALF.search(json.dumps(value, ensure_ascii=False) if "\\u" in text else text):
+            raise ValueError("half a surrogate pair is no character")
     except (ValueError, RecursionError) as error:
         raise InvalidArgumentError(f"{where}: expected JSON, got a text that is none ({error})") from error
     return value
