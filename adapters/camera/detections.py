@@ -11,6 +11,7 @@ import numpy as np
 
 from worldstate.adapters.files.file_io import read_json, read_text, refused_as_file
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
+from worldstate.ground.checks import check_shape
 from worldstate.ground.serialisation import Check, Count, Probability, decode
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -66,6 +67,15 @@ class DetectionFrame:
     boxes_px: FloatArray
     scores: FloatArray
     labels: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.labels)
+        for name, shape in (("boxes_px", (n, 4)), ("scores", (n,))):
+            numbers = np.asarray(getattr(self, name), dtype=np.float64)
+            numbers = numbers if n or numbers.size else numbers.reshape(shape)
+            check_shape(name, numbers.shape, shape)
+            object.__setattr__(self, name, numbers)
+        object.__setattr__(self, "labels", tuple(self.labels))
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -420,7 +430,7 @@ def read_any_detections(
     if name.suffix.lower() == ".txt":
         return read_mot_text(name, frame_rate_hz, n_images)
     document = read_json(name, "a detections file", MAX_BYTES)
-    if isinstance(document, list) or (isinstance(document, dict) and "images" in document):
+    if isinstance(document, list) or (isinstance(document, dict) and {"images", "annotations"} & {*document}):
         return coco_log(name, document, frame_rate_hz, n_images)
     if n_images is not None:
         raise InputFileError(name, "expected no number of images (--images): the file has every image")
@@ -436,8 +446,8 @@ def coco_log(
     after the start.
     """
     with refused_as_file(path):
-        listed = isinstance(document, dict)
-        read = decode(_CocoFile, document if listed else {"annotations": document}, "COCO")
+        held = document if isinstance(document, dict) else {"annotations": document}
+        listed, read = "images" in held, decode(_CocoFile, held, "COCO")
         named = {one.id: one.name for one in read.categories or () if one.name is not None}
         names = {**COCO_CATEGORIES, **named}
         rows: dict[int, list[Row]] = {one.id: [] for one in read.images or ()}

@@ -12,7 +12,7 @@ from worldstate.ground.typing import FloatArray, IndexArray
 TOLERANCE_M = 1e-3
 # Only `run` and `live` go on with a model of another array; the other commands have no such option to name.
 TRAIN = "Make a model for it (worldstate model make; of recordings model features, model fit)"
-WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
+WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (settings=ListenSettings(uncalibrated=True))"
 _UNITS = {1.0: "", 1e-3: "looks like millimetres", 1e-2: "looks like centimetres"}
 _LEAST_TURN_DEG = 0.5
 

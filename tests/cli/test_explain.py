@@ -46,7 +46,7 @@ def states(tmp_path_factory) -> Path:
 
 RAISED = """\
 time  1.00 s
-left: advisory raised: not below the threshold now
+left: advisory raised
   since 0.70 s, valid until 2.00 s, rests on acoustic (working), camera (working)
   log-odds that a vehicle comes into view within 3 s, nats:
     at, s                     0.70          1.00
@@ -55,18 +55,17 @@ left: advisory raised: not below the threshold now
     look camera              +0.59         +0.59
     together                 +2.97         +2.97
     mean of .3 s             +1.63         +2.97
-    threshold                +1.00         +1.00
   side: 0.70 of what is hidden; risk 0.96
   comes into view: 0.00 in 0.5 s, 0.01 in 1 s, 0.94 in 2 s, 0.95 in 3 s; 1.8 s from now (1.3 to 2.2)
   entity: f8eadf57 hidden at +56 deg (std 7), exists with 0.97, by acoustic; the last look did not find it
-uncalibrated: no false-alarm budget stands behind the thresholds
+uncalibrated: no false-alarm budget stands behind the advisories
 sensor acoustic: working
 sensor camera: working
 look of camera at 1.00 s: nothing from -34 to 34 deg, misses 0.10
 """
 HELD = """\
 time  1.40 s
-left: advisory held: below the threshold now, it ends without news
+left: advisory held
   since 0.70 s, valid until 2.10 s, rests on acoustic (impaired), camera (working)
   log-odds that a vehicle comes into view within 3 s, nats:
     at, s                     0.70          1.40
@@ -75,11 +74,10 @@ left: advisory held: below the threshold now, it ends without news
     look camera              +0.59         +0.59
     together                 +2.97         -1.05
     mean of .3 s             +1.63         -1.05
-    threshold                +1.00         +1.00
   side: 0.50 of what is hidden; risk 0.40
   comes into view: 0.05 in 0.5 s, 0.10 in 1 s, 0.16 in 2 s, 0.26 in 3 s; 2.2 s from now (0.0 to 4.8)
   entity: f8eadf57 hidden at -59 deg (std 9), exists with 0.54, by acoustic; the last look did not find it
-uncalibrated: no false-alarm budget stands behind the thresholds
+uncalibrated: no false-alarm budget stands behind the advisories
 sound: sounds like speech: the evidence of this hop counts little
 sensor acoustic: impaired (sounds like speech)
 sensor camera: working

@@ -26,6 +26,7 @@ Examples
 """
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,7 +62,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     other = "what another sensor recorded, by a reader that an installed package brings; may be repeated"
     add("--measurements", action="append", default=[], metavar="NAME=FILE", help=other)
     sensors.add_detector_option(parser, default=None)
-    group = exports.add_output_options(parser)
+    group = exports.add_output_options(parser, pages=False)
     group.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
 
 
@@ -91,6 +92,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if arguments.save_state is not None and report.end is not None:
         adapters.save_checkpoint(arguments.save_state, report.end)
     boxes = sensors.box_counts(source, as_json=arguments.json)
+    if given.camera is not None and boxes is None and source.co_evidence is None and arguments.car is None:
+        print("worldstate: --camera without --detections: the camera counts as not asked", file=sys.stderr)
     beside = {"array": inputs.stance(source.array), "detections": boxes}
     return output.CommandResult(report.to_dict() | beside)
 

@@ -14,9 +14,12 @@ Examples
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 from worldstate.cli.common import inputs, output, progress
+
+_MUCH_AT_EDGE = 0.1  # Share of the hops: what lies behind is found at the edge
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +44,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     write_text(arguments.out, bearing_track.bearings_csv(track))
     if arguments.figure is not None:
         bearing_track.write_bearings_figure(track, arguments.figure, audio.path.name)
+    if arguments.azimuth_span < 360 and front_end.array.ambiguity in ("none", "up-down"):
+        at_edge = float((abs(track.azimuth_deg) > 0.5 * arguments.azimuth_span - 1.0).mean())
+        if at_edge > _MUCH_AT_EDGE:
+            told = f"{100 * at_edge:.0f} % of the bearings lie at the edge of what is searched"
+            print(f"worldstate: {told}: --azimuth-span 360 searches all round", file=sys.stderr)
     summary = {
         "out": str(arguments.out),
         "array": inputs.stance(front_end.array),

@@ -34,8 +34,8 @@ _FILES = "mcap", "rerun", "osi", "autoware"
 _VIEWERS = "mcap", "rerun", "foxglove"
 
 
-def add_output_options(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Declare --out and --export, where states go; return their group.
+def add_output_options(parser: argparse.ArgumentParser, *, pages: bool = True) -> "argparse._ArgumentGroup":
+    """Declare --out, --export and --origin, where states go; return their group.
 
     --export NAME=TARGET sends states on, and may be repeated:
       mcap=FILE            snapshots and scene for Foxglove
@@ -52,8 +52,10 @@ def add_output_options(parser: argparse.ArgumentParser) -> "argparse._ArgumentGr
     group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     told = "send states to a viewer, a log or another stack; repeated"
     group.add_argument("--export", action="append", default=[], metavar="NAME=TARGET", help=told)
-    told = "let web pages of this origin see the websocket, such as https://app.foxglove.dev; repeated"
-    group.add_argument("--origin", action="append", default=[], metavar="URL", help=told)
+    if pages:
+        told = "let web pages of this origin see the websocket, such as https://app.foxglove.dev; repeated"
+        group.add_argument("--origin", action="append", metavar="URL", help=told)
+    parser.set_defaults(origin=[])
     return group
 
 

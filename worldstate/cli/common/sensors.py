@@ -204,9 +204,12 @@ def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
     if source.detections is None:
         return None
     counts = count_boxes(source.detections, source.settings.boxes)
-    if counts["frames"] and not counts["empty"]:
-        problem = "no image is without a box: are those missing in which nothing was found (--images N)?"
-        print(f"worldstate: {problem}", file=sys.stderr)
+    if not counts["frames"]:
+        told = "no image was looked at, so that the camera counts as not asked (--images N)"
+        print(f"worldstate: {told}", file=sys.stderr)
+    elif not counts["empty"] and not counts["parked"]:
+        told = "no image is without a box: are those missing in which nothing was found (--images N)?"
+        print(f"worldstate: {told}", file=sys.stderr)
     return counts if as_json else COUNTS_TOLD.format(**counts)
 
 

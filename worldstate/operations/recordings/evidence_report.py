@@ -74,6 +74,7 @@ class SideEvidenceReport:
     cue: RiskCue
     onset: RiskCue | None  # When the advisory began; None without one, or where the file begins later
     entity: Entity | None
+    calibrated: bool = True
 
     @property
     def standing(self) -> Standing:
@@ -97,7 +98,8 @@ class SideEvidenceReport:
     def lines(self, now_s: float) -> Iterator[str]:
         """Yield it for people."""
         cue, told = self.cue, self.cue.advisory
-        yield f"{cue.direction}: advisory {_SAID[self.standing]}"
+        said = _SAID[self.standing] if self.calibrated else _SAID[self.standing].partition(":")[0]
+        yield f"{cue.direction}: advisory {said}"
         if told is not None:
             since_s, until_s = seconds(told.since_ns), seconds(told.valid_until_ns)
             rests = ", ".join(f"{one.sensor} ({one.condition})" for one in told.sensors)
@@ -126,7 +128,8 @@ class SideEvidenceReport:
         yield _row("together", *(sum(one.terms_nats.values()) for one in both))
         if evidence.hypothesis == "coming":
             yield _row("mean of .3 s", *(one.compared_nats for one in both))
-        yield _row("threshold", *(one.threshold_nats for one in both))
+        if self.calibrated:
+            yield _row("threshold", *(one.threshold_nats for one in both))
 
 
 def evidence_report(
@@ -139,14 +142,15 @@ def evidence_report(
         if side in (None, cue.direction):
             began = () if cue.advisory is None else read(cue.advisory.since_ns).cues
             first = next((one for one in began if one.direction == cue.direction), None)
-            reports[cue.direction] = SideEvidenceReport(cue, first, entities.get(cue.entity_id or ""))
+            entity = entities.get(cue.entity_id or "")
+            reports[cue.direction] = SideEvidenceReport(cue, first, entity, state.calibrated)
     return reports
 
 
 def common_lines(state: WorldState) -> Iterator[str]:
     """Yield what all sides share: sound, looks, the state of the sensors, what has just happened."""
     if not state.calibrated:
-        yield "uncalibrated: no false-alarm budget stands behind the thresholds"
+        yield "uncalibrated: no false-alarm budget stands behind the advisories"
     if isinstance(state.domain, Foreign):
         yield f"sound: {state.domain.reason}: the evidence of this hop counts little"
     elif isinstance(state.domain, WarningSignal):
