@@ -18,6 +18,7 @@ from worldstate import WorldState
 from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement.measurement import Bearing
 from worldstate.operations import figure_style
 from worldstate.operations.viewing import log_page
 from worldstate.operations.viewing.log_page import page_data, write_log_page
@@ -199,8 +200,47 @@ def browser(folder: Path):
         os.close(ours_out)
 
 
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None or shutil.which("bash") is None, reason="there is no Chromium here"
+)
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None or shutil.which("bash") is None, reason="there is no Chromium here")
+@needs_browser
+def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states, tmp_path):
+    heard = [replace(one, bearing=None if k == 2 else Bearing(0.3, 0.1, 2.0)) for k, one in enumerate(states)]
+    low = replace(states[0].cues[0], evidence=replace(states[0].cues[0].evidence, compared_nats=-20.0))
+    write_log_page([replace(heard[0], cues=(low, *heard[0].cues[1:])), *heard[1:]], tmp_path / "log.html")
+    with browser(tmp_path / "profile") as page:
+        page.open(tmp_path / "log.html")
+        page.press("End")
+        written_in = "document.querySelectorAll('h2, .legend, svg text')"
+        texts = page.value(f"[...{written_in}].map(one => one.textContent)")
+        paths = page.value(
+            "Object.fromEntries([...document.querySelectorAll('.chart')].map(one => ["
+            "one.firstChild.textContent.split(' ')[0],"
+            "[...one.querySelectorAll('path')].map(path => path.getAttribute('d'))]))"
+        )
+        advisory = page.value(
+            "[...document.querySelectorAll('#street polygon[stroke]')].map(one => ["
+            "getComputedStyle(one).stroke, getComputedStyle(one).fillOpacity,"
+            "getComputedStyle([...document.querySelectorAll('.legend')]"
+            ".find(one => one.textContent === 'advisory'), '::before').borderTopColor])"
+        )
+    nats = sum(states[-1].cues[0].evidence.terms_nats.values())
+    assert texts[texts.index("together now") + 1] == f"{nats:+.2f}"
+    assert texts[texts.index("mean of .3 s: decides", texts.index("together now")) + 1] == "+2.55"
+    assert "below \u22128" in texts
+    assert not [one for one in texts if re.search(r"window|sequence|look camera", one)]
+    assert len(paths["Risk:"]) == len(states[0].cues)
+    assert [path.count("M") for path in paths["Prominence"]] == [2]
+    assert len(advisory) == 1
+    assert advisory[0][0] == advisory[0][2]
+    assert advisory[0][1] == "0"
+
+
+@pytest.mark.slow
+@needs_browser
 @pytest.mark.parametrize("width", [1300, 420])
 def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_path, width):
     since_1970 = [replace(state, stamp_ns=state.stamp_ns + 1_700_000_000 * 10**9) for state in states]

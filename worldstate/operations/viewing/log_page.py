@@ -178,7 +178,7 @@ def _cue(one: RiskCue) -> Row:
         "evidence": evidence
         and {
             "hypothesis": evidence.hypothesis,
-            "terms": {name: round(value, 2) for name, value in evidence.terms_nats.items()},
+            "terms": {name: round(value, 3) for name, value in evidence.terms_nats.items()},
             "compared": round(evidence.compared_nats, 2),
         },
     }
