@@ -460,8 +460,9 @@ class ChosenChannels(Audio):
 
     def __init__(self, audio: Audio, channels: Sequence[int]) -> None:
         if max(channels) > audio.channels:
-            expected = f"expected {max(channels)} channels or more, of which {', '.join(map(str, channels))}"
-            raise InputFileError(audio.path, f"{expected} are chosen, got {audio.channels}")
+            chosen = f"of which {', '.join(map(str, channels)):.60} are chosen"
+            expected = f"expected {max(channels)} channels or more, {chosen}"
+            raise InputFileError(audio.path, f"{expected}, got {audio.channels}")
         self._audio, self._taken = audio, [channel - 1 for channel in channels]
         self.path, self.sample_rate_hz, self.frames = audio.path, audio.sample_rate_hz, audio.frames
         self.channels, silent = len(channels), audio.silent_channels

@@ -118,9 +118,8 @@ class MicrophoneArray:
             raise InvalidArgumentError(f"positions_m: {expected}, {got}")
         numbers = {one for one in self.channels if type(one) is int and one > 0}
         if self.channels and not len(numbers) == len(self.channels) == len(positions):
-            expected = f"{len(positions)} different numbers from 1 on, one for each microphone"
-            got = ", ".join(map(str, self.channels))
-            raise InvalidArgumentError(f"channels: expected {expected}, got {got:.60}")
+            expected = f"expected {len(positions)} different numbers from 1 on, one for each microphone"
+            raise InvalidArgumentError(f"channels: {expected}, got {', '.join(map(str, self.channels)):.60}")
         positions.flags.writeable = False
         object.__setattr__(self, "positions_m", positions)
 
