@@ -460,8 +460,7 @@ class ChosenChannels(Audio):
 
     def __init__(self, audio: Audio, channels: Sequence[int]) -> None:
         if max(channels) > audio.channels:
-            chosen = f"of which {', '.join(map(str, channels)):.60} are chosen"
-            expected = f"expected {max(channels)} channels or more, {chosen}"
+            expected = f"expected at least {max(channels)} channels, the largest number that is chosen"
             raise InputFileError(audio.path, f"{expected}, got {audio.channels}")
         self._audio, self._taken = audio, [channel - 1 for channel in channels]
         self.path, self.sample_rate_hz, self.frames = audio.path, audio.sample_rate_hz, audio.frames
@@ -527,8 +526,8 @@ def open_sound(
     expect_channels : int, optional
         Number of microphones of the array that it shall fit.
     channels : sequence of int, optional
-        `MicrophoneArray.channels`, the only ones that are read and checked. A recording of as many channels,
-        some of which it would not have, is taken as it is: they were chosen when it was made.
+        `MicrophoneArray.channels`, where there are others beside them. A recording of so many channels that
+        has not all of these is taken as it is: they were chosen when it was made.
     strict : bool
         As `open_audio`.
 

@@ -167,8 +167,7 @@ def _played(arguments: argparse.Namespace, recorded: "adapters.Source") -> "Soun
     from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.adapters.live.live_sound import Playback
 
-    # All its channels, as a card would give them: what listens chooses among them.
-    audio = open_sound(recorded.sound, strict=False)
+    audio = open_sound(recorded.sound, strict=False)  # with the channels of the card, as microphones give it
     return Playback(audio, arguments.speed, arguments.duration)
 
 
