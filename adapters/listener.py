@@ -415,7 +415,7 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
 def listened(source: Source) -> Iterator[tuple[Listener, Float32Array | None]]:
     """Yield the sound of `source` block by block, None last, each beside the one listener to take it."""
     strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
-    with open_sound(source.sound, expect_channels=n_microphones, strict=strict) as audio:
+    with open_sound(source.sound, n_microphones, channels=source.array.channels, strict=strict) as audio:
         listener = Listener(source, audio.sample_rate_hz)
         for block in audio.blocks(max(audio.sample_rate_hz // PARTS_PER_SECOND, 1)):
             yield listener, block

@@ -59,7 +59,8 @@ class Audio(ABC):
         """Refuse another number of channels than microphones."""
         if expect_channels is not None and self.channels != expect_channels:
             expected = f"expected {expect_channels} channels, one per microphone"
-            raise InputFileError(self.path, f"{expected}, got {self.channels}")
+            way_out = "; --channels names those of the microphones" if self.channels > expect_channels else ""
+            raise InputFileError(self.path, f"{expected}, got {self.channels}{way_out}")
 
     def check_size(self, expect_channels: int | None) -> None:
         """Refuse another number of channels than microphones, and less than a second."""
@@ -222,15 +223,12 @@ def open_audio(
     ...         source.channels, source.duration_s, [block.shape for block in source.blocks(4800)]
     (4, 1.2, [(4800, 4), (4800, 4)])
     """
-    name = Path(path)
-    source = AudioSource(name, _open_file(name))
-    try:
+    with ExitStack() as opened:
+        source = opened.enter_context(AudioSource(Path(path), _open_file(Path(path))))
         _check(source)
         (source.check_channels if short else source.check_size)(expect_channels)
         source.check_silence(strict)
-    except BaseException:
-        source.close()
-        raise
+        opened.pop_all()  # what is fit to be read stays open
     return source
 
 
@@ -457,6 +455,34 @@ class RawAudio(Audio):
         return block
 
 
+class ChosenChannels(Audio):
+    """Some channels of an open recording, counted from 1, in an order of their own."""
+
+    def __init__(self, audio: Audio, channels: Sequence[int]) -> None:
+        if max(channels) > audio.channels:
+            expected = f"expected at least {max(channels)} channels, the largest number that is chosen"
+            raise InputFileError(audio.path, f"{expected}, got {audio.channels}")
+        self._audio, self._taken = audio, [channel - 1 for channel in channels]
+        self.path, self.sample_rate_hz, self.frames = audio.path, audio.sample_rate_hz, audio.frames
+        self.channels, silent = len(channels), audio.silent_channels
+        self.silent_channels = tuple(i for i, channel in enumerate(channels, 1) if channel in silent)
+
+    def check_size(self, expect_channels: int | None) -> None:
+        """Refuse another number of channels than microphones, and less than a second."""
+        self.check_channels(expect_channels)
+        self._audio.check_size(None)
+
+    def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
+        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+        for block in self._audio.blocks(frames):
+            self.frames = self._audio.frames
+            yield block.take(self._taken, axis=1)
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._audio.close()
+
+
 class MonoFiles(Audio):
     """Files of one channel each, read side by side."""
 
@@ -483,7 +509,13 @@ class MonoFiles(Audio):
             source.close()
 
 
-def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict: bool = True) -> Audio:
+def open_sound(
+    sound: SoundInput,
+    expect_channels: int | None = None,
+    *,
+    channels: Sequence[int] = (),
+    strict: bool = True,
+) -> Audio:
     """Open whatever a recording stands in, checked as `open_audio` does.
 
     Parameters
@@ -493,6 +525,9 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
         open already.
     expect_channels : int, optional
         Number of microphones of the array that it shall fit.
+    channels : sequence of int, optional
+        `MicrophoneArray.channels`, where there are others beside them. A recording of so many channels that
+        has not all of these is taken as it is: they were chosen when it was made.
     strict : bool
         As `open_audio`.
 
@@ -504,7 +539,7 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
     Raises
     ------
     InputFileError
-        As `open_audio`; of mono files, if rates or lengths differ.
+        As `open_audio`; of mono files, if rates or lengths differ; if there is no such channel.
     SilentChannelsError
         Channels constant over the first second.
 
@@ -516,18 +551,23 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
     ...     [block.shape for block in audio.blocks(12_000)], audio.duration_s
     ([(12000, 2), (4000, 2)], 1.0)
     """
-    if isinstance(sound, Path):
-        return open_audio(sound, expect_channels, strict=strict)
-    if isinstance(sound, Audio):
-        sound.check_size(expect_channels)
-        return sound
     with ExitStack() as opened:
-        audio = (
-            sound.open()
-            if isinstance(sound, SoundStream)
-            else MonoFiles([opened.enter_context(open_audio(path, 1, strict=False)) for path in sound])
-        )
+        audio = sound if isinstance(sound, Audio) else _unchecked(sound, opened)
+        if channels and not audio.channels == len(channels) < max(channels):
+            audio = ChosenChannels(audio, channels)
         audio.check_size(expect_channels)
-        audio.check_silence(strict)
+        if not isinstance(sound, Audio):
+            audio.check_silence(strict)
         opened.pop_all()  # what is fit to be read stays open
     return audio
+
+
+def _unchecked(sound: Path | tuple[Path, ...] | SoundStream, opened: ExitStack) -> Audio:
+    """Open what can be read, whatever is silent, on the stack that closes it."""
+    if isinstance(sound, tuple):
+        return MonoFiles([opened.enter_context(open_audio(path, 1, strict=False)) for path in sound])
+    if isinstance(sound, SoundStream):
+        return opened.enter_context(sound.open())
+    source = opened.enter_context(AudioSource(sound, _open_file(sound)))
+    _check(source)
+    return source

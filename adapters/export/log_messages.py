@@ -5,7 +5,7 @@ import json
 import math
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
@@ -126,12 +126,14 @@ def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterato
 
 
 @contextmanager
-def recorded_sound(sound: SoundInput, start_ns: int = 0) -> Iterator[Callable[[int], Iterator[LogMessage]]]:
+def recorded_sound(
+    sound: SoundInput, start_ns: int = 0, channels: Sequence[int] = ()
+) -> Iterator[Callable[[int], Iterator[LogMessage]]]:
     """Lend what yields the sound of one microphone up to a stamp, asked in order of time; of files only."""
     if not isinstance(sound, Path | tuple):
         yield lambda stamp_ns: iter(())
         return
-    with open_sound(sound, strict=False) as audio:
+    with open_sound(sound, channels=channels, strict=False) as audio:
         rate_hz, taken = audio.sample_rate_hz, 0
         blocks = audio.blocks(rate_hz // 10)
         heard = next(channel for channel in range(audio.channels) if channel not in audio.silent_channels)

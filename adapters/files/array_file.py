@@ -48,9 +48,10 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     - CSV, one microphone a line: x, y, z, with or without a header and a column of names; separated by comma,
       semicolon, tab or blanks. In `base_link` axes: x forward, y left, z up.
     - JSON, ``[[x, y, z], ...]`` or ``{"positions_m": [[x, y, z], ...], "axes": "base_link"}``, in `base_link`
-      axes unless ``"axes"`` is ``"acoular"``.
+      axes unless ``"axes"`` is ``"acoular"``; with ``"channels": [2, 3, ...]``, from 1, where the card has
+      more channels than microphones.
 
-    Where no such file is, its name may be one of `named_arrays`: a board that lies flat, x forward.
+    Where no such file is, its name may be one of `named_arrays`.
 
     Parameters
     ----------
@@ -88,24 +89,28 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
         if axes is not None:
             # Acoular's axes are left-handed: a flat board in them would be its mirror image.
             raise InputFileError(name, f"expected no axes with the name of an array, got {axes}")
-        return MicrophoneArray(known[name.name]["positions_m"], name.name)
+        board = known[name.name]
+        return MicrophoneArray(board["positions_m"], name.name, tuple(board.get("channels", ())))
     data = read_bytes(name, f"an array file or one of {', '.join(known)}", MAX_BYTES)
+    channels: tuple[int, ...] = ()
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
     if start == b"<":
         rows, said = _xml_rows(name, data), "acoular"
+    elif start in (b"[", b"{"):
+        rows, said, channels = _json_rows(name, data)
     else:
-        rows, said = _json_rows(name, data) if start in (b"[", b"{") else (_csv_rows(name, data), "base_link")
-    return checked_array(name, _numbers(name, rows), axes or said)
+        rows, said = _csv_rows(name, data), "base_link"
+    return checked_array(name, _numbers(name, rows), axes or said, channels)
 
 
 @cache
 def named_arrays() -> dict[str, dict[str, Any]]:
-    """Return the boards that are known by name: ``"positions_m"`` in `base_link` axes, and ``"source"``.
+    """Return the boards that are known by name: as in JSON files, and the ``"source"``.
 
     Examples
     --------
     >>> ", ".join(named_arrays())
-    'respeaker-4, respeaker-6, uma-8, xmos'
+    'respeaker-4, respeaker-6, respeaker-usb, uma-8, uma-16, xmos'
     """
     text = (files("worldstate") / "data" / "arrays.json").read_text("utf-8")
     known: dict[str, dict[str, Any]] = json.loads(text)
@@ -147,7 +152,9 @@ def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array
     write_text(path, "\n".join([head, *rows, "</MicArray>", ""]))
 
 
-def checked_array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> MicrophoneArray:
+def checked_array(
+    path: Path, in_file: Sequence[Sequence[float]], axes: str, channels: tuple[int, ...] = ()
+) -> MicrophoneArray:
     """Check the positions that a file held, and turn them into `base_link` axes."""
     if axes not in get_args(Axes):
         raise InputFileError(path, f"axes: expected {' or '.join(get_args(Axes))}, got {axes!r:.40}")
@@ -158,7 +165,7 @@ def checked_array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> 
         positions = positions[:, [2, 0, 1]] * [1.0, -1.0, 1.0] + 0.0
     _check_size(path, positions)
     try:
-        return MicrophoneArray(positions, str(path))
+        return MicrophoneArray(positions, str(path), channels)
     except InvalidArgumentError as error:
         raise InputFileError(path, str(error)) from error
 
@@ -222,7 +229,7 @@ def _csv_columns(path: Path, first: list[str]) -> tuple[list[int], bool]:
     return columns, False
 
 
-def _json_rows(path: Path, data: bytes) -> tuple[list[Row], str]:
+def _json_rows(path: Path, data: bytes) -> tuple[list[Row], str, tuple[int, ...]]:
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -231,7 +238,9 @@ def _json_rows(path: Path, data: bytes) -> tuple[list[Row], str]:
     rows = held.get("positions_m")
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
         raise InputFileError(path, "expected a list of positions [x, y, z], or one as positions_m")
-    return [[*zip("xyz", row, strict=True)] for row in rows], held.get("axes", "base_link")
+    channels = held.get("channels", [])
+    numbers = tuple(channels) if isinstance(channels, list) else (channels,)
+    return [[*zip("xyz", row, strict=True)] for row in rows], held.get("axes", "base_link"), numbers
 
 
 def _numbers(path: Path, rows: list[Row]) -> list[list[float]]:

@@ -240,10 +240,11 @@ class _ArrayRecord:
         if (self.file is None) == (self.positions_m is None):
             raise InvalidArgumentError("car.array: expected either file or positions_m")
         file = self.file
-        own = self.positions_m or () if file is None else read_array(path.parent / file).positions_m
+        read = None if file is None else read_array(path.parent / file)
+        own, channels = (self.positions_m or (), ()) if read is None else (read.positions_m, read.channels)
         with _placed_at("car.array"):
             mounting = Mounting(self.position_m, self.yaw_deg, self.pitch_deg, self.roll_deg)
-        return checked_array(path, mounting.applied(own).tolist(), "base_link")
+        return checked_array(path, mounting.applied(own).tolist(), "base_link", channels)
 
 
 @dataclass(frozen=True, slots=True)

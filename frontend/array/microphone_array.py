@@ -82,12 +82,14 @@ class MicrophoneArray:
         apart. The order is that of the audio channels.
     name : str
         How messages call it.
+    channels : tuple of int
+        Channel of each microphone, from 1, where a recording has others beside them; none by default.
 
     Raises
     ------
     InvalidArgumentError
         On another shape, numbers that are not finite, or two microphones at one place, which the message
-        names, counted from 1.
+        names, counted from 1; if `channels` does not name a channel of its own for every microphone.
 
     Examples
     --------
@@ -100,6 +102,7 @@ class MicrophoneArray:
 
     positions_m: FloatArray
     name: str = "the array given"
+    channels: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         positions = finite_array("positions_m", self.positions_m, (None, 3)).copy()
@@ -113,6 +116,10 @@ class MicrophoneArray:
             expected = f"expected microphones at least {LEAST_SPACING_M:g} m apart"
             got = f"got microphones {one} and {other} {spacings.min():.2g} m apart"
             raise InvalidArgumentError(f"positions_m: {expected}, {got}")
+        numbers = {one for one in self.channels if type(one) is int and one > 0}
+        if self.channels and not len(numbers) == len(self.channels) == len(positions):
+            expected = f"expected {len(positions)} different numbers from 1 on, one for each microphone"
+            raise InvalidArgumentError(f"channels: {expected}, got {', '.join(map(str, self.channels)):.60}")
         positions.flags.writeable = False
         object.__setattr__(self, "positions_m", positions)
 

@@ -80,6 +80,7 @@ def test_the_roof_keeps_the_papers_band_exactly() -> None:
     [
         ("respeaker-4", 4, 0.0405, 180),
         ("respeaker-6", 6, 0.0463, 120),
+        ("respeaker-usb", 4, 0.032, 180),
         ("uma-8", 7, 0.043, 90),
         ("xmos", 7, 0.043, 240),
     ],
@@ -95,18 +96,41 @@ def test_a_board_is_known_by_its_name(name: str, microphones: int, radius_m: flo
     assert name in str(add_array_options.__doc__)
 
 
+def test_a_square_board_faces_forward_and_its_first_microphone_is_below_to_the_right() -> None:
+    array = read_array("uma-16")
+    assert (array.n_microphones, array.ambiguity, array.channels) == (16, "front-back", ())
+    np.testing.assert_allclose(array.aperture_m, [0.0, 0.126, 0.126])
+    np.testing.assert_allclose(nearest_spacings_m(array.positions_m), 0.042)
+    np.testing.assert_array_equal(array.positions_m[0], [0.0, -0.021, -0.063])
+
+
+@pytest.mark.parametrize(
+    ("channels", "got"),
+    [([2, 3], "2, 3"), ([2, 2, 3], "2, 2, 3"), ([0, 1, 2], "0, 1, 2"), ([1, 2, 3.0], "3.0"), ("2-4", "2-4")],
+)
+def test_channels_that_are_not_one_for_each_microphone_are_refused(
+    channels: object, got: str, tmp_path: Path
+) -> None:
+    (tmp_path / "mics.json").write_text(json.dumps({"positions_m": PLACES, "channels": channels}))
+    expected = "channels: expected 3 different numbers from 1 on, one for each microphone, got "
+    with pytest.raises(InputFileError, match=rf"mics.json: {expected}.*{got}"):
+        read_array(tmp_path / "mics.json")
+
+
 def test_a_file_goes_before_a_name_and_an_unknown_name_lists_the_known(tmp_path: Path) -> None:
     (tmp_path / "uma-8").write_text(SAME["plain.csv"])
     np.testing.assert_array_equal(read_array(tmp_path / "uma-8").positions_m, PLACES)
-    with pytest.raises(InputFileError, match=r"umma: .* one of respeaker-4, respeaker-6, uma-8, xmos"):
+    known = "respeaker-4, respeaker-6, respeaker-usb, uma-8, uma-16, xmos"
+    with pytest.raises(InputFileError, match=f"umma: .* one of {known}"):
         read_array("umma")
     with pytest.raises(InputFileError, match="expected no axes with the name of an array, got acoular"):
         read_array("xmos", "acoular")
 
 
 def test_a_car_file_mounts_a_board_by_its_name(tmp_path: Path) -> None:
-    mounted = {"file": "respeaker-4", "position_m": [1.0, 0.0, 1.5], "yaw_deg": 90}
+    mounted = {"file": "respeaker-usb", "position_m": [1.0, 0.0, 1.5], "yaw_deg": 90}
     (tmp_path / "car.json").write_text(json.dumps({"array": mounted}))
     array = read_car(tmp_path / "car.json").array
     assert array is not None
-    np.testing.assert_allclose(array.positions_m[0], [1.0, -0.0405, 1.5], atol=1e-12)
+    np.testing.assert_allclose(array.positions_m[0], [1.0, -0.032, 1.5], atol=1e-12)
+    assert array.channels == (2, 3, 4, 5)

@@ -1,5 +1,6 @@
 """Microphones through PortAudio, of which a stand-in plays the part."""
 
+import json
 import sys
 import time
 from importlib.machinery import ModuleSpec
@@ -7,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import soundfile
 
 from worldstate.adapters.live import live_sound
 from worldstate.adapters.live.live_sound import LiveSound, MissingPortAudioError, PortAudioInput, portaudio
@@ -147,6 +149,60 @@ def test_the_command_records_from_the_device_until_the_duration(stand_in, tmp_pa
     command = ["live", "--array", str(array), "--rate", str(RATE), "--uncalibrated", "--duration", "1.2"]
     assert main([*command, "--json"]) == 0
     assert '"states": 3' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "opened"),
+    [('{"positions_m": [[0, 0.1, 0], [0, -0.1, 0.05]], "channels": [4, 2]}', 4), ("0,0.1,0\n0,-0.1,0.05", 3)],
+)
+def test_the_command_hears_the_channels_that_microphones_are_on(
+    stand_in, tmp_path, capsys, monkeypatch, given, opened
+):
+    (tmp_path / "mics").write_text(given)
+    sound = np.random.default_rng(5).normal(0.0, 0.1, (60, LENGTH, 4)).astype(np.float32)
+    original = PortAudioInput.start
+
+    def start(feed, into):
+        original(feed, into)
+        for number, block in enumerate(sound):
+            times = SimpleNamespace(inputBufferAdcTime=1.0 + number / 40, currentTime=1.0 + (number + 1) / 40)
+            none_lost = SimpleNamespace(input_overflow=False)
+            stand_in.stream.callback(block[:, : stand_in.stream.channels].copy(), LENGTH, times, none_lost)
+
+    monkeypatch.setattr(PortAudioInput, "start", start)
+    kept, options = tmp_path / "kept.wav", ["--array", str(tmp_path / "mics"), "--uncalibrated"]
+    options += ["--channels", "3,1"] if opened == 3 else []
+    live = ["--rate", str(RATE), "--duration", "1.2", "--keep-sound", str(kept)]
+    assert main(["live", *options, *live]) == 0
+    assert stand_in.stream.channels == opened
+    samples, _ = soundfile.read(kept)
+    assert samples.shape[1] == opened, "what is kept is as the card gave it, and chosen again when it is read"
+    chosen = tmp_path / "chosen.wav"
+    soundfile.write(chosen, samples[:, [3, 1] if opened == 4 else [2, 0]], RATE, subtype="PCM_24")
+    (tmp_path / "two.csv").write_text("0,0.1,0\n0,-0.1,0.05")
+
+    def bearings(sound, *options):
+        out = str(tmp_path / "b.csv")
+        assert main(["array", "bearings", str(sound), *options, "--out", out]) == 0
+        return (tmp_path / "b.csv").read_text()
+
+    options.remove("--uncalibrated")
+    assert bearings(kept, *options) == bearings(chosen, "--array", str(tmp_path / "two.csv"))
+
+
+def test_a_recording_with_more_channels_is_played(tmp_path, capsys):
+    sound = np.random.default_rng(5).normal(0.0, 0.1, (RATE * 3 // 2, 6))
+    soundfile.write(tmp_path / "card.wav", sound, RATE)
+    soundfile.write(tmp_path / "chosen.wav", sound[:, [4, 2, 3, 1]], RATE)
+    found = []
+    for name, channels in (("card.wav", ["--channels", "5,3,4,2"]), ("chosen.wav", [])):
+        out = tmp_path / "states.jsonl"
+        command = ["live", "--play", str(tmp_path / name), "--array", "respeaker-4", "--uncalibrated"]
+        assert main([*command, *channels, "--speed", "20", "--out", str(out)]) == 0
+        bearings = [json.loads(line).get("evidence") for line in out.read_text().splitlines()]
+        found.append(bearings)
+    assert found[0] == found[1]
+    assert found[0]
 
 
 def test_the_command_asks_for_the_array(stand_in, capsys):

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -202,3 +203,74 @@ def test_a_file_a_microphone(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     soundfile.write(names[2], sound[:, :2], RATE)
     assert main(["array", "bearings", *map(str, names), *options]) == 2
     assert "expected 1 channels" in capsys.readouterr().err
+
+
+def recorded_by_card(path: Path, sound: np.ndarray, silent: int) -> Path:
+    """Write a beam and the microphones, as a card gives them, and so many channels that stay silent."""
+    beam = np.random.default_rng(4).normal(0, 0.3, (len(sound), 1))
+    soundfile.write(path, np.hstack([beam, sound, np.zeros((len(sound), silent))]), RATE)
+    return path
+
+
+@pytest.mark.parametrize("silent", [1, 12])
+def test_a_card_with_more_channels_than_microphones(
+    silent: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    array, out = read_array("respeaker-usb"), tmp_path / "b.csv"
+    sound = wave(array, 20.0)
+    soundfile.write(tmp_path / "chosen.wav", sound, RATE)
+    card = recorded_by_card(tmp_path / "card.wav", sound, silent)
+    raw = io.BytesIO()
+    soundfile.write(raw, soundfile.read(card)[0], RATE, format="RAW", subtype="PCM_16")
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(raw.getvalue())))
+    file = write_array(tmp_path / "m.csv", array.positions_m.tolist())
+    (tmp_path / "car.json").write_text('{"array": {"file": "respeaker-usb"}}')
+
+    def bearings(sound: Path | str, *options: str) -> str:
+        assert main(["array", "bearings", str(sound), *options, "--out", str(out)]) == 0
+        return out.read_text()
+
+    expected = bearings(tmp_path / "chosen.wav", "--array", str(file))
+    assert bearings(card, "--array", "respeaker-usb") == expected
+    assert bearings(card, "--array", str(file), "--channels", "2-5") == expected
+    assert bearings(card, "--array", str(file), "--channels", "2,3, 4-5") == expected
+    assert bearings(f"pcm:{RATE}:{5 + silent}", "--array", "respeaker-usb") == expected
+    assert bearings(tmp_path / "chosen.wav", "--array", "respeaker-usb") == expected, "chosen already"
+    turned = bearings(tmp_path / "chosen.wav", "--array", str(file), "--channels", "2,3,4,1")
+    assert turned != expected, "an order of the channels that there are is one that was asked for"
+    assert bearings(card, "--array", "respeaker-usb", "--channels", "3-5,2") == turned, "the option counts"
+
+    def states(sound: Path, *options: str) -> str:
+        assert main(["run", str(sound), *options, "--uncalibrated", "--out", str(out)]) == 0
+        return out.read_text()
+
+    expected = states(tmp_path / "chosen.wav", "--array", str(file))
+    assert states(card, "--array", "respeaker-usb") == expected
+    assert states(card, "--car", str(tmp_path / "car.json")) == expected
+    assert states(card, "--array", str(file), "--channels", "2-5") == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--channels", "4-7"], "card.wav: expected at least 7 channels, the largest number.*, got 6"),
+        (["--channels", "2,2-4"], "channels: expected 4 different numbers from 1 on.*got 2, 2, 3, 4"),
+        (["--channels", "2-4"], "channels: expected 4 different.* one for each microphone, got 2, 3, 4"),
+        (["--channels", "5-2"], "--channels: expected such as 2-5 or 1,3,5-8, got '5-2'"),
+        (["--channels", "2-5,"], "--channels: expected such as 2-5"),
+        (["--channels", "3-6"], "got one constant value for a second on channel 4"),
+        ([], "card.wav: expected 4 channels, one per microphone, got 6; --channels names"),
+    ],
+)
+def test_channels_that_cannot_be_chosen(
+    options: list[str], problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_array(tmp_path / "m.csv", ring(4, 0.2))
+    card = recorded_by_card(tmp_path / "card.wav", wave(MicrophoneArray(ring(4, 0.2)), 20.0), 1)
+    assert main(["run", str(card), "--array", str(file), "--uncalibrated", *options]) == 2
+    assert re.search(problem, capsys.readouterr().err)
+
+
+def test_channels_belong_to_an_array(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(tmp_path / "card.wav"), "--channels", "2-5"]) == 2
+    assert "--channels: expected --array" in capsys.readouterr().err

@@ -73,6 +73,7 @@ FIRST_OPTIONS = (
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     inputs.add_array_options(parser)
+    inputs.add_channel_option(parser)
     sensors.add_car_option(parser)
     add = parser.add_argument_group("sound").add_argument
     add("--device", metavar="NAME", help="number or name of the input device (default: the system's)")
@@ -159,14 +160,14 @@ def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> 
     device = arguments.device
     number = int(device) if device is not None and device.isdecimal() else device
     rate_hz = int(ground.in_range("--rate", arguments.rate, 1000, 1_000_000))
-    return PortAudioInput(array.n_microphones, rate_hz, number)
+    return PortAudioInput(max(array.channels, default=array.n_microphones), rate_hz, number)
 
 
 def _played(arguments: argparse.Namespace, recorded: "adapters.Source") -> "SoundFeed":
     from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.adapters.live.live_sound import Playback
 
-    audio = open_sound(recorded.sound, recorded.array.n_microphones, strict=False)
+    audio = open_sound(recorded.sound, strict=False)  # with the channels of the card, as microphones give it
     return Playback(audio, arguments.speed, arguments.duration)
 
 

@@ -258,7 +258,7 @@ def hear_stream(
 
 def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
     """Listen to a recording that is known to hold no vehicle."""
-    with open_sound(sound, array.n_microphones) as audio:
+    with open_sound(sound, array.n_microphones, channels=array.channels) as audio:
         about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
         blocks = audio.blocks(round(audio.sample_rate_hz))
         (hops,) = _heard_hops(blocks, [array], audio.sample_rate_hz, sound.name, about)

@@ -179,7 +179,7 @@ def exported_hops(
         from worldstate.adapters.export.log_messages import camera_images, recorded_sound, srp_message
 
         image_before = camera_images(source.audio_path.parent, source.start_ns)
-        with recorded_sound(source.sound, source.start_ns) as sound_until:
+        with recorded_sound(source.sound, source.start_ns, source.array.channels) as sound_until:
 
             def export_hop(step: "adapters.Step") -> None:
                 stamp_ns = step.state.stamp_ns

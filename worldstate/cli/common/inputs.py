@@ -1,9 +1,12 @@
 """What a command listens to, and by which microphones: INPUT, --array, where a bearing is looked for."""
 
 import argparse
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from inspect import getdoc
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -42,6 +45,13 @@ def add_sound_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", type=Path, nargs="+", metavar="INPUT", help=what)
     topic = "audio=, detections= or odometry=TOPIC of a bag (default: the only one of its type); repeated"
     parser.add_argument("--topic", action="append", default=[], metavar="NAME=TOPIC", help=topic)
+    add_channel_option(parser)
+
+
+def add_channel_option(parser: argparse.ArgumentParser) -> None:
+    """Declare --channels."""
+    told = "channels of the microphones, from 1: 2-5 or 1,3,5-8, where there are more (default: the array's)"
+    parser.add_argument("--channels", metavar="LIST", help=told)
 
 
 def add_array_options(
@@ -52,8 +62,10 @@ def add_array_options(
     --array FILE holds one microphone a channel, in the order of the channels, in metres:
       XML   Acoular's and OVAD's <pos x= y= z= />: the array plane seen from behind, x right, y up, z forward
       CSV   x,y,z a line, with or without header and names: base_link, x forward, y left, z up
-      JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too
-    or is the name of a board that lies flat, x forward: respeaker-4, respeaker-6, uma-8, xmos
+      JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too;
+            "channels": [2, 3, 4, 5] of a card with more channels than microphones
+    or is the name of a board that lies flat, x forward: respeaker-4, respeaker-6, respeaker-usb, uma-8, xmos,
+    or that stands upright and faces forward: uma-16
     """
     describe(parser, add_array_options)
     add = parser.add_argument
@@ -116,7 +128,24 @@ def bag_of(arguments: argparse.Namespace) -> Path | None:
 
 def given_array(arguments: argparse.Namespace) -> "frontend.MicrophoneArray | None":
     """Return the array that --array names, None without it: a recording may then bring its own."""
-    return None if arguments.array is None else adapters.read_array(arguments.array, arguments.array_axes)
+    given = None if arguments.array is None else adapters.read_array(arguments.array, arguments.array_axes)
+    return with_channels(arguments, given)
+
+
+def with_channels(
+    arguments: argparse.Namespace, array: "frontend.MicrophoneArray | None"
+) -> "frontend.MicrophoneArray | None":
+    """Return the array, its channels those of --channels where that is given."""
+    text = getattr(arguments, "channels", None)
+    if text is None:
+        return array
+    if array is None:
+        raise InvalidArgumentError("--channels: expected --array, or --car with an array, that they are of")
+    parts = [re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part.strip()) for part in text.split(",")]
+    ranges = [range(int(one[1]), int(one[2] or one[1]) + 1) for one in parts if one is not None]
+    if len(ranges) < len(parts) or not all(ranges):
+        raise InvalidArgumentError(f"--channels: expected such as 2-5 or 1,3,5-8, got {text!r:.40}")
+    return replace(array, channels=tuple(chain(*ranges)))
 
 
 def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
@@ -148,7 +177,7 @@ def opened_front_end(arguments: argparse.Namespace) -> "Iterator[tuple[Audio, fr
     from worldstate.adapters.audio.sound_file import open_sound
 
     sound, array = _sound_and_array(arguments)
-    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
+    with open_sound(sound, array.n_microphones, channels=array.channels, strict=False) as audio:
         settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
         yield audio, frontend.FrontEnd(array, audio.sample_rate_hz, settings)
 

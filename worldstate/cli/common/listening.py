@@ -174,7 +174,8 @@ def listen_with_progress(
 
     hops = None
     if not isinstance(source.sound, adapters.RawPcm):
-        with open_sound(source.sound, strict=not source.settings.mask_dead) as audio:
+        array, strict = source.array, not source.settings.mask_dead
+        with open_sound(source.sound, array.n_microphones, channels=array.channels, strict=strict) as audio:
             hops = 10.0 * audio.duration_s
     with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
 

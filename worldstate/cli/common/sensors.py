@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from worldstate import adapters
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
-from .inputs import add_array_options, describe, given_array
+from .inputs import add_array_options, describe, given_array, with_channels
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import SoundInput
@@ -163,6 +163,7 @@ def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
     if arguments.array is not None:
         raise InvalidArgumentError("--car: expected no --array with it, it holds the array")
     car = read_car(arguments.car)
+    car = replace(car, array=with_channels(arguments, car.array))
     name = next(iter(car.cameras), None) if arguments.camera is None else str(arguments.camera)
     setup = CameraSetup() if name is None else car.setups.get(name, CameraSetup())
     return GivenSensors(arguments, car, None if name is None else car.camera(name), setup)
@@ -172,8 +173,6 @@ def recorded(
     arguments: argparse.Namespace, sound: "SoundInput", settings: "adapters.ListenSettings"
 ) -> "adapters.Source":
     """Return a recording of which sound, boxes and camera are used, and no model has to fit the array."""
-    from dataclasses import replace
-
     given = given_sensors(arguments)
     array, seen = given.car.array, given.detections()
     heard = replace(settings, boxes=given.setup.boxes, uncalibrated=True)

@@ -83,7 +83,7 @@ def _windows(
     from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.operations.labelling.label_files import window_rows
 
-    with open_sound(source.sound) as audio:
+    with open_sound(source.sound, channels=source.array.channels) as audio:
         time_s = np.arange(10, int(10.0 * audio.duration_s) + 1) / 10.0
     seen = np.zeros(len(time_s), np.bool_)
     for one in tracks:

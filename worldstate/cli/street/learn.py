@@ -100,7 +100,7 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
 
     model = adapters.read_model(arguments.model)
     source, detections = sensors.camera_source(arguments, as_sound((path,)))
-    with open_sound(source.sound) as audio:
+    with open_sound(source.sound, channels=source.array.channels) as audio:
         duration_s = audio.duration_s
     watched = watched_recording(detections, source.camera, source.settings.boxes, duration_s)
     return replace(watched, heard=heard_street(source, model)) if arguments.sides else watched

@@ -83,7 +83,8 @@ def heard_passes(source: Source, margin_s: float) -> list[HeardPass]:
 
 
 def _bearings(source: Source) -> HopTable:
-    with open_sound(source.sound, source.array.n_microphones, strict=False) as audio:
+    n_microphones, channels = source.array.n_microphones, source.array.channels
+    with open_sound(source.sound, n_microphones, channels=channels, strict=False) as audio:
         settings = source.settings.front_end(source.array, audio.sample_rate_hz)
         return track_bearings(audio, FrontEnd(source.array, audio.sample_rate_hz, settings))
 
