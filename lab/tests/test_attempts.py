@@ -97,7 +97,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same(number, 
     assert run.returncode != 0
     assert time.monotonic() - asked < 10.0
     assert not list(tmp_path.rglob(".*"))
-    kept = len(list((tmp_path / "cache" / "levels").iterdir()))
+    kept = len(list((tmp_path / "cache" / "levels").glob("*.sum")))
     assert 3 <= kept < 8
 
     (tmp_path / "log").unlink()

@@ -20,7 +20,7 @@ Examples
   worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png
   worldstate run ovad_dataset/SB1/left/2_00_0005 --context elm_street.json
   worldstate run second.wav --resume state.json --start 60 --save-state state2.json
-  worldstate run drive.wav --car car.json --ego-noise
+  worldstate run drive.wav --car car.json
   worldstate run ovad_dataset/SA1/left/1_00_0002 --export mcap=out.mcap
   worldstate run street_bag --export rosbag=states_bag
 """

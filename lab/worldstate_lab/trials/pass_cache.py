@@ -134,7 +134,8 @@ class PassCache:
         """Return what `make` gave for this `key`, anything ready for JSON that the tables depend on."""
         path = self.folder / pass_name / f"{origin_of(key)}.npz"
         sealed = path.with_suffix(".sum")
-        if path.is_file():
+        # Killed between the two, a run has not finished writing.
+        if path.is_file() and sealed.is_file():
             try:
                 _check_seal(path, sealed)
                 return load_named(path, "tables of a pass")
@@ -154,7 +155,7 @@ def _seal(path: Path) -> str:
 
 def _check_seal(path: Path, sealed: Path) -> None:
     """Refuse tables that are not those that were written under this name: they may read all the same."""
-    if not sealed.is_file() or sealed.read_bytes() != _seal(path).encode():
+    if sealed.read_bytes() != _seal(path).encode():
         raise InputFileError(path, f"expected what {sealed.name} was written for")
 
 

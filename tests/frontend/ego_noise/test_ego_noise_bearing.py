@@ -11,7 +11,6 @@ from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.source import ListenSettings, Source, open_source
-from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
@@ -92,19 +91,6 @@ def test_the_signature_hears_what_it_was_trained_with(recording: Path) -> None:
     plain, learned = (list(listen_steps(opened(recording, ego))) for ego in (False, True))
     for a, b in zip(plain, learned, strict=True):
         assert a.measurement.signature == b.measurement.signature
-
-
-def test_the_command_line_passes_it_on(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    heard: list[Source] = []
-
-    def listened(source: Source, **_: object) -> None:
-        heard.append(source)
-        raise InvalidArgumentError("enough")
-
-    monkeypatch.setattr("worldstate.cli.common.listening.listen_with_progress", listened)
-    for options in ([], ["--ego-noise"]):
-        main(["run", str(recording), "--uncalibrated", *options])
-    assert [source.settings.ego_noise for source in heard] == [False, True]
 
 
 def test_a_belief_out_of_range_is_refused_and_without_ego_noise_ignored() -> None:

@@ -27,7 +27,7 @@ _EXTRAS = {"figure": "matplotlib", "camera_device": "cv2", "view": "rich"}
 
 
 def add_listen_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --model, --alpha, --site-memory, --uncalibrated, --grounded, --ego-noise and the place."""
+    """Declare --model, --alpha, --site-memory, --uncalibrated, --grounded and the place."""
     add = parser.add_argument
     add("--model", type=Path, help="model file (default: that of --car, or the one that ships)")
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)")
@@ -39,8 +39,6 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     grounded = "weigh windows with bearing and approach, eq. (5), not the sequence (default: off)"
     add("--grounded", action="store_true", help=grounded)
-    ego_noise = "learn the own vehicle's noise while nothing is there and hear past it (default: off)"
-    add("--ego-noise", action="store_true", help=ego_noise)
     usual = "default: a usual blind junction, and states say so"
     add(
         "--context", type=Path, metavar="FILE", help=f"corners, lanes and rates of this place, JSON ({usual})"
@@ -142,7 +140,6 @@ def open_given(
         site_adaptation=arguments.site_memory != 0.0,
         forgetting_s=arguments.site_memory or None,
         grounding=adapters.Grounding() if arguments.grounded else None,
-        ego_noise=arguments.ego_noise,
         uncalibrated=arguments.uncalibrated,
         boxes=boxes,
         mask_dead=mask_dead,
