@@ -259,7 +259,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         share = unheard.heard
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
-            share = heard_beside(domain, share)
+            share = beside_foreign(domain, share)
         # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
         reader = self._sequence
         sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
@@ -326,7 +326,7 @@ def heard_of(frame: AcousticFrame) -> Heard:
     return Heard(share, reason if share < _SAID else None, frame.excess_db)
 
 
-def heard_beside(foreign: Foreign, heard: Heard) -> Heard:
+def beside_foreign(foreign: Foreign, heard: Heard) -> Heard:
     """Return how likely a hidden vehicle would have been noticed beside a sound that is not known.
 
     As likely as the sound is not foreign: a model that was not made for it reads neither a vehicle nor

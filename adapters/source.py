@@ -415,7 +415,7 @@ def open_source(
 
 
 def check_mounting(array: MicrophoneArray) -> None:
-    """Refuse images of a camera that nobody described: the one of OVAD is known, beside OVAD's array."""
+    """Refuse images of a camera that was not described: the one of OVAD is known, beside OVAD's array."""
     positions_m = ovad_array().positions_m
     if array.n_microphones != len(positions_m) or not np.allclose(array.positions_m, positions_m, atol=1e-3):
         problem = "expected the camera that took the images: its lens, and where it stands beside the array"

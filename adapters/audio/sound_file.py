@@ -378,9 +378,9 @@ class RawPcm(SoundStream):
         in_range("channels", self.channels, 1, MAX_CHANNELS)
         one_of("encoding", self.encoding, SUBTYPES)
 
-    def open(self) -> "RawAudio":
+    def open(self) -> "PcmAudio":
         """Read its first second."""
-        return RawAudio(self)
+        return PcmAudio(self)
 
     @property
     def frame_bytes(self) -> int:
@@ -418,7 +418,7 @@ def path_of(sound: SoundInput) -> Path:
     return sound if isinstance(sound, Path) else sound[0]
 
 
-class RawAudio(Audio):
+class PcmAudio(Audio):
     """A pipe that is being read; `frames` counts what has been read."""
 
     def __init__(self, raw: RawPcm) -> None:

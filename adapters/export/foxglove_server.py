@@ -1,4 +1,4 @@
-"""Foxglove on a websocket: who may connect, and what a viewer costs that does not take what it is sent."""
+"""Foxglove on a websocket: what may connect, and what a viewer costs that does not take what it is sent."""
 
 import io
 import logging
@@ -111,7 +111,7 @@ class OriginGate:
         while not self._stopped.is_set():
             try:
                 viewer, _ = self._listening.accept()
-            except OSError:  # nobody came, or who came has gone
+            except OSError:  # no viewer came, or it has gone
                 continue
             if self._places.acquire(blocking=False):
                 threading.Thread(target=self._serve, args=(viewer,), daemon=True).start()

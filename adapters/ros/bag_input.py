@@ -30,7 +30,7 @@ from .message_types import (
     PCM_INFO,
     RAW_AUDIO,
     STAMPED_PCM,
-    nanoseconds,
+    instant_of,
     stamp_of,
     typestore,
 )
@@ -326,7 +326,7 @@ def _pcm_block(info: sound_file.RawPcm, message: Any, recorded_ns: int) -> Audio
 def _begin_ns(message: Any, recorded_ns: int, length_ns: int) -> int:
     """Return the time of a message's first sample."""
     if hasattr(message, "timestamp"):
-        return nanoseconds(message.timestamp)
+        return instant_of(message.timestamp)
     if hasattr(message, "audio"):
         return stamp_of(message.header)
     # AudioFrame is stamped when its last sample is there; what has no stamp was recorded then.

@@ -72,10 +72,10 @@ def time_of(stamp_ns: int) -> dict[str, int]:
 
 def stamp_of(header: Any) -> int:
     """Return the stamp of a header, ns."""
-    return nanoseconds(header.stamp)
+    return instant_of(header.stamp)
 
 
-def nanoseconds(time: Any) -> int:
+def instant_of(time: Any) -> int:
     """Return a time, ns."""
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)
 
