@@ -303,7 +303,10 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionL
     """
     in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
     name = Path(path)
-    document = read_json(name, "a detections file", MAX_BYTES)
+    return _ovad_log(name, read_json(name, "a detections file", MAX_BYTES), frame_rate_hz)
+
+
+def _ovad_log(name: Path, document: object, frame_rate_hz: float) -> DetectionLog:
     rows = document.get("detections_per_frame") if isinstance(document, dict) else None
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
@@ -434,7 +437,7 @@ def read_any_detections(
         return coco_log(name, document, frame_rate_hz, n_images)
     if n_images is not None:
         raise InputFileError(name, "expected no number of images (--images): the file has every image")
-    return read_detections(name, frame_rate_hz)
+    return _ovad_log(name, document, frame_rate_hz)
 
 
 def coco_log(
