@@ -136,7 +136,8 @@ def recorded_sound(
     with open_sound(sound, channels=channels, strict=False) as audio:
         rate_hz, taken = audio.sample_rate_hz, 0
         blocks = audio.blocks(rate_hz // 10)
-        heard = next(channel for channel in range(audio.channels) if channel not in audio.silent_channels)
+        # Silent channels are counted from 1.
+        heard = next(i for i in range(audio.channels) if i + 1 not in audio.silent_channels)
 
         def sound_until(stamp_ns: int) -> Iterator[LogMessage]:
             nonlocal taken

@@ -1,5 +1,6 @@
 """MCAP logs for Foxglove: schemas, the same states back, what a scene shows, and where it refuses."""
 
+import base64
 import json
 import math
 from dataclasses import replace
@@ -18,6 +19,7 @@ from scripted_states import EGO, scripted_states
 
 from worldstate.adapters.export.log_messages import (
     image_message,
+    recorded_sound,
     sound_message,
     srp_message,
     state_messages,
@@ -157,6 +159,17 @@ def test_foxglove_parses_every_field_by_its_own_definitions():
     assert np.frombuffer(samples, "<i2").tolist() == [16384, -32768, 32767]
     image = json.loads(image_message(1_500_000_000, b"\xff\xd8\xff").data)
     assert json_format.Parse(json.dumps(as_protobuf_json(image)), image_class()).data == b"\xff\xd8\xff"
+
+
+def test_the_sound_of_a_log_is_that_of_the_first_microphone_that_hears(tmp_path):
+    heard = np.stack([np.zeros(8000), np.full(8000, 0.5), np.zeros(8000)], axis=1)
+    heard[::2, 1:] *= -1.0
+    heard[:, 2] = 0.25 * heard[:, 1]
+    soundfile.write(tmp_path / "a.wav", heard, 8000, subtype="FLOAT")
+    with recorded_sound(tmp_path / "a.wav") as sound_until:
+        (first,) = sound_until(100_000_000)
+    samples = np.frombuffer(base64.b64decode(json.loads(first.data)["data"]), "<i2")
+    assert samples[:2].tolist() == [-16384, 16384]
 
 
 def test_a_scene_shows_who_is_there_where_was_looked_and_the_risk():
