@@ -3,7 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
-from scipy.fft import irfft, rfft, rfftfreq
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 from worldstate.ground.typing import Float32Array, FloatArray
 
@@ -41,12 +41,15 @@ def split_octaves(signal: Float32Array, sample_rate_hz: float, oversampling: int
     Shapes: signal (n,).
     """
     n = len(signal)
-    spectrum = rfft(signal)
+    # The length of a vehicle's time in sight may be a prime: its transform takes five times as long.
+    whole = next_fast_len(n, real=True)
+    spectrum = rfft(signal, whole)
     bands = np.zeros((len(OCTAVES_HZ), n * oversampling), np.float32)
-    for band, mask in zip(bands, _masks_for(n, sample_rate_hz), strict=True):
+    for band, mask in zip(bands, _masks_for(whole, sample_rate_hz), strict=True):
         # Above half the rate there is nothing.
         if mask.any():
-            band[:] = irfft(spectrum * (mask * np.float32(oversampling)), n * oversampling)
+            wave = irfft(spectrum * (mask * np.float32(oversampling)), whole * oversampling)
+            band[:] = wave[: n * oversampling]
     return bands
 
 
