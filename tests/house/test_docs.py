@@ -102,3 +102,8 @@ def test_figures_are_those_that_the_laboratory_wrote():
     # A figure without its number would not be found.
     readme = texts[ROOT / "README.md"]
     assert len(re.findall(r"[\d\]] <!-- [\w.]+ -->", readme)) == readme.count("<!--") >= 10
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_can_be_read_where_pages_are_not_built(page):
+    assert "[](" not in page.read_text(encoding="utf-8")
