@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worldstate_lab.cli.main import keep_results, main, read_results
+from worldstate_lab.cli.main import keep_results, main, read_results, result_key
 from worldstate_lab.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
 from worldstate_lab.degradation.beta_curves import Band, BetaCurves
 from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, Condition
@@ -321,6 +321,11 @@ def test_results_are_merged_by_the_words_that_change_a_figure(tmp_path, capsys):
     }
     assert found["bench --seed 3"]["figures"] == {"beta": [0.1, None]}
     assert found["bench --seed 3"]["seeds"] == [3] and "commit" in found["bench --seed 3"]
+    for name in ("a.npz", "b.npz"):
+        (tmp_path / name).touch()
+    both = [f"{tmp_path}/a.npz", f"{tmp_path}/b.npz"]
+    assert result_key(["streams", *both]) == f"streams {tmp_path.name}/*.npz"
+    assert result_key(["streams", both[0], "--set-on", both[1]]) == "streams a.npz --set-on b.npz"
     path.write_text("{")
     assert main(["place", "none.csv", "--results", str(path)]) == 2
     assert "results of worldstate-lab: expected JSON" in capsys.readouterr().err

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,8 @@ _NO_FIGURE = ("--results", "--out", "--predictions", "--jobs")
 def result_key(words: Sequence[str]) -> str:
     """Return a command line by which its figures are found: paths by their names, nothing of where it ran.
 
+    All files of a folder stand together, as they were asked for.
+
     Examples
     --------
     >>> result_key(["windows", "data/features.csv", "--protocol", "lojo", "--jobs", "2", "--json"])
@@ -89,8 +92,19 @@ def result_key(words: Sequence[str]) -> str:
         elif skip or word == "--json":
             skip = False
         else:
-            kept.append(word if word.startswith("--") else Path(word).name)
-    return " ".join(kept)
+            kept.append(word)
+    return " ".join(word for key, words in groupby(kept, _beside) for word in _named(key, list(words)))
+
+
+def _beside(word: str) -> tuple[Path, str]:
+    return Path(word).parent, Path(word).suffix
+
+
+def _named(beside: tuple[Path, str], words: Sequence[str]) -> list[str]:
+    folder, suffix = beside
+    if suffix and len(words) > 1 and len(words) == len(list(folder.glob(f"*{suffix}"))):
+        return [f"{folder.name}/*{suffix}"]
+    return [word if word.startswith("--") else Path(word).name for word in words]
 
 
 def read_results(path: Path) -> dict[str, Any]:
