@@ -4,13 +4,15 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
-from worldstate.adapters.export.log_messages import read_snapshot_lines
+from worldstate.adapters.export.log_messages import IMAGE_TOPIC, SNAPSHOT_TOPIC, SOUND_TOPIC, read_messages
+from worldstate.adapters.export.scene import CompressedImage, RawAudio
 from worldstate.adapters.files.file_io import GrowingFile, line_writer, refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
 from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
-from worldstate.ground.serialisation import MOST_CHARACTERS, decode_json
+from worldstate.ground.serialisation import MOST_CHARACTERS, decode, decode_json
 from worldstate.state import WorldState
 
 # A hop: the last decision of a recording ends up to so long before it does.
@@ -18,6 +20,7 @@ _SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
 _HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
+Media = TypeVar("Media", CompressedImage, RawAudio)
 
 
 def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
@@ -31,15 +34,25 @@ def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
         raise InputFileError(path, _EMPTY)
 
 
+def read_media(path: Path, kind: type[Media]) -> Iterator[tuple[int, Media]]:
+    """Yield each image or block of sound of a log with its stamp, ns; only MCAP of `--export` holds any."""
+    topic = IMAGE_TOPIC if kind is CompressedImage else SOUND_TOPIC
+    with refused_as_file(path):
+        for stamp_ns, text in read_messages(path, topic) if _is_own_mcap(path) else ():
+            yield stamp_ns, decode(kind, decode_json(text, topic), topic)
+
+
 def _lines(path: Path) -> Iterator[str]:
-    if path.suffix.lower() == ".mcap" and path.is_file() and not _is_of_ros(path):
-        return read_snapshot_lines(path)
+    if _is_own_mcap(path):
+        return (text for _, text in read_messages(path, SNAPSHOT_TOPIC))
     return bag_snapshot_lines(path) if is_bag(path) else _json_lines(path)
 
 
-def _is_of_ros(path: Path) -> bool:
+def _is_own_mcap(path: Path) -> bool:
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return False
     with path.open("rb") as file:
-        return _ROS_PROFILE in file.read(_HEADER_BYTES)
+        return _ROS_PROFILE not in file.read(_HEADER_BYTES)
 
 
 def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:

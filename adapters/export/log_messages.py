@@ -319,8 +319,8 @@ class _McapMessages:
 _LARGEST_RECORD = 1 << 28
 
 
-def read_snapshot_lines(path: Path) -> Iterator[str]:
-    """Yield the snapshots of an MCAP file as the text that was written, in the order of their writing.
+def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str]]:
+    """Yield stamp and text of the messages of a topic of an MCAP file, in the order of their writing.
 
     Of a file that was not finished those are read whose chunk is whole.
     """
@@ -331,9 +331,10 @@ def read_snapshot_lines(path: Path) -> Iterator[str]:
         try:
             # By time of writing and not by stamp: a late measurement may have moved a stamp back.
             messages = reader(file, validate_crcs=True, record_size_limit=_LARGEST_RECORD)
-            for _, _, message in messages.iter_messages([SNAPSHOT_TOPIC], log_time_order=False):
-                text, found = message.data.decode(), True
-                yield text
+            for _, channel, message in messages.iter_messages(log_time_order=False):
+                found = True
+                if channel.topic == topic:
+                    yield message.log_time, message.data.decode()
         except GeneratorExit:
             raise
         except (

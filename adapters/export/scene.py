@@ -1,5 +1,6 @@
 """The world-state as a scene that Foxglove draws: its messages, and sectors, lines and labels in them."""
 
+import base64
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -16,8 +17,18 @@ from worldstate.state import Entity, Occluder, RiskCue, SearchedView, WorldState
 NoPrimitives: TypeAlias = Annotated[
     tuple[str, ...], Check("an empty list", lambda value: not value, {"maxItems": 0})
 ]
+
+
+def _is_base64(text: str) -> bool:
+    try:
+        base64.b64decode(text, validate=True)
+    except ValueError:
+        return False
+    return True
+
+
 # In the words of JSON Schema; it is what tells a viewer to decode the text.
-Base64: TypeAlias = Annotated[str, Check("base64", str.isascii, {"contentEncoding": "base64"})]
+Base64: TypeAlias = Annotated[str, Check("base64", _is_base64, {"contentEncoding": "base64"})]
 
 
 @dataclass(frozen=True, slots=True)

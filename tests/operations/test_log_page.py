@@ -1,21 +1,26 @@
 """A log as one page: it says what the states say, stands alone, and opens in a browser without a fault."""
 
+import base64
+import io
 import json
 import os
 import re
 import shutil
 import subprocess
+import wave
 from contextlib import contextmanager
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scripted_states import scripted_states
 
 from worldstate import WorldState
 from worldstate.adapters.datasets.ovad import TrueTrack
+from worldstate.adapters.export.log_messages import image_message, mcap_file, sound_message, state_messages
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement.measurement import Bearing
@@ -26,6 +31,8 @@ from worldstate.operations.viewing.log_page import page_data, write_log_page
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 TIME_S = 0.1 * np.arange(40)
 TRUE = TrueTrack(TIME_S, 0.02 * np.arange(40), TIME_S > 2.0, np.zeros((40, 2)))
+# Two images of a pixel, black and white.
+JPEGS = [cv2.imencode(".jpg", np.full((1, 1), grey, np.uint8))[1].tobytes() for grey in (0, 255)]
 HOSTILE = "</script><script src='https://example.org/x.js'></script><!--"
 
 
@@ -137,6 +144,171 @@ def test_the_command_writes_a_part_of_a_log_beside_it(states, tmp_path, capsys):
 def test_no_state_is_refused():
     with pytest.raises(InvalidArgumentError, match="at least one snapshot"):
         page_data([])
+
+
+def logged_sound(samples, rate_hz, begins_ns=0):
+    """Return what a log holds of sound in [-1, 1): blocks of a tenth of a second, each with its stamp."""
+    size = rate_hz // 10
+    stamps_ns = [begins_ns + round(k * size * 1e9 / rate_hz) for k in range(-(-len(samples) // size))]
+    blocks = np.split(samples, range(size, len(samples), size))
+    return [
+        (at, sound_message(at, block, rate_hz).value) for at, block in zip(stamps_ns, blocks, strict=True)
+    ]
+
+
+def logged_images(stamps_ns):
+    """Return what a log holds of images, each with bytes of its own."""
+    return [(at, image_message(at, b"\xff\xd8\xff" + str(at).encode()).value) for at in stamps_ns]
+
+
+def of_uri(uri, kind):
+    head, text = uri.split(",")
+    assert head == f"data:{kind};base64"
+    return base64.b64decode(text, validate=True)
+
+
+def of_wave(uri):
+    """Return rate and samples of the page's sound, by the reader of the standard library."""
+    with wave.open(io.BytesIO(of_uri(uri, "audio/wav"))) as sound:
+        assert (sound.getnchannels(), sound.getsampwidth()) == (1, 2)
+        return sound.getframerate(), np.frombuffer(sound.readframes(sound.getnframes()), "<i2")
+
+
+@pytest.mark.parametrize("since_ns", [0, 1_700_000_000 * 10**9 + 7])
+@pytest.mark.parametrize("rate_hz", [8000, 15_999, 11_025])
+def test_the_sound_of_the_page_is_that_of_the_log_from_the_first_snapshot_on(states, since_ns, rate_hz):
+    noise = np.random.default_rng(0).uniform(-1.0, 1.0, 2 * rate_hz).astype(np.float32)
+    later = [replace(state, stamp_ns=state.stamp_ns + since_ns) for state in states]
+    got_hz, got = of_wave(page_data(later, sound=logged_sound(noise, rate_hz, since_ns))["sound"])
+    first, last = (round(rate_hz * states[k].stamp_ns / 1e9) for k in (0, -1))
+    assert got_hz == rate_hz
+    assert len(got) == pytest.approx(last - first, abs=1)
+    begins = min(range(first - 1, first + 2), key=lambda k: abs(got[0] / 32768 - noise[k]))
+    assert got / 32768 == pytest.approx(
+        np.clip(noise, -1, 32767 / 32768)[begins:][: len(got)], abs=0.51 / 32768
+    )
+
+
+def test_sound_of_a_high_rate_is_resampled_and_what_the_log_lacks_is_silent(states):
+    time_s = np.arange(48_000) / 48_000
+    both = 0.4 * np.sin(2 * np.pi * 1000 * time_s) + 0.4 * np.sin(2 * np.pi * 12_000 * time_s)
+    blocks = logged_sound(both.astype(np.float32), 48_000)
+    rate_hz, samples = of_wave(page_data(states, sound=[*blocks[:4], *blocks[5:]])["sound"])
+    assert (rate_hz, len(samples)) == (16_000, 8000)
+    whole = samples / 32768
+    tones = 2 / 1600 * np.abs(np.fft.rfft(whole[4800:6400]))
+    assert tones[100] == pytest.approx(0.4, abs=0.004)
+    assert np.delete(tones, 100).max() < 0.004
+    lost = whole[round(0.21 * 16_000) : round(0.29 * 16_000)]
+    assert np.abs(lost).max() < 0.01
+
+
+def test_a_long_sound_is_cut_and_says_so(states, monkeypatch):
+    blocks = logged_sound(np.full(8000, 0.5, np.float32), 8000)
+    assert page_data(states, sound=blocks)["remarks"] == []
+    monkeypatch.setattr(log_page, "MOST_SOUND_S", 0.2)
+    data = page_data(states, sound=blocks)
+    assert len(of_wave(data["sound"])[1]) == 1600
+    assert "sound is that of the first 0.2 s" in data["remarks"][-1]
+
+
+def test_sound_that_would_be_played_wrongly_is_refused(states):
+    blocks = logged_sound(np.full(8000, 0.5, np.float32), 8000)
+    for wrong in (
+        {"number_of_channels": 2},
+        {"format": "pcm-f32"},
+        {"sample_rate": 0},
+        {"sample_rate": 10**9},
+    ):
+        for spoiled in (
+            [(0, replace(blocks[0][1], **wrong))],
+            [*blocks[:2], (2, replace(blocks[2][1], **wrong))],
+        ):
+            with pytest.raises(
+                InvalidArgumentError, match="sound: expected pcm-s16 of one channel at one rate"
+            ):
+                page_data(states, sound=spoiled)
+
+
+def test_the_image_of_a_snapshot_is_the_last_one_at_or_before_it(states):
+    stamps_ns = [one.stamp_ns for one in states]
+    given = [stamps_ns[1], stamps_ns[2] + 1, stamps_ns[4] - 1, stamps_ns[4], stamps_ns[-1] + 1]
+    for early in ([], [0, stamps_ns[0] - 5]):
+        data = page_data(states, images=logged_images([*early, *given]))
+        assert not data["remarks"]
+        assert len(data["images"]) == 4 + bool(early), (
+            "no other one before the first snapshot or after the last"
+        )
+        for row, at_ns in zip(data["states"], stamps_ns, strict=True):
+            before = [str(one).encode() for one in [*early, *given] if one <= at_ns]
+            shown = data["images"][row["image"]] if row["image"] >= 0 else None
+            assert (shown is None) == (not before)
+            if shown:
+                assert of_uri(shown["src"], "image/jpeg") == b"\xff\xd8\xff" + before[-1]
+                assert shown["t"] == pytest.approx(int(before[-1]) / 1e9, abs=1e-3)
+
+
+@pytest.mark.parametrize("bound", [{"MOST_IMAGES": 20}, {"MOST_CHARACTERS": 1000}])
+def test_many_images_are_thinned_evenly_and_the_page_says_so(states, monkeypatch, bound):
+    for name, value in bound.items():
+        monkeypatch.setattr(log_page, name, value)
+    many = [replace(states[0], stamp_ns=10**8 * k) for k in range(90)]
+    data = page_data(many, images=logged_images(range(0, 9 * 10**9, 10**8)))
+    times = [one["t"] for one in data["images"]]
+    assert 10 <= len(times) <= 25
+    assert np.ptp(np.diff(times)) == pytest.approx(0.0, abs=1e-9)
+    assert sum(len(one["src"]) for one in data["images"]) <= log_page.MOST_CHARACTERS
+    assert f"{len(times)} of 90 images of the camera are shown" in data["remarks"][-1]
+    assert data["states"][-1]["image"] == len(times) - 1
+
+
+def test_an_image_larger_than_the_page_is_left_out(states, monkeypatch):
+    monkeypatch.setattr(log_page, "MOST_CHARACTERS", 10)
+    data = page_data(states, images=logged_images([0, states[1].stamp_ns]))
+    assert "images" not in data
+    assert "0 of 2 images" in data["remarks"][-1]
+
+
+@pytest.fixture
+def log_with_media(states, tmp_path):
+    """An MCAP file of the states, of noise at 16 kHz and of an image a state, as a run writes them."""
+    noise = np.random.default_rng(0).uniform(-0.5, 0.5, 16_000).astype(np.float32)
+    with mcap_file(tmp_path / "log.mcap") as write:
+        for at_ns, _ in logged_sound(noise, 16_000):
+            begins = 16_000 * at_ns // 10**9
+            write(sound_message(at_ns, noise[begins : begins + 1600], 16_000))
+        for number, state in enumerate(states):
+            write(image_message(state.stamp_ns - 1, JPEGS[number % 2]))
+            for message in state_messages(state):
+                write(message)
+    return tmp_path / "log.mcap", noise
+
+
+def test_the_command_shows_images_and_sound_of_a_log_that_holds_them(states, log_with_media, tmp_path):
+    log, noise = log_with_media
+    assert main(["log", "view", str(log)]) == 0
+    data = json.loads(Elements(log.with_suffix(".html").read_text("utf-8")).data)
+    rate_hz, samples = of_wave(data["sound"])
+    begins = round(rate_hz * states[0].stamp_ns / 1e9)
+    assert samples / 32768 == pytest.approx(noise[begins:][: len(samples)], abs=0.51 / 32768)
+    assert [of_uri(one["src"], "image/jpeg") for one in data["images"][:2]] == JPEGS
+    assert [row["image"] for row in data["states"]] == list(range(len(states)))
+    lines = tmp_path / "states.jsonl"
+    lines.write_text("".join(state.to_json() + "\n" for state in states))
+    assert main(["log", "view", str(lines), "--out", str(tmp_path / "plain.html")]) == 0
+    plain = Elements((tmp_path / "plain.html").read_text("utf-8"))
+    assert not {"img", "audio"} & {tag for tag, _ in plain.found}
+    assert not {"images", "sound"} & set(json.loads(plain.data))
+    assert not any("image" in row for row in json.loads(plain.data)["states"])
+
+
+def test_media_that_is_no_base64_is_refused_in_one_line(states, tmp_path, capsys):
+    log, message = tmp_path / "log.mcap", image_message(0, b"image")
+    with mcap_file(log) as write:
+        for one in (*state_messages(states[0]), replace(message, value=replace(message.value, data='"><x'))):
+            write(one)
+    assert main(["log", "view", str(log)]) == 2
+    assert "log.mcap: /camera/image.data: expected base64" in capsys.readouterr().err
 
 
 class Browser:
@@ -271,3 +443,45 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
             assert not {"Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"} & set(kinds)
             asked = [one["params"] for one in page.events if one["method"] == "Network.requestWillBeSent"]
             assert [one["request"]["url"] for one in asked] == [path.as_uri()]
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_sound_plays_in_step_with_the_slider_and_the_image(states, log_with_media, tmp_path):
+    log, _ = log_with_media
+    assert main(["log", "view", str(log)]) == 0
+    path = log.with_suffix(".html")
+    write_log_page(states, tmp_path / "plain.html")
+    held = "[document.querySelector('audio').currentTime, +document.getElementById('slider').value]"
+    with browser(tmp_path / "profile") as page:
+        page.open(path)
+        assert "space: play or pause, with sound" in page.value("document.body.textContent")
+        for key, at in (("Home", 0), ("ArrowRight", 1), ("End", 5)):
+            page.press(key)
+            assert page.value(held) == [
+                pytest.approx((states[at].stamp_ns - states[0].stamp_ns) / 1e9, abs=1e-4),
+                at,
+            ]
+            assert of_uri(page.value("document.querySelector('img').src"), "image/jpeg") == JPEGS[at % 2]
+        page.value(
+            "slider.value = 2; slider.dispatchEvent(new Event('input'))".replace("slider", "at('slider')")
+        )
+        assert page.value(held) == [pytest.approx(0.2, abs=1e-4), 2]
+        # Slower than the clock, it sets the pace: it would else be paused halfway.
+        page.value("document.querySelector('audio').playbackRate = 0.5")
+        space = "document.body.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))"
+        page.call("Runtime.evaluate", expression=space, userGesture=True)
+        assert page.value("document.querySelector('audio').paused") is False
+        sound = "document.querySelector('audio')"
+        ended = (
+            f"{sound}.paused || new Promise(done => {sound}.addEventListener('pause', done, {{once: true}}))"
+        )
+        page.call("Runtime.evaluate", expression=ended, awaitPromise=True)
+        assert page.value(held) == [pytest.approx(0.5, abs=0.05), pytest.approx(5, abs=1)]
+        kinds = {one["method"] for one in page.events}
+        assert not {"Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"} & kinds
+        asked = [one["params"]["request"]["url"] for one in page.events if "requestWillBe" in one["method"]]
+        assert [url for url in asked if not url.startswith("data:")] == [path.as_uri()]
+        page.events.clear()
+        page.open(tmp_path / "plain.html")
+        assert page.value("document.querySelectorAll('img, audio').length") == 0

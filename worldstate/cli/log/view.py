@@ -1,8 +1,9 @@
 """`worldstate log view`: a log as one page to step through in a browser.
 
 Write one HTML file that needs no other file and no network: the street from above, azimuths, what decides
-an advisory with its threshold, the evidence piece by piece, what was searched and heard. The arrow keys step
-from snapshot to snapshot, space plays, home and end go to the ends.
+an advisory with its threshold, the evidence piece by piece, what was searched and heard, and the camera's
+images and the sound where LOG is an MCAP file that holds them. The arrow keys step from snapshot to snapshot,
+space plays, home and end go to the ends.
 
 Examples
 --------
@@ -33,13 +34,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
+    from worldstate.adapters.export.scene import CompressedImage, RawAudio
+    from worldstate.adapters.state_log import read_media
     from worldstate.operations.viewing.log_page import check_page, write_log_page
 
     arguments.out = check_page(arguments.out or arguments.log.with_suffix(".html"))
     output.check_outputs(arguments, "out")
     with progress.progress_bar(f"reading {arguments.log.name}", None) as bar:
         states = _between(arguments.log, arguments.between or (-9e9, 9e9), bar.advance)
-        page = write_log_page(states, arguments.out, title=arguments.log.name)
+        page = write_log_page(
+            states,
+            arguments.out,
+            title=arguments.log.name,
+            images=read_media(arguments.log, CompressedImage),
+            sound=read_media(arguments.log, RawAudio),
+        )
     report = {"states": len(page["states"]), "remarks": page["remarks"], "written": str(arguments.out)}
     return output.CommandResult(report)
 

@@ -1,24 +1,33 @@
 """A state log as one page of HTML to step through in a browser, without another file or a network."""
 
+import base64
+import io
 import json
 import math
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TypeAlias, TypedDict
+from typing import NotRequired, TypeAlias, TypedDict
 
 import numpy as np
+import soundfile
+from scipy import signal
 
 from worldstate.abduction.road_users import Foreign
 from worldstate.adapters.datasets.ovad import TrueTrack
-from worldstate.adapters.export.scene import hidden_sector, label_of, sector_of
+from worldstate.adapters.export.scene import CompressedImage, RawAudio, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.file_io import write_text
 from worldstate.ground import InputFileError, InvalidArgumentError, seconds
 from worldstate.operations.recordings.evidence_report import common_lines
 from worldstate.state import Entity, RiskCue, WorldState
 
-# A snapshot with two entities is 1 kB: five to ten minutes are shown whole, and a page has 6 MB at most.
+# A snapshot with two entities is 1 kB: five to ten minutes are shown whole, and they take 6 MB at most.
 MOST_STATES = 3000
+# Of characters images take 12 MB at most and sound 8, so that a page stays below 27 MB. Of a street little is
+# heard above 8 kHz.
+MOST_IMAGES, MOST_CHARACTERS = 300, 12_000_000
+MOST_SOUND_S, HIGHEST_RATE_HZ, _MOST_RATE_HZ = 180.0, 16_000, 1_000_000
 # A street has fewer; of a fault that gives birth to many the likeliest are enough to see it.
 _MOST_ENTITIES = 16
 
@@ -33,6 +42,8 @@ class PageData(TypedDict):
     t0_s: float | None
     truth: list[list[Row]]
     states: list[Row]
+    images: NotRequired[list[Row]]  # Time and data URI; "image" of a state is its number, -1 before the first
+    sound: NotRequired[str]  # Data URI, from the first snapshot on
 
 
 def check_page(path: Path) -> Path:
@@ -49,6 +60,8 @@ def write_log_page(
     title: str = "",
     t0_s: float | None = None,
     truth: Sequence[TrueTrack] = (),
+    images: Iterable[tuple[int, CompressedImage]] = (),
+    sound: Iterable[tuple[int, RawAudio]] = (),
 ) -> PageData:
     """Write snapshots as one page of HTML; return what it draws.
 
@@ -64,11 +77,14 @@ def write_log_page(
         Line-of-sight entry.
     truth : sequence of TrueTrack
         True tracks of the vehicles of a simulated recording.
+    images, sound : iterable of (int, CompressedImage) or (int, RawAudio), optional
+        What `read_media` yields of the log: read after the snapshots, in order of their stamps, ns. The page
+        holds at most 300 images of 12 MB, thinned evenly, and 180 s of sound at no more than 16 kHz.
 
     Raises
     ------
     InvalidArgumentError
-        If there is no snapshot.
+        If there is no snapshot, or the sound is not of one microphone at one rate.
 
     Examples
     --------
@@ -78,7 +94,7 @@ def write_log_page(
     >>> len(page["states"])
     1
     """
-    data = page_data(states, title=title, t0_s=t0_s, truth=truth)
+    data = page_data(states, title=title, t0_s=t0_s, truth=truth, images=images, sound=sound)
     template = (files("worldstate") / "data" / "log_view.html").read_text("utf-8")
     # Within a script element only "<" can end it or begin a comment.
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
@@ -92,21 +108,83 @@ def page_data(
     title: str = "",
     t0_s: float | None = None,
     truth: Sequence[TrueTrack] = (),
+    images: Iterable[tuple[int, CompressedImage]] = (),
+    sound: Iterable[tuple[int, RawAudio]] = (),
 ) -> PageData:
     """Return what the page draws of snapshots; parameters are those of `write_log_page`."""
-    kept, every, count, calibrated = list[Row](), 1, 0, 0
+    kept, every, count, calibrated = list[tuple[int, Row]](), 1, 0, 0
     for count, state in enumerate(states, start=1):
         calibrated += state.calibrated
         if (count - 1) % every == 0:
-            kept.append(_row(state))
+            kept.append((state.stamp_ns, _row(state)))
         if len(kept) > 2 * MOST_STATES:
             kept, every = kept[::2], 2 * every
     if not kept:
         raise InvalidArgumentError("states: expected at least one snapshot, got none")
-    for row in kept if not calibrated else ():
+    rows = [row for _, row in kept]
+    for row in rows if not calibrated else ():
         row["thresholds"] = {}
     remarks = _remarks(count, every, calibrated)
-    return PageData(title=title, remarks=remarks, t0_s=t0_s, truth=list(map(_track, truth)), states=kept)
+    data = PageData(title=title, remarks=remarks, t0_s=t0_s, truth=list(map(_track, truth)), states=rows)
+    stamps_ns = [stamp_ns for stamp_ns, _ in kept]
+    _add_images(data, stamps_ns, images)
+    _add_sound(data, stamps_ns[0], stamps_ns[-1], sound)
+    return data
+
+
+def _add_images(
+    data: PageData, stamps_ns: Sequence[int], images: Iterable[tuple[int, CompressedImage]]
+) -> None:
+    """Add images from the last before the first snapshot on, and to each snapshot the number of its own."""
+    kept, every, count = list[tuple[int, str]](), 1, 0
+    for stamp_ns, image in images:
+        if stamp_ns > stamps_ns[-1]:
+            break
+        if stamp_ns <= stamps_ns[0]:
+            kept, every, count = [], 1, 0
+        if count % every == 0:
+            kept.append((stamp_ns, f"data:image/{image.format};base64,{image.data}"))
+        count += 1
+        while len(kept) > MOST_IMAGES or sum(len(uri) for _, uri in kept) > MOST_CHARACTERS:
+            kept, every = kept[::2] if len(kept) > 1 else [], 2 * every
+    if len(kept) < count:
+        said = f"{len(kept)} of {count} images of the camera are shown, evenly spread over the time."
+        data["remarks"].append(f"{said} The option --between shows more of a part.")
+    if kept:
+        data["images"] = [{"t": round(seconds(stamp_ns), 3), "src": uri} for stamp_ns, uri in kept]
+        for stamp_ns, row in zip(stamps_ns, data["states"], strict=True):
+            row["image"] = bisect_right(kept, stamp_ns, key=lambda one: one[0]) - 1
+
+
+def _add_sound(data: PageData, first_ns: int, last_ns: int, sound: Iterable[tuple[int, RawAudio]]) -> None:
+    """Add the sound from the first snapshot on; where the log has none in between, it is silent."""
+    span_s, rate_hz, begun_ns, begun = min(seconds(last_ns - first_ns), MOST_SOUND_S), 0, 0, 0
+    samples = np.zeros(0, np.int16)
+    for stamp_ns, block in sound:
+        if seconds(stamp_ns - first_ns) > span_s:
+            break
+        got, rate = (block.format, block.number_of_channels, block.sample_rate), rate_hz or block.sample_rate
+        if got != ("pcm-s16", 1, rate) or not 0 < rate <= _MOST_RATE_HZ:
+            raise InvalidArgumentError(f"sound: expected pcm-s16 of one channel at one rate, got {got}")
+        if not rate_hz:
+            # The blocks after the first are placed by whole samples from it: rounding leaves no gap.
+            rate_hz, begun_ns, begun = rate, stamp_ns, round(seconds(stamp_ns - first_ns) * rate)
+            samples = np.zeros(round(span_s * rate), np.int16)
+        heard = base64.b64decode(block.data)
+        at = begun + round(seconds(stamp_ns - begun_ns) * rate_hz)
+        low, high = np.clip((at, at + len(heard) // 2), 0, len(samples))
+        samples[low:high] = np.frombuffer(heard, "<i2", len(heard) // 2)[low - at : high - at]
+    if not samples.any():
+        return
+    step = -(-rate_hz // HIGHEST_RATE_HZ)
+    if step > 1:
+        samples = np.clip(np.rint(signal.resample_poly(samples.astype(float), 1, step)), -32768, 32767)
+    file = io.BytesIO()
+    soundfile.write(file, samples.astype(np.int16), round(rate_hz / step), "PCM_16", format="WAV")
+    data["sound"] = "data:audio/wav;base64," + base64.b64encode(file.getvalue()).decode()
+    if seconds(last_ns - first_ns) > span_s:
+        said = f"The sound is that of the first {span_s:g} s. The option --between chooses another part."
+        data["remarks"].append(said)
 
 
 def _remarks(count: int, every: int, calibrated: int) -> list[str]:
