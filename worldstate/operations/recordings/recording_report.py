@@ -214,9 +214,7 @@ def run_recording(
     )
 
 
-def announcement(
-    states: Iterable[WorldState], truth: Sequence[TrueTrack], vehicle: str = "a vehicle"
-) -> str:
+def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehicle: str = "a vehicle") -> str:
     """Return in one sentence how long before it came into sight each vehicle was announced.
 
     Parameters
