@@ -8,9 +8,11 @@ A package names them in its pyproject.toml, and the command line names one of th
 | `worldstate.exporters` | `ExporterPart` | ``--export NAME=TARGET`` |
 | `worldstate.measurements` | `MeasurementsPart` | ``--measurements NAME=FILE`` |
 
-A part has a minute for each call: one that hangs ends the command as one that fails.
+A part has a minute for each call: one that hangs ends the command as one that fails. Code below Python that
+does not come back then either ends the process, with exit code 1 and where it hangs.
 """
 
+import faulthandler
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -31,6 +33,9 @@ from worldstate.state import WorldState
 SIGNALLED = 128
 # A model of a detector may load for tens of seconds; what takes longer than a minute does not come back.
 LONGEST_S = 60.0
+# What Python raises reaches nothing below it.
+BELOW_PYTHON_S = 10.0
+_STDERR = 2
 Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
 # What other modalities say, each time it is asked for anew.
 OtherModality: TypeAlias = Callable[[], Iterable[Timed]]
@@ -119,9 +124,11 @@ def _limited() -> Iterator[None]:
 
     signal.signal(signal.SIGALRM, end)
     signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
+    faulthandler.dump_traceback_later(LONGEST_S + BELOW_PYTHON_S, exit=True, file=_STDERR)
     try:
         yield
     finally:
+        faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
 

@@ -224,6 +224,23 @@ def test_a_detector_that_hangs_ends_the_run_with_its_name(monkeypatch):
     assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
 
 
+BELOW_PYTHON = """
+import itertools
+from worldstate.adapters import own_parts
+own_parts.LONGEST_S, own_parts.BELOW_PYTHON_S = 0.2, 0.3
+def the_part_that_hangs():
+    sum(itertools.repeat(0))
+with own_parts.of_part("mine"):
+    the_part_that_hangs()
+"""
+
+
+def test_code_below_python_that_never_returns_ends_the_process_and_is_named():
+    ended = subprocess.run([sys.executable, "-c", BELOW_PYTHON], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert "the_part_that_hangs" in ended.stderr
+
+
 @pytest.mark.parametrize("error", [SystemExit(0), BaseException("odd"), RuntimeError("no licence")])
 def test_a_detector_that_raises_anything_ends_the_run_with_its_name(error):
     class Raising:
