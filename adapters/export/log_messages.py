@@ -3,12 +3,13 @@
 import base64
 import json
 import math
-import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from types import ModuleType
 from typing import BinaryIO, TypeAlias
@@ -349,40 +350,49 @@ _MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.
 
 
 def check_chunks(path: Path) -> None:
-    """Refuse an MCAP file with a chunk that fills the memory, by what its head and its data say of its size.
+    """Refuse an MCAP file with a chunk that fills the memory.
 
-    Neither the reader of MCAP nor that of bags has a bound.
+    Neither the reader of MCAP nor that of bags has a bound, and what a frame states of its own size may be
+    wrong, missing, or followed by another frame. So a chunk is decoded here first, up to the size it claims.
     """
+    about = path.stat()
+    _check_chunks(path, about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(maxsize=8)  # a bag is opened several times in a run, and decoding takes seconds a gigabyte
+def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
     with path.open("rb") as file:
-        end, at = file.seek(0, os.SEEK_END), _MAGIC_BYTES
+        at = _MAGIC_BYTES
         while at + _RECORD.size <= end:
             file.seek(at)
             kind, length = _RECORD.unpack(file.read(_RECORD.size))
-            if kind == _CHUNK and (size := _decoded_bytes(file.read(min(length, 64)))) > _LARGEST_RECORD:
-                problem = f"expected chunks of at most {_LARGEST_RECORD >> 20} MiB, got one of {size >> 20}"
-                raise InputFileError(path, problem)
             at += _RECORD.size + length
+            # What was cut short the readers refuse or leave out before they decode it.
+            if kind == _CHUNK and length >= _CHUNK_HEAD.size and at <= end:
+                head = file.read(_CHUNK_HEAD.size)
+                claimed = int(_CHUNK_HEAD.unpack(head)[2])
+                if (size := max(length, claimed)) > _LARGEST_RECORD:
+                    limit = f"expected chunks of at most {_LARGEST_RECORD >> 20} MiB"
+                    raise InputFileError(path, f"{limit}, got one of {size >> 20}")
+                if _is_longer(head + file.read(length - len(head)), claimed):
+                    raise InputFileError(path, f"expected {claimed} bytes in a chunk as it claims, got more")
 
 
-def _decoded_bytes(head: bytes) -> int:
-    """Return how long a chunk is when it is decoded; 0 where it has no whole head."""
-    if len(head) < _CHUNK_HEAD.size:
-        return 0
-    _, _, told_bytes, _, named = _CHUNK_HEAD.unpack_from(head)
-    claimed = int(told_bytes)
-    name, data = head[_CHUNK_HEAD.size :][:named], head[_CHUNK_HEAD.size + named + 8 :]
+def _is_longer(chunk: bytes, claimed: int) -> bool:
+    """Return whether a chunk holds more than its record or, decoded, more than it claims."""
+    named = _CHUNK_HEAD.unpack_from(chunk)[4]
+    name, rest = chunk[_CHUNK_HEAD.size :][:named], chunk[_CHUNK_HEAD.size + named :]
+    data = rest[8:]
+    if int.from_bytes(rest[:8], "little") > len(data):
+        return True
     try:
         if name == b"zstd":
-            told = int(optional("zstandard").get_frame_parameters(data).content_size)
-            # The largest number stands for a frame that does not tell.
-            return max(claimed, told if told < _UNKNOWN else 0)
+            decoder = optional("zstandard").ZstdDecompressor()
+            return len(decoder.stream_reader(data, read_across_frames=True).read(claimed + 1)) > claimed
         if name == b"lz4":
-            return max(claimed, int(optional("lz4.frame").get_frame_info(data)["content_size"]))
+            return len(optional("lz4.frame").LZ4FrameFile(BytesIO(data)).read(claimed + 1)) > claimed
     except MissingExtraError:
         raise
     except Exception:  # a damaged frame, which the reader refuses with an error of its own
-        return claimed
-    return claimed
-
-
-_UNKNOWN = (1 << 64) - 1
+        return False
+    return False

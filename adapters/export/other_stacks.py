@@ -1,4 +1,4 @@
-"""Entities as other stacks have them: Autoware's PredictedObjects, ASAM OSI's SensorData, tracks of ODAS.
+"""Entities as other stacks have them: Autoware's PredictedObjects, OSI's SensorData, ODAS's and MOT's tracks.
 
 A place is as measured, or in the crossing lane where only the azimuth is known.
 """
@@ -397,6 +397,40 @@ def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
             candidate.vehicle_classification.type = vehicle
 
 
+class _Numbers:
+    """Numbers of entities as they come up, of what is there now: a long run has more than memory holds."""
+
+    def __init__(self) -> None:
+        self._there: dict[str, int] = {}
+        self._next = count(1)
+
+    def of(self, state: WorldState) -> dict[str, int]:
+        """Return the number of every entity of a state by its id; none is given again."""
+        self._there = {one.id: self._there.get(one.id) or next(self._next) for one in state.entities}
+        return self._there
+
+
+@contextmanager
+def mot_lines(path: Path) -> Iterator[Callable[[WorldState], None]]:
+    """Lend a function that writes states as text of MOTChallenge 2015, tracks in space.
+
+    A line is ``frame, id, -1, -1, -1, -1, conf, x, y, z``: number of the state from 1, that of the entity,
+    its existence, and its place in metres in the frame of the state. A snapshot holds no box of an image, and
+    a moving entity of which no distance is stated has no line.
+    """
+    numbers, frames = _Numbers(), count(1)
+    with line_writer(path) as write:
+
+        def write_state(state: WorldState) -> None:
+            frame, known = next(frames), numbers.of(state)
+            for one in state.entities:
+                if one.moving and one.position_m is not None:
+                    place = ",".join(f"{value:.3f}" for value in one.position_m)
+                    write(f"{frame},{known[one.id]},-1,-1,-1,-1,{one.existence_probability:.6f},{place}")
+
+        yield write_state
+
+
 # ODAS sends as many tracks each time, empty ones with id 0.
 _TRACKS = 4
 # ODAS Studio splits the stream at "}", newline, "{", and puts back the brace that is lost only where neither
@@ -414,28 +448,23 @@ class OdasTracks:
     """
 
     def __init__(self) -> None:
-        # Of what is there now: a long run has more entities than memory should hold.
-        self._numbers: dict[str, int] = {}
-        self._next = count(1)
+        self._numbers = _Numbers()
 
     def message(self, state: WorldState) -> str:
         """Return one message: the likeliest moving entities as directions, existence as activity."""
-        there = {one.id for one in state.entities}
-        self._numbers = {name: number for name, number in self._numbers.items() if name in there}
+        numbers = self._numbers.of(state)
         moving = [one for one in state.entities if one.moving]
         likeliest = sorted(moving, key=lambda one: -one.existence_probability)[:_TRACKS]
-        tracks = [self._track(one) for one in likeliest]
+        tracks = [_odas_track(one, numbers[one.id]) for one in likeliest]
         empty = {"id": 0, "tag": "", "x": 0.0, "y": 0.0, "z": 0.0, "activity": 0.0}
         sources = map(json.dumps, tracks + [empty] * (_TRACKS - len(tracks)))
         return _ODAS_MESSAGE.format(stamp=state.seq, sources=",\n        ".join(sources))
 
-    def _track(self, entity: Entity) -> dict[str, object]:
-        if entity.id not in self._numbers:
-            self._numbers[entity.id] = next(self._next)
-        x, y = round(math.cos(entity.azimuth_rad), 3), round(math.sin(entity.azimuth_rad), 3)
-        activity = round(entity.existence_probability, 3)
-        number = self._numbers[entity.id]
-        return {"id": number, "tag": "dynamic", "x": x, "y": y, "z": 0.0, "activity": activity}
+
+def _odas_track(entity: Entity, number: int) -> dict[str, object]:
+    x, y = round(math.cos(entity.azimuth_rad), 3), round(math.sin(entity.azimuth_rad), 3)
+    activity = round(entity.existence_probability, 3)
+    return {"id": number, "tag": "dynamic", "x": x, "y": y, "z": 0.0, "activity": activity}
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import io
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,12 @@ import numpy as np
 from worldstate.adapters.audio import sound_file
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.export.log_messages import check_chunks
+from worldstate.adapters.files.array_file import named_arrays
 from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, WorldstateError, seconds
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.measurement.odometry import Odometry
 
 from .message_types import (
@@ -30,6 +31,7 @@ from .message_types import (
     PCM_INFO,
     RAW_AUDIO,
     STAMPED_PCM,
+    TRANSFORMS,
     instant_of,
     stamp_of,
     typestore,
@@ -164,6 +166,9 @@ ENCODINGS: dict[str, dict[str, sound_file.Encoding]] = {
 MAX_RATE_HZ = 10_000_000
 # Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
 LONGEST_GAP_S = 2.0
+STATIC_TOPIC = "/tf_static"
+# Of a quaternion, as tf2 has it.
+_LENGTH_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -412,11 +417,75 @@ def read_bag(path: Path, topics: BagTopics | None = None) -> BagInput:
         return BagInput(sound, _array(bag), detections, None if driven is None else _ego(bag, driven))
 
 
-def needed_array(path: Path, array: MicrophoneArray | None) -> MicrophoneArray:
-    """Return the array; refuse a bag that does not say where its microphones are."""
+def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneArray:
+    """Return the array in `base_link`; refuse a bag that does not say where its microphones are.
+
+    A board by name is in axes of its own. Where static transforms lead from `base_link` to the frame of the
+    sound, it is turned and moved by them.
+    """
     if array is None:
-        raise InputFileError(path, f"expected --array, or a message of {ARRAY} in the bag")
-    return array
+        raise InputFileError(sound.path, f"expected --array, or a message of {ARRAY} in the bag")
+    if array.name not in named_arrays():
+        return array
+    with open_bag(sound.path) as bag, refused_as_file(sound.path):
+        positions_m = _in_base_link(bag, sound, array.positions_m)
+        if positions_m is None:
+            return array
+        placed = replace(array, positions_m=positions_m)
+    x, y, z = positions_m.mean(axis=0).tolist()
+    told = "%s: %s is turned and moved by %s, its middle at (%.3g, %.3g, %.3g) m"
+    _LOG.warning(told, sound.path, array.name, STATIC_TOPIC, x, y, z)
+    return placed
+
+
+def _in_base_link(bag: BagReader, sound: BagSound, points_m: FloatArray) -> FloatArray | None:
+    """Return points of the sound's frame in `base_link`, None where no static transforms lead there."""
+    _, first = next(bag.messages(sound.topic))
+    frame = _frame_name(first.header.frame_id) if hasattr(first, "header") else ""
+    transforms, passed = _static_transforms(bag), set[str]()
+    while frame != "base_link" and frame in transforms:
+        if frame in passed:
+            raise InputFileError(
+                bag.path, f"{STATIC_TOPIC}: expected no loop, got one of {len(passed)} frames"
+            )
+        passed.add(frame)
+        frame, said = transforms[frame]
+        points_m = _in_parent(bag.path, said, points_m)
+    return points_m if passed and frame == "base_link" else None
+
+
+def _static_transforms(bag: BagReader) -> dict[str, tuple[str, Any]]:
+    """Return the parent of every frame and the transform to it, of several the last."""
+    found: dict[str, tuple[str, Any]] = {}
+    if not bag.count(STATIC_TOPIC) or bag.kind_of(STATIC_TOPIC) != TRANSFORMS:
+        return found
+    for _, message in _few(bag, STATIC_TOPIC):
+        for one in message.transforms:
+            child, parent = _frame_name(one.child_frame_id), _frame_name(one.header.frame_id)
+            before, _ = found.get(child, (parent, None))
+            if before != parent:
+                problem = f"{STATIC_TOPIC}: expected one parent of {child}, got {before} and {parent}"
+                raise InputFileError(bag.path, problem)
+            found[child] = parent, one.transform
+    return found
+
+
+def _frame_name(text: str) -> str:
+    return text.removeprefix("/")  # which ROS 1 had
+
+
+def _in_parent(path: Path, transform: Any, points_m: FloatArray) -> FloatArray:
+    """Return points of a frame in its parent's."""
+    about, by = (
+        [getattr(one, axis) for axis in "xyz"] for one in (transform.rotation, transform.translation)
+    )
+    axis, scalar = np.array(about), transform.rotation.w
+    length = float(np.hypot(np.linalg.norm(axis), scalar))
+    if not abs(length - 1.0) <= _LENGTH_TOLERANCE:
+        raise InputFileError(path, f"{STATIC_TOPIC}: expected a quaternion of length 1, got {length:.3g}")
+    axis, scalar = axis / length, scalar / length
+    turned = points_m + 2.0 * np.cross(axis, np.cross(axis, points_m) + scalar * points_m)
+    return np.asarray(turned + by)
 
 
 def sound_of_bag(bag: BagReader, topic: str | None) -> BagSound:

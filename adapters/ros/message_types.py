@@ -17,6 +17,7 @@ AUDIO_FRAME, RAW_AUDIO = "audio_utils_msgs/msg/AudioFrame", "foxglove_msgs/msg/R
 DETECTIONS, ODOMETRY = "vision_msgs/msg/Detection2DArray", "nav_msgs/msg/Odometry"
 OBJECTS = "autoware_perception_msgs/msg/PredictedObjects"
 MARKERS, TEXT = "visualization_msgs/msg/MarkerArray", "std_msgs/msg/String"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _OURS = ("MultiChannelAudio", "MicrophoneArray", "RiskAdvisory", "RiskAdvisories")
 _OTHERS = "audio_common_msgs", "audio_utils_msgs", "autoware_perception_msgs", "foxglove_msgs", "vision_msgs"

@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import onnx
 import pytest
@@ -24,6 +25,7 @@ from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.datasets.ovad import OvadDataset, read_true_tracks
+from worldstate.adapters.export.log_messages import read_snapshot_lines
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.context_file import read_context
@@ -196,14 +198,42 @@ def many_zip(path: Path) -> None:
             archive.writestr(f"{number}.npy", b"")
 
 
-def chunk_bomb(path: Path, claimed: int | None = None) -> None:
-    """Write MCAP with one chunk of 1.5 GB, which may say that it is smaller."""
-    writing = zstandard.ZstdCompressor().compressobj(size=BOMB_MIB << 20)
-    data = b"".join([writing.compress(bytes(1 << 20)) for _ in range(BOMB_MIB)] + [writing.flush()])
-    size = BOMB_MIB << 20 if claimed is None else claimed
-    record = struct.pack("<QQQII", 0, 0, size, 0, 4) + b"zstd" + struct.pack("<Q", len(data)) + data
-    head = struct.pack("<BQ", 1, 8) + bytes(8)
-    path.write_bytes(MCAP + head + struct.pack("<BQ", 6, len(record)) + record)
+def zstd_frame(mib: int, *, stated: bool = True) -> bytes:
+    """Return zeros as a frame, of which the head may leave out how many they are."""
+    told = {"size": mib << 20} if stated else {}
+    writing = zstandard.ZstdCompressor().compressobj(**told)
+    return b"".join([writing.compress(bytes(1 << 20)) for _ in range(mib)] + [writing.flush()])
+
+
+def lz4_frame(mib: int) -> bytes:
+    """Return zeros as a frame whose head leaves out how many they are."""
+    writing = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB)
+    parts = [writing.begin(), *(writing.compress(bytes(1 << 20)) for _ in range(mib)), writing.flush()]
+    return b"".join(parts)
+
+
+def mcap_chunk(codec: str, data: bytes, claimed: int) -> bytes:
+    """Return a chunk that claims a size, as a record."""
+    named = codec.encode()
+    head = struct.pack("<QQQII", 0, 0, claimed, 0, len(named)) + named + struct.pack("<Q", len(data))
+    return struct.pack("<BQ", 6, len(head) + len(data)) + head + data
+
+
+def chunk_bomb(path: Path, codec: str, data: bytes, claimed: int) -> None:
+    """Write MCAP of ROS 2 with one chunk, whole but for an index, so that every reader decodes the chunk."""
+    head = struct.pack("<BQI", 1, 12, 4) + b"ros2" + bytes(4)
+    end = struct.pack("<BQI", 15, 4, 0) + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + MCAP
+    path.write_bytes(MCAP + head + mcap_chunk(codec, data, claimed) + end)
+
+
+# Of a chunk: its codec, what it holds, what it claims to hold. Readers go on to a second frame of zstd.
+CHUNK_BOMBS: dict[str, tuple[str, Callable[[], bytes], int]] = {
+    "chunk": ("zstd", lambda: zstd_frame(BOMB_MIB), BOMB_MIB << 20),
+    "secret": ("zstd", lambda: zstd_frame(BOMB_MIB), 1000),
+    "unstated": ("zstd", lambda: zstd_frame(BOMB_MIB, stated=False), 1000),
+    "second": ("zstd", lambda: zstd_frame(1) + zstd_frame(BOMB_MIB), 1 << 20),
+    "unstated_lz4": ("lz4", lambda: lz4_frame(BOMB_MIB), 1000),
+}
 
 
 def constant_bomb(path: Path) -> None:
@@ -221,10 +251,6 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "zeros.npz": (zeros_zip, load_streams),
     "long.npz": (long_zip, load_streams),
     "many.npz": (many_zip, load_streams),
-    "chunk.mcap": (chunk_bomb, log),
-    "secret.mcap": (lambda path: chunk_bomb(path, 1000), log),
-    "chunk_bag.mcap": (chunk_bomb, bag),
-    "secret_bag.mcap": (lambda path: chunk_bomb(path, 1000), bag),
     "lists.json": (lambda path: path.write_text("[" + "[]," * 20_000_000 + "[]]"), read_any_detections),
     "line.jsonl": (lambda path: path.write_bytes(b"[" * (1 << 28)), log),
     "deep.xml": (lambda path: path.write_text("<a>" * 300_000), read_array),
@@ -232,15 +258,28 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
 }
 
 
-@pytest.mark.parametrize("name", BOMBS)
-def test_a_small_file_that_grows_is_refused(name, tmp_path):
-    write, read = BOMBS[name]
-    write(tmp_path / name)
+def refused_by(name: str, read: Callable[[Path], object], folder: Path) -> None:
+    """Check that a file is refused by name, within the memory and the time that a file may take."""
 
     def refused() -> int:
         limited()
         with pytest.raises(WorldstateError, match=name):
-            read(tmp_path / name)
+            read(folder / name)
         return 1
 
-    in_child(refused, tmp_path / "report")
+    in_child(refused, folder / "report")
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_small_file_that_grows_is_refused(name, tmp_path):
+    write, read = BOMBS[name]
+    write(tmp_path / name)
+    refused_by(name, read, tmp_path)
+
+
+@pytest.mark.parametrize("kind", CHUNK_BOMBS)
+def test_a_chunk_that_grows_is_refused_by_the_readers_of_logs_and_of_bags(kind, tmp_path):
+    codec, frame, claimed = CHUNK_BOMBS[kind]
+    chunk_bomb(tmp_path / "bomb.mcap", codec, frame(), claimed)
+    for read in (lambda path: list(read_snapshot_lines(path)), bag):
+        refused_by("bomb.mcap", read, tmp_path)

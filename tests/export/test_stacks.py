@@ -448,7 +448,52 @@ def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgo
         one = replace(with_entity.entities[0], id=f"entity-{hop}", moving=True)
         message = json.loads(tracks.message(replace(with_entity, entities=(one,))))
         numbers.append(message["src"][0]["id"])
-    assert numbers == list(range(1, 201)) and len(tracks._numbers) == 1
+    assert numbers == list(range(1, 201)) and len(tracks._numbers.of(replace(with_entity, entities=()))) == 0
+
+
+def placed(name, x, y, exists=0.9):
+    return replace(PLACED.entities[0], id=name, position_m=(x, y, 0.0), existence_probability=exists)
+
+
+def mot_text(tmp_path):
+    """Write three states, of which the second has no distance and one number goes on; return the file."""
+    only_heard = replace(HIDDEN.entities[0], id="heard")
+    lost = replace(only_heard, id="a")
+    first, last = placed("a", 8.0, 4.4), placed("a", 7.0, 4.0)
+    entities = [(first, only_heard), (lost,), (last, placed("b", 9.0, -3.0, 0.25))]
+    states = [replace(PLACED, seq=k, entities=each) for k, each in enumerate(entities)]
+    (tmp_path / "states.jsonl").write_text("".join(state.to_json() + "\n" for state in states))
+    told = f"mot={tmp_path / 'tracks.txt'}"
+    assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", told]) == 0
+    return tmp_path / "tracks.txt"
+
+
+def test_mot_text_has_a_row_for_what_has_a_place(tmp_path):
+    """Read by py-motmetrics' rule: ten numbers a row without a head, indexed by whole frame and id."""
+    table = np.loadtxt(mot_text(tmp_path), delimiter=",", ndmin=2)
+    assert table.shape == (3, 10)
+    frames, ids = table[:, 0], table[:, 1]
+    assert (table[:, :2] == np.floor(table[:, :2])).all() and (frames >= 1).all() and (ids >= 1).all()
+    assert len(set(zip(frames, ids, strict=True))) == len(table), "a number stands once in a frame"
+    assert frames.tolist() == [1, 3, 3] and (table[:, 2:6] == -1).all()
+    assert ids[0] == ids[1] != ids[2], "a number stays with its entity"
+    found = [[0.9, 8.0, 4.4, 0.0], [0.9, 7.0, 4.0, 0.0], [0.25, 9.0, -3.0, 0.0]]
+    assert table[:, 6:].tolist() == found
+
+
+READS_MOT = "import sys, motmetrics; print(motmetrics.io.loadtxt(sys.argv[1]).reset_index().to_json())"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    "MOTMETRICS" not in os.environ, reason="MOTMETRICS names no Python that has py-motmetrics"
+)
+def test_py_motmetrics_reads_the_rows(tmp_path):
+    command = [os.environ["MOTMETRICS"], "-c", READS_MOT, str(mot_text(tmp_path))]
+    table = json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
+    assert list(table["FrameId"].values()) == [1, 3, 3]
+    assert table["Id"]["0"] == table["Id"]["1"] != table["Id"]["2"]
+    assert list(table["Confidence"].values()) == [0.9, 0.9, 0.25]
 
 
 def test_what_is_missing_is_named(log, tmp_path, monkeypatch, capsys):

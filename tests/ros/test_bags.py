@@ -8,18 +8,24 @@ import shutil
 import sqlite3
 import struct
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from scripted_states import scripted_states
 
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.export.other_stacks import autoware_objects
 from worldstate.adapters.export.scene import scene_update
+from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.odometry_file import OdometryLog
-from worldstate.adapters.ros.bag_input import BagTopics, read_bag
+from worldstate.adapters.ros.bag_input import BagTopics, needed_array, read_bag
 from worldstate.adapters.ros.bag_writer import bag_writer, state_bag
 from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
 from worldstate.cli.main import main
@@ -311,6 +317,101 @@ def test_sixteen_channels_of_another_recorder_run_as_our_own_sound_does(tmp_path
     states = (tmp_path / "theirs.jsonl").read_text()
     assert len(states.splitlines()) == 21
     assert states == (tmp_path / "ours.jsonl").read_text()
+
+
+def board_bag(path: Path, transforms: list[tuple[str, str, tuple, tuple]], topic: str = "/tf_static") -> Path:
+    """Write sound of the frame `mics` and transforms: parent, child, translation, quaternion x, y, z, w."""
+    with bag_writer(path) as write:
+        for k, (parent, child, at, turn) in enumerate(transforms):
+            moved = {"translation": dict(zip("xyz", at, strict=True))}
+            moved |= {"rotation": dict(zip("xyzw", turn, strict=True))}
+            one = {"header": header(k, parent), "child_frame_id": child, "transform": moved}
+            write(topic, "tf2_msgs/msg/TFMessage", k, {"transforms": [one]})
+        samples = (sound_of(RATE_HZ) * 2**15).astype("<i2")
+        said = {"format": "signed_16", "sampling_frequency": RATE_HZ, "channel_count": CHANNELS}
+        said |= {"frame_sample_count": RATE_HZ, "data": np.frombuffer(samples.tobytes(), np.uint8)}
+        write("/mics", FRAME, 6 * 10**9, {"header": header(6 * 10**9, "mics")} | said)
+    return path
+
+
+BOARD = read_array("respeaker-4")
+STILL, QUARTER = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+angles, metres = st.floats(-math.pi, math.pi), st.floats(-5.0, 5.0)
+poses = st.tuples(st.tuples(metres, metres, metres), st.tuples(angles, angles, angles))
+
+
+@settings(max_examples=20)
+@given(st.lists(poses, min_size=1, max_size=4))
+def test_a_board_stands_where_the_static_transforms_put_it(chain):
+    """SciPy's rotations are the oracle; the transforms are written in the order of the last to the first."""
+    frames, told = [*("base_link", "roof", "pole", "head")[: len(chain)], "mics"], []
+    wanted = BOARD.positions_m.copy()
+    for (parent, child), (at, turn) in reversed(list(zip(pairwise(frames), chain, strict=True))):
+        rotation = Rotation.from_euler("ZYX", turn)
+        wanted = rotation.apply(wanted) + at
+        told.append((parent, child, at, tuple(rotation.as_quat())))
+    with TemporaryDirectory() as folder:
+        sound = read_bag(board_bag(Path(folder, "bag"), told)).sound
+        placed = needed_array(sound, BOARD)
+    np.testing.assert_allclose(placed.positions_m, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("transforms", "topic"),
+    [
+        ([], "/tf_static"),
+        ([("base_link", "camera", (1.0, 0.0, 0.0), QUARTER)], "/tf_static"),
+        ([("pole", "mics", (1.0, 0.0, 0.0), QUARTER)], "/tf_static"),
+        ([("base_link", "mics", (1.0, 0.0, 0.0), QUARTER)], "/tf"),
+    ],
+)
+def test_a_board_without_a_chain_of_static_transforms_is_as_it_was(transforms, topic, tmp_path, caplog):
+    sound = read_bag(board_bag(tmp_path / "bag", transforms, topic)).sound
+    assert needed_array(sound, BOARD) is BOARD and not caplog.text
+
+
+def test_a_board_is_told_to_be_turned_and_an_array_file_stays(tmp_path, caplog, capsys):
+    bag = board_bag(tmp_path / "bag", [("base_link", "/mics", (1.0, 0.0, 1.5), QUARTER)])
+    words = ["array", "bearings", str(bag), "--azimuth-span", "360", "--out", str(tmp_path / "b.csv")]
+    assert main([*words, "--array", "respeaker-4"]) == 0
+    assert caplog.messages == [
+        f"{bag}: respeaker-4 is turned and moved by /tf_static, its middle at (1, 0, 1.5) m"
+    ]
+    caplog.clear()
+    assert main(["run", str(bag), "--array", "respeaker-4"]) == 2
+    assert "respeaker-4 is turned" in caplog.text, "what is compared with the model is the board as it stands"
+    assert "not the array of the model" in capsys.readouterr().err
+    own = tmp_path / "respeaker.json"
+    own.write_text(json.dumps(BOARD.positions_m.tolist()))
+    caplog.clear()
+    assert main([*words, "--array", str(own)]) == 0
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    ("transforms", "problem"),
+    [
+        (
+            [("base_link", "mics", (0.0,) * 3, (0.0, 0.0, 0.0, 0.0))],
+            "expected a quaternion of length 1, got 0",
+        ),
+        (
+            [("base_link", "mics", (0.0,) * 3, (0.0, 0.0, 1.0, 1.0))],
+            "expected a quaternion of length 1, got 1.41",
+        ),
+        ([("base_link", "mics", (math.nan, 0.0, 0.0), STILL)], "expected finite"),
+        ([("pole", "mics", (0.0,) * 3, STILL), ("mics", "pole", (0.0,) * 3, STILL)], "expected no loop"),
+        ([("mics", "mics", (0.0,) * 3, STILL)], "expected no loop"),
+        (
+            [("base_link", "mics", (0.0,) * 3, STILL), ("pole", "mics", (0.0,) * 3, STILL)],
+            "expected one parent of mics, got base_link and pole",
+        ),
+    ],
+)
+def test_transforms_that_cannot_be_are_refused(transforms, problem, tmp_path):
+    sound = read_bag(board_bag(tmp_path / "bag", transforms)).sound
+    with pytest.raises(InputFileError, match=re.escape(problem)):
+        needed_array(sound, BOARD)
 
 
 @pytest.mark.parametrize(

@@ -136,4 +136,4 @@ def _input(
         raise InvalidArgumentError("--start: expected none with a bag, whose messages have stamps")
     held = read_bag(bag, inputs.topics_of(arguments))
     seen = held.detections if seen is None else seen
-    return held.sound, needed_array(bag, given.car.array or held.array), seen, held.ego
+    return held.sound, needed_array(held.sound, given.car.array or held.array), seen, held.ego

@@ -12,6 +12,7 @@ EXTRAS = {
     "filterpy": ("filterpy", "smoothing"),
     "foxglove": ("foxglove-sdk", "foxglove"),
     "gtsam": ("gtsam", "gtsam"),
+    "lz4": ("lz4", "ros"),
     "matplotlib": ("matplotlib", "plot"),
     "mcap": ("mcap", "mcap"),
     "networkx": ("networkx", "graph"),
@@ -22,6 +23,7 @@ EXTRAS = {
     "rosbags": ("rosbags", "ros"),
     "sklearn": ("scikit-learn", "train"),
     "sounddevice": ("sounddevice", "live"),
+    "zstandard": ("zstandard", "ros"),
 }
 
 

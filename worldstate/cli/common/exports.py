@@ -27,9 +27,9 @@ CROSSING_M = 9.0
 # Exporters of the library, with the optional module that each needs.
 EXPORTERS = {
     "mcap": "mcap", "foxglove": "foxglove", "rerun": "rerun", "osi": "osi3", "autoware": None, "odas": None,
-    "rosbag": "rosbags", "rosbag-sqlite3": "rosbags",
+    "mot": None, "rosbag": "rosbags", "rosbag-sqlite3": "rosbags",
 }  # fmt: skip
-_FILES = "mcap", "rerun", "osi", "autoware"
+_FILES = "mcap", "rerun", "osi", "autoware", "mot"
 # These are given messages on topics, the others states.
 _VIEWERS = "mcap", "rerun", "foxglove"
 
@@ -43,6 +43,7 @@ def add_output_options(parser: argparse.ArgumentParser, *, pages: bool = True) -
       rerun=FILE           the same for the Rerun viewer
       osi=FILE             a trace of ASAM OSI SensorData; of NAME.mcap one in MCAP under OSI's file name
       autoware=FILE        Autoware's PredictedObjects, one a line
+      mot=FILE             places as MOTChallenge text of 2015; what is only heard has none
       odas=HOST:PORT       tracks as ODAS sends them; ODAS Studio listens at port 9000
       rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3 in that storage
       NAME=TARGET          what an exporter does that an installed package brings
@@ -157,6 +158,7 @@ def _stack(name: str, target: str, crossing_m: float, live: bool) -> "Stack":
     own: dict[str, ExporterPart] = {
         "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m),
         "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m),
+        "mot": lambda path: other_stacks.mot_lines(Path(path)),
         "odas": partial(other_stacks.odas_socket, live=live),
         "rosbag": lambda path: state_bag(Path(path), crossing_m),
         "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),

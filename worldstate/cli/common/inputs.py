@@ -163,7 +163,7 @@ def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, fronte
     bag = bag_of(arguments)
     if bag is not None:
         heard, own = read_sound(bag, topics_of(arguments).audio)
-        return heard, needed_array(bag, given_array(arguments) or own)
+        return heard, needed_array(heard, given_array(arguments) or own)
     sound = sound_of(arguments)
     array = choose_array(path_of(sound), given_array(arguments))
     if isinstance(sound, Path) and sound.is_dir():

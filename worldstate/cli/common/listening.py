@@ -79,6 +79,7 @@ def checked_sensors(arguments: argparse.Namespace, sound: list[Path]) -> GivenSe
 
 def _check_array(given: "GivenSensors", made_for: "frontend.MicrophoneArray", sound: list[Path]) -> None:
     from worldstate.adapters.datasets.ovad import check_channels, named_array
+    from worldstate.adapters.files.array_file import named_arrays
     from worldstate.adapters.files.array_match import WAY_OUT, matched_order
 
     if any(named_array(path) is not None for path in sound):
@@ -87,7 +88,10 @@ def _check_array(given: "GivenSensors", made_for: "frontend.MicrophoneArray", so
     if array is None:
         if len(sound) == 1 and sound[0].is_file():
             check_channels(sound[0], made_for)
-    elif not given.arguments.uncalibrated:
+        return
+    # The bag of a `run`, whose INPUT is then no sound, may turn a board by name: it has to be read for that.
+    turned = "input" in given.arguments and not sound and array.name in named_arrays()
+    if not (given.arguments.uncalibrated or turned):
         matched_order(made_for, array, WAY_OUT)
 
 
