@@ -61,7 +61,8 @@ class BoostedTrees:
             most = f"at most {MOST_TREES} trees of {MOST_NODES} nodes"
             raise InvalidArgumentError(f"split: expected {most}, got {grid}")
         for name in ("split", "yes", "no", "tree_class"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), np.intp))
+            object.__setattr__(self, name, np.array(getattr(self, name), np.intp))
+            getattr(self, name).flags.writeable = False
         freeze_arrays(self, threshold=grid, value=grid, baseline=(len(self.baseline),))
         here = np.arange(nodes)
         for name in ("yes", "no"):

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.resources import as_file, files
 from operator import attrgetter
 from pathlib import Path
@@ -129,9 +130,14 @@ def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> M
     """
     if path is not None:
         return read_record(Model, path, "model")
-    name = "moving_model.json" if moving_ego else "default_model.json"
-    with as_file(files("worldstate") / "data" / name) as default:
-        return read_record(Model, default, "model")
+    return _shipped("moving_model.json" if moving_ego else "default_model.json")
+
+
+@cache
+def _shipped(name: str) -> Model:
+    # Read once a process: a quarter of a second for every listener otherwise.
+    with as_file(files("worldstate") / "data" / name) as path:
+        return read_record(Model, path, "model")
 
 
 def save_model(path: str | Path, model: Model) -> None:

@@ -9,8 +9,9 @@ near one if the partials are multiples of one fundamental.
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
@@ -296,7 +297,7 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
     # With zero phase, to at least three times the highest partial.
     factor = int(rate // (3.0 * BAND_HIGH_HZ))
     if factor > 1:
-        x, rate = signal.decimate(x, factor, ftype="fir", zero_phase=True), rate / factor
+        x, rate = scipy.signal.decimate(x, factor, ftype="fir", zero_phase=True), rate / factor
     size, step = round(WINDOW_S * rate), STEP_S * rate
     starts = np.round(np.arange(0, len(x) - size + 1, step)).astype(np.intp)
     frames = x[starts[:, None] + np.arange(size)]
@@ -315,4 +316,4 @@ def _slope(time: FloatArray, frequency: FloatArray) -> FloatArray:
     """Slope of the track, Hz per second, by straight lines through five windows."""
     if len(time) < 5:
         return np.zeros_like(frequency)
-    return np.asarray(signal.savgol_filter(frequency, 5, 1, deriv=1, delta=float(np.diff(time).mean())))
+    return np.asarray(scipy.signal.savgol_filter(frequency, 5, 1, deriv=1, delta=float(np.diff(time).mean())))

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-import scipy.signal
+import scipy
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray

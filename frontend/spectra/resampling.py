@@ -4,13 +4,14 @@ from fractions import Fraction
 from math import ceil
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import signal
 
 from worldstate.ground import FloatArray, in_range
 from worldstate.ground.typing import Float32Array
 
+# `scipy.signal` takes longer to import than all else: by way of `scipy` that waits for its first use.
 # Attenuation of what aliases into the band, and of the ripple within it: the resolution of 16-bit converters.
 _ATTENUATION_DB = 80.0
 # Samples kept per period of the highest frequency: with 2 the filter would need an endless transition.
@@ -47,14 +48,14 @@ class Decimator:
         self._waiting = waiting[n_out * self.factor :]
         # The taps are symmetric, so that a convolution is the sum above.
         first = (len(self._taps) - 1) // self.factor
-        filtered = signal.upfirdn(self._taps, waiting, down=self.factor)
+        filtered = scipy.signal.upfirdn(self._taps, waiting, down=self.factor)
         return np.asarray(filtered[first : first + n_out], dtype=np.float64)
 
 
 def _low_pass(rate: float, high: float, low_rate: float) -> FloatArray:
     width = (low_rate - 2.0 * high) / (0.5 * rate)
-    n_taps, beta = signal.kaiserord(_ATTENUATION_DB, width)
-    taps = signal.firwin(n_taps | 1, 0.5 * low_rate, window=("kaiser", beta), fs=rate)
+    n_taps, beta = scipy.signal.kaiserord(_ATTENUATION_DB, width)
+    taps = scipy.signal.firwin(n_taps | 1, 0.5 * low_rate, window=("kaiser", beta), fs=rate)
     return np.asarray(taps, dtype=np.float64)
 
 
@@ -89,9 +90,9 @@ class Resampler:
         self._ratio = Fraction(wanted_hz / sample_rate_hz).limit_denominator(_LARGEST_TERM)
         up, down = self._ratio.as_integer_ratio()
         self.rate_hz = sample_rate_hz * up / down
-        n_taps, beta = signal.kaiserord(_ATTENUATION_DB, _TRANSITION / max(up, down))
+        n_taps, beta = scipy.signal.kaiserord(_ATTENUATION_DB, _TRANSITION / max(up, down))
         half = ceil(n_taps / (2 * up))
-        taps = up * signal.firwin(2 * half * up + 1, 1.0 / max(up, down), window=("kaiser", beta))
+        taps = up * scipy.signal.firwin(2 * half * up + 1, 1.0 / max(up, down), window=("kaiser", beta))
         several = ceil(_ROWS / 2 / up)
         self._size, self._step = several * up, several * down
         self._width = self._step + 2 * half

@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-import scipy.signal
+import scipy
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 from worldstate.adapters.audio.sound_file import open_audio

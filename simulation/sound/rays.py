@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import oaconvolve
+import scipy
 from scipy.special import modfresnelm
 
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray
@@ -463,7 +463,7 @@ def _smeared(table: SampledSignal, early: float, decay_s: float, rng: np.random.
     noise = rng.standard_normal(len(tail)) * 10.0 ** (-3.0 * tail / (decay_s * table.rate_hz))
     response = np.sqrt(max(1.0 - early, 0.0) / np.square(noise).sum()) * noise
     response[0] += np.sqrt(early)
-    values = oaconvolve(table.values, response.astype(np.float32))[: len(table.values)]
+    values = scipy.signal.oaconvolve(table.values, response.astype(np.float32))[: len(table.values)]
     return SampledSignal(np.asarray(values, np.float32), table.start_s, table.rate_hz)
 
 

@@ -9,7 +9,7 @@ those of real recordings (docs/evidence/foreign_sounds.md).
 from dataclasses import replace
 
 import numpy as np
-import scipy.signal
+import scipy
 from scipy.fft import irfft, rfft, rfftfreq
 
 from worldstate.ground.typing import Float32Array, FloatArray

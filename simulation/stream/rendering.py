@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.signal import butter, sosfilt
+import scipy
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -173,8 +173,8 @@ def _envelope(event: Event, site: Site, receiver: Receiver, late_s: float) -> Fl
 
 def band_filter(sample_rate_hz: float) -> FloatArray:
     """Return the second-order sections that pass `BAND_HZ`, or what the rate holds of it."""
-    high_hz = min(BAND_HZ[1], 0.45 * sample_rate_hz)
-    return np.asarray(butter(4, (BAND_HZ[0], high_hz), "bandpass", fs=sample_rate_hz, output="sos"))
+    band = BAND_HZ[0], min(BAND_HZ[1], 0.45 * sample_rate_hz)
+    return np.asarray(scipy.signal.butter(4, band, "bandpass", fs=sample_rate_hz, output="sos"))
 
 
 def loudness_db(
@@ -187,7 +187,7 @@ def loudness_db(
     pressure = sound.pressure_pa
     if banded:
         # Of every eighth microphone: levels differ little between them, and filtering takes time.
-        pressure = sosfilt(band_filter(sample_rate_hz), pressure[::8])
+        pressure = scipy.signal.sosfilt(band_filter(sample_rate_hz), pressure[::8])
     power = np.einsum("mn,mn->n", pressure, pressure, dtype=np.float64)
     energy = np.r_[0.0, np.cumsum(power)] / len(pressure)
     ends = (rows_s + ROW_S * np.array([[-0.5], [0.5]])) * sample_rate_hz - sound.first

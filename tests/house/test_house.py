@@ -93,6 +93,8 @@ HEAVY = {"scipy.stats", "scipy.signal", "sklearn", "filterpy", "gtsam", "matplot
         "import worldstate; worldstate.WorldFilter",
         "import worldstate; worldstate.WorldFilter().predict(0.1).state",
         "import worldstate.cli.main",
+        "import worldstate.adapters.listener",
+        "import worldstate.simulation.dataset.dataset",
     ],
 )
 def test_import_stays_light(statement):
