@@ -35,7 +35,7 @@ def test_a_pass_swells_and_an_engine_that_idles_stays(kind: str) -> None:
             np.ptp(levels_db(close_vehicle(KINDS[kind], STREET.preset, STREET.site, SECONDS, RATE_HZ, one))),
             np.ptp(levels_db(idling_vehicle(KINDS[kind], STREET.preset, STREET.site, SECONDS, RATE_HZ, one))),
         )
-        for one in np.random.default_rng(1).spawn(3)
+        for one in np.random.default_rng(1).spawn(6)
     ]
     passes, idles = np.median(drawn, axis=0)
     # A tram is 30 m long: it is beside for two seconds.
@@ -67,7 +67,7 @@ def test_a_vehicle_of_another_kind_is_another_sound() -> None:
     for name, kind in kinds.items():
         drawn = [
             np.abs(np.fft.rfft(close_vehicle(kind, STREET.preset, STREET.site, SECONDS, RATE_HZ, one))) ** 2
-            for one in np.random.default_rng(5).spawn(4)
+            for one in np.random.default_rng(5).spawn(8)
         ]
         hz = np.fft.rfftfreq(round(SECONDS * RATE_HZ), 1.0 / RATE_HZ)
         shares[name] = np.median(

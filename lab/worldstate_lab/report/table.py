@@ -171,7 +171,11 @@ def figure_lines(columns: Mapping[str, Mapping[str, float | None]], form: str = 
     figure  ours  theirs
     n         12      12
     lead_s   1.7       -
+    >>> figure_lines({})
+    []
     """
+    if not columns:
+        return []
     rows = [
         (name, *(_figure_text(one[name], form) for one in columns.values()))
         for name in next(iter(columns.values()))
