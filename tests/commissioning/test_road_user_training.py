@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from worldstate_lab.cli.kinds import road_user_exam
 
+from worldstate.adapters.files.model_file import read_model
+from worldstate.commissioning import guard_training
+from worldstate.commissioning.guard_training import characters
 from worldstate.commissioning.road_user_training import (
     CLASS_OF,
     CLASSES,
@@ -16,6 +19,8 @@ from worldstate.commissioning.road_user_training import (
 )
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
+from worldstate.ground.typing import FloatArray
+from worldstate.simulation.stream.close_sounds import recorded
 
 N_INPUTS, EACH, SITES = len(MEASURES) + len(BANDS), 100, ("one", "two", "three")
 
@@ -58,3 +63,22 @@ def test_vehicles_of_the_simulator_are_heard_before_they_are_seen_and_bicycles_h
     assert audible["light"] > 0.8
     assert audible["bicycle"] < 0.5
     assert rows.weights.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("kind", ["light", "tram"])
+def test_kinds_do_not_hang_on_a_recorder_that_rises_or_falls(kind: str) -> None:
+    """Fresh clips through a filter of 6 dB from 80 to 2,700 Hz, by the model that ships."""
+    model, rng, rate_hz = read_model().road_users, np.random.default_rng(3), 6000.0
+    assert model is not None
+    said = {tilt_db: list[FloatArray]() for tilt_db in (0.0, 6.0, -6.0)}
+    for _ in range(12):
+        dry = recorded(guard_training._vehicle(kind, 4.0, rate_hz, rng), rate_hz, rng)
+        octaves = np.log2(np.clip(np.fft.rfftfreq(len(dry), 1.0 / rate_hz), 80.0, 2700.0) / 80.0)
+        for tilt_db, means in said.items():
+            gain = 10.0 ** (tilt_db * octaves / np.log2(2700.0 / 80.0) / 20.0)
+            sound = np.fft.irfft(np.fft.rfft(dry) * gain, len(dry)).astype(np.float32)
+            means.append(model.probabilities(characters(sound, rate_hz)[0]).mean(axis=0))
+    as_it_is = np.mean(said[0.0], axis=0)
+    assert as_it_is[model.classes.index(CLASS_OF[kind])] > 0.25
+    for tilt_db in (6.0, -6.0):
+        assert np.abs(np.mean(said[tilt_db], axis=0) - as_it_is).max() < 0.06
