@@ -71,7 +71,7 @@ def _run(run: Run, words: Sequence[str], arguments: argparse.Namespace) -> Comma
 
 
 # Options that say where work is done and what is written, and change no figure.
-_NO_FIGURE = ("--results", "--out", "--predictions", "--jobs")
+_NO_FIGURE = ("--results", "--out", "--predictions", "--jobs", "--cache", "--figure")
 
 
 def result_key(words: Sequence[str]) -> str:

@@ -401,6 +401,8 @@ def _draw_costs(
 
     axes.plot(*zip(*(place(one) for one in curve), strict=True), color=_COLOURS[CHANCE], marker=".", zorder=2)
     for name, one in figures.items():
-        axes.plot(*place(one), color=_COLOURS[name], marker="o", markersize=8, linestyle="", clip_on=False)
+        told = "chance, set on loud ones" if name == LOUD else None
+        axes.plot(*place(one), "o", color=_COLOURS[name], markersize=8, clip_on=False, label=told)
+    axes.legend(loc="upper right", fontsize=8)
     axes.set(xlabel=f"needless braking, s ({SHARES[0]:.0%} with a vehicle)", xlim=(0.0, None))
     axes.set(ylabel="collisions in 1,000 approaches", ylim=(0.0, None), title="what each threshold costs")
