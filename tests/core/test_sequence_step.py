@@ -210,6 +210,15 @@ def test_what_came_into_view_decides_no_alarm_of_its_side_any_more() -> None:
     assert after.decided[1] == sequence.decided[1] and after.over_ns == (None, sequence.over_ns[1])
 
 
+def test_beside_one_that_has_just_come_the_alarm_is_higher_for_five_seconds() -> None:
+    """What it leaves behind is heard as another one: half of the single vehicles were announced twice."""
+    said = drawn(np.random.default_rng(5), 1, SequenceAlarm(-0.8, 20.0))[0]
+    sequence = run(WorldFilter(), [heard(hop, said) for hop in range(8)])[-1].memory.sequence
+    beside = sequence.handed_over({0: 0.02}, (), sequence.stamp_ns)
+    stood = [replace(beside, stamp_ns=beside.stamp_ns + after_ns) for after_ns in (0, 49 * 10**8, 51 * 10**8)]
+    assert [one.threshold_nats for one in (sequence, *stood)] == pytest.approx([-0.8, 0.4, 0.4, -0.8])
+
+
 def test_a_vehicle_announced_on_one_side_is_in_view_from_whichever_it_came() -> None:
     context = Context()
     hidden = born("left", 0, 0.9, 0, site_geometry_of(context, FilterSettings()))
