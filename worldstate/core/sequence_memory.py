@@ -45,8 +45,8 @@ _FOLLOWED, _FOLLOWED_SHAPE = 1.0 / 6.0, 6.0
 # So long after one the reading knows by itself that vehicles come here: moved by the street's traffic as well
 # it has .19 on the other side where .13 is true, seconds after a vehicle (ten streams of exam seeds 1 and 6).
 _EMERGED_NS = 5_000_000_000
-# Meanwhile what it leaves behind is heard as another one: a risk of .35 and more, of .47 in the mean, holds in
-# .19 of the hops from 1.5 to 4.5 s after a pass. The alarm stands higher by so much until then.
+# Meanwhile what it leaves behind is heard as another one: a risk of .35 and more, of .47 in the mean, holds
+# in .18 of the hops from 1.5 to 4.5 s after a pass. The alarm stands higher by so much until then.
 _BESIDE_ONE_NATS = 1.2
 
 
