@@ -25,7 +25,7 @@ from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.datasets.ovad import OvadDataset, read_true_tracks
-from worldstate.adapters.export.log_messages import read_snapshot_lines
+from worldstate.adapters.export.log_messages import SNAPSHOT_TOPIC, read_messages
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.context_file import read_context
@@ -281,5 +281,5 @@ def test_a_small_file_that_grows_is_refused(name, tmp_path):
 def test_a_chunk_that_grows_is_refused_by_the_readers_of_logs_and_of_bags(kind, tmp_path):
     codec, frame, claimed = CHUNK_BOMBS[kind]
     chunk_bomb(tmp_path / "bomb.mcap", codec, frame(), claimed)
-    for read in (lambda path: list(read_snapshot_lines(path)), bag):
+    for read in (lambda path: list(read_messages(path, SNAPSHOT_TOPIC)), bag):
         refused_by("bomb.mcap", read, tmp_path)
