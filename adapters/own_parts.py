@@ -33,9 +33,9 @@ from worldstate.state import WorldState
 SIGNALLED = 128
 # A model of a detector may load for tens of seconds; what takes longer than a minute does not come back.
 LONGEST_S = 60.0
-# What Python raises reaches nothing below it.
+# What Python raises then reaches no code below it: so long after, the process ends.
 BELOW_PYTHON_S = 10.0
-_STDERR = 2
+_STDERR = 2  # Where it hangs is written without Python: to the descriptor, whatever `sys.stderr` is by then
 Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
 # What other modalities say, each time it is asked for anew.
 OtherModality: TypeAlias = Callable[[], Iterable[Timed]]

@@ -476,16 +476,15 @@ def _frame_name(text: str) -> str:
 
 def _in_parent(path: Path, transform: Any, points_m: FloatArray) -> FloatArray:
     """Return points of a frame in its parent's."""
-    about, by = (
-        [getattr(one, axis) for axis in "xyz"] for one in (transform.rotation, transform.translation)
-    )
-    axis, scalar = np.array(about), transform.rotation.w
-    length = float(np.hypot(np.linalg.norm(axis), scalar))
+    from scipy.spatial.transform import Rotation
+
+    turn, by = transform.rotation, transform.translation
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+    length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) <= _LENGTH_TOLERANCE:
         raise InputFileError(path, f"{STATIC_TOPIC}: expected a quaternion of length 1, got {length:.3g}")
-    axis, scalar = axis / length, scalar / length
-    turned = points_m + 2.0 * np.cross(axis, np.cross(axis, points_m) + scalar * points_m)
-    return np.asarray(turned + by)
+    turned = points_m @ Rotation.from_quat(quaternion).as_matrix().T
+    return np.asarray(turned + np.array([by.x, by.y, by.z]))
 
 
 def sound_of_bag(bag: BagReader, topic: str | None) -> BagSound:

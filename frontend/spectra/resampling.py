@@ -4,14 +4,13 @@ from fractions import Fraction
 from math import ceil
 
 import numpy as np
-import scipy
+import scipy  # `scipy.signal`, which takes longer to import than all else, waits for its first use
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from worldstate.ground import FloatArray, in_range
 from worldstate.ground.typing import Float32Array
 
-# `scipy.signal` takes longer to import than all else: by way of `scipy` that waits for its first use.
 # Attenuation of what aliases into the band, and of the ripple within it: the resolution of 16-bit converters.
 _ATTENUATION_DB = 80.0
 # Samples kept per period of the highest frequency: with 2 the filter would need an endless transition.

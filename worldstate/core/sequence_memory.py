@@ -171,11 +171,11 @@ class SequenceMemory:
     @property
     def threshold_nats(self) -> float:
         """What the alarm is raised from: higher where its budget is broken, or a vehicle has just come."""
-        return math.inf if self.alarm is None else self.own_threshold_nats + self.watch.shift_nats
+        return self.own_threshold_nats + self.watch.shift_nats
 
     @property
     def own_threshold_nats(self) -> float:
-        """The same, whatever the budget: infinite without an alarm."""
+        """The same, whatever has become of the budget; infinite without an alarm."""
         if self.alarm is None:
             return math.inf
         return self.alarm.threshold_nats + _BESIDE_ONE_NATS * self.just_emerged()

@@ -93,15 +93,15 @@ def result_key(words: Sequence[str]) -> str:
             skip = False
         else:
             kept.append(word)
-    return " ".join(word for key, words in groupby(kept, _beside) for word in _named(key, list(words)))
+    return " ".join(word for place, some in groupby(kept, _place) for word in _named(place, list(some)))
 
 
-def _beside(word: str) -> tuple[Path, str]:
+def _place(word: str) -> tuple[Path, str]:
     return Path(word).parent, Path(word).suffix
 
 
-def _named(beside: tuple[Path, str], words: Sequence[str]) -> list[str]:
-    folder, suffix = beside
+def _named(place: tuple[Path, str], words: Sequence[str]) -> list[str]:
+    folder, suffix = place
     if suffix and len(words) > 1 and len(words) == len(list(folder.glob(f"*{suffix}"))):
         return [f"{folder.name}/*{suffix}"]
     return [word if word.startswith("--") else Path(word).name for word in words]
