@@ -230,6 +230,7 @@ def write_dataset(
     array: MicrophoneArray | None = None,
     jobs: int = 1,
     progress: Callable[[LogRow], None] | None = None,
+    go_on: bool = False,
 ) -> list[LogRow]:
     """Simulate a data set.
 
@@ -249,11 +250,13 @@ def write_dataset(
         Processes, 1 to 256.
     progress : callable, optional
         Called with every finished recording, in order.
+    go_on : bool
+        Leave recordings that the log lists as they are: the same settings, interrupted, are finished.
 
     Returns
     -------
     list of LogRow
-        The lines of `DataLog.csv`.
+        The lines of `DataLog.csv`, of what was simulated by this call.
 
     Raises
     ------
@@ -280,8 +283,11 @@ def write_dataset(
     listed, listening = _listed(folder), ovad_array() if array is None else array
     if (folder / ARRAY_NAME).exists():
         _name_array(folder / ARRAY_NAME, listening)
-    for plan in plans:
-        refuse_foreign(folder / _log_row(plan.environment, plan.approach, plan.number, 0).folder)
+    folders = [_log_row(plan.environment, plan.approach, plan.number, 0).folder for plan in plans]
+    if go_on:
+        plans = [plan for plan, at in zip(plans, folders, strict=True) if at not in listed]
+    for at in folders:
+        refuse_foreign(folder / at)
     rows = []
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as unlisted:
         simulate = partial(_simulate_one, Path(unlisted), wanted, listening)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -209,6 +210,8 @@ def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp
     seen = []
     write_dataset(tmp_path / "two", wanted, array=PAIR, jobs=2, progress=seen.append)
     assert seen == rows
+    shutil.rmtree(tmp_path / "two" / rows[-1].folder)  # as if interrupted
+    assert write_dataset(tmp_path / "two", wanted, array=PAIR, go_on=True) == rows[-1:]
     files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file())
     assert len(files) == 2 * 3 + 2 + 2  # and the log and the array
     for name in files:

@@ -15,9 +15,10 @@ simulated recordings; else on the calibration recordings of each fold.
 
 OUT/report.md holds every table and figure beside the paper's, OUT/report_files the same as PNG and CSV.
 
-What was heard is kept in OUT/cache by the content of each recording: an interrupted run goes on where it
-stopped, and a second one takes a minute. Least data: two approaches and two hazard-free recordings, and for
-leaving junctions out two junctions that have both; what a protocol lacks is said before anything is heard.
+Streets are kept, and what was heard is in OUT/cache by the content of each recording: an interrupted run
+goes on where it stopped, and a second one takes a minute. Least data: two approaches and two hazard-free
+recordings, and for leaving junctions out two junctions that have both; what a protocol lacks is said before
+anything is heard.
 
 --stage-streams lets camera and rain fail on the streams of --hazard-free as well, and prints advisories an
 hour in every state beside those of the clean camera, on the same minutes: half an hour for each hour.
@@ -254,9 +255,10 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
     if dynamic:
         parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
-    with progress_bar("simulating streets", static + dynamic) as bar:
+    kept = len(OvadDataset(root)) if (root / LOG_NAME).is_file() else 0
+    with progress_bar("simulating streets", static + dynamic - kept) as bar:
         for part in parts:
-            write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance())
+            write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance(), go_on=True)
     return root
 
 
