@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
 from types import ModuleType
 from typing import BinaryIO, TypeAlias
@@ -347,6 +348,10 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str]]:
 
 # Of an MCAP file: its magic number, the head of every record, and that of a chunk up to its compression.
 _MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
+# Of the index of a chunk: its first and last time and where it stands; its last 16 bytes are its sizes.
+_INDEX, _INDEX_HEAD = 8, struct.Struct("<QQQ")
+# Readers of bags hold every chunk whose times overlap, decoded.
+_MOST_AT_ONCE = 1 << 29
 
 
 def check_chunks(path: Path) -> None:
@@ -354,6 +359,7 @@ def check_chunks(path: Path) -> None:
 
     Neither the reader of MCAP nor that of bags has a bound, and what a frame states of its own size may be
     wrong, missing, or followed by another frame. So a chunk is decoded here first, up to the size it claims.
+    The index, from which bags are read, has to name these chunks and no other bytes of the file.
     """
     about = path.stat()
     _check_chunks(path, about.st_size, about.st_mtime_ns)
@@ -361,12 +367,18 @@ def check_chunks(path: Path) -> None:
 
 @lru_cache(maxsize=8)  # a bag is opened several times in a run, and decoding takes seconds a gigabyte
 def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
+    chunks, times = dict[int, tuple[int, int]](), list[tuple[int, int, int]]()
     with path.open("rb") as file:
         at = _MAGIC_BYTES
         while at + _RECORD.size <= end:
             file.seek(at)
-            kind, length = _RECORD.unpack(file.read(_RECORD.size))
+            begin, (kind, length) = at, _RECORD.unpack(file.read(_RECORD.size))
             at += _RECORD.size + length
+            if kind == _INDEX and _INDEX_HEAD.size < length <= _LARGEST_RECORD:
+                first, last, place, sizes = _indexed(file.read(length))
+                if chunks.get(place) != sizes:
+                    raise InputFileError(path, f"expected an index of its chunks, got none at byte {place}")
+                times += [(first, 0, sizes[1]), (last, 1, -sizes[1])]
             # What was cut short the readers refuse or leave out before they decode it.
             if kind == _CHUNK and length >= _CHUNK_HEAD.size and at <= end:
                 head = file.read(_CHUNK_HEAD.size)
@@ -374,8 +386,25 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
                 if (size := max(length, claimed)) > _LARGEST_RECORD:
                     limit = f"expected chunks of at most {_LARGEST_RECORD >> 20} MiB"
                     raise InputFileError(path, f"{limit}, got one of {size >> 20}")
-                if _is_longer(head + file.read(length - len(head)), claimed):
+                chunk = head + file.read(length - len(head))
+                if _is_longer(chunk, claimed):
                     raise InputFileError(path, f"expected {claimed} bytes in a chunk as it claims, got more")
+                chunks[begin] = _compressed_bytes(chunk), claimed
+    if (most := max(accumulate(size for *_, size in sorted(times)), default=0)) > _MOST_AT_ONCE:
+        limit = f"expected at most {_MOST_AT_ONCE >> 20} MiB in chunks of one time"
+        raise InputFileError(path, f"{limit}, got {most >> 20}")
+
+
+def _indexed(index: bytes) -> tuple[int, int, int, tuple[int, int]]:
+    """Return first and last time of an indexed chunk, where it stands, and its sizes, packed and not."""
+    first, last, place = _INDEX_HEAD.unpack_from(index)
+    sizes = index[-16:]
+    return first, last, place, (int.from_bytes(sizes[:8], "little"), int.from_bytes(sizes[8:], "little"))
+
+
+def _compressed_bytes(chunk: bytes) -> int:
+    named = _CHUNK_HEAD.unpack_from(chunk)[4]
+    return int.from_bytes(chunk[_CHUNK_HEAD.size + named :][:8], "little")
 
 
 def _is_longer(chunk: bytes, claimed: int) -> bool:
@@ -383,7 +412,7 @@ def _is_longer(chunk: bytes, claimed: int) -> bool:
     named = _CHUNK_HEAD.unpack_from(chunk)[4]
     name, rest = chunk[_CHUNK_HEAD.size :][:named], chunk[_CHUNK_HEAD.size + named :]
     data = rest[8:]
-    if int.from_bytes(rest[:8], "little") > len(data):
+    if _compressed_bytes(chunk) > len(data):
         return True
     try:
         if name == b"zstd":

@@ -18,6 +18,7 @@ from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, WorldstateError, seconds
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.measurement.odometry import Odometry
 
@@ -125,6 +126,7 @@ def open_bag(path: Path) -> Iterator[BagReader]:
     with refused_as_bag(path):
         for file in path.glob("*.mcap") if path.is_dir() else [path] * (path.suffix == ".mcap"):
             check_chunks(file)
+        _check_packing(path)
         # Bags of before ROS 2 Iron hold no definitions; then those that ship here count.
         reader = AnyReader([path], default_typestore=store)
         reader.open()
@@ -132,6 +134,17 @@ def open_bag(path: Path) -> Iterator[BagReader]:
         yield BagReader(path, reader)
     finally:
         reader.close()
+
+
+def _check_packing(path: Path) -> None:
+    """Refuse a bag whose files or messages are compressed: its reader decodes them without a bound."""
+    if not (path / METADATA_NAME).is_file():
+        return
+    about = optional("ruamel.yaml").YAML(typ="safe").load((path / METADATA_NAME).read_text())
+    mode = about["rosbag2_bagfile_information"].get("compression_mode") or "none"
+    if mode.lower() != "none":
+        problem = f"expected a bag that is compressed by chunks of MCAP or not at all, got by {mode:.20}"
+        raise InputFileError(path, f"{problem}: `ros2 bag convert` writes one")
 
 
 @contextmanager

@@ -608,6 +608,20 @@ def test_a_damaged_bag_is_refused_by_name(tmp_path, storage):
     assert refused >= 20
 
 
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_a_bag_whose_reader_would_decode_without_a_bound_is_refused(tmp_path, mode):
+    samples = sound_of(RATE_HZ)
+    with bag_writer(tmp_path / "bag", "sqlite3") as write:
+        for k in range(10):
+            write("/mics", AUDIO, k, block(samples[800 * k : 800 * (k + 1)], 1 + k * 100_000_000))
+    said = tmp_path / "bag" / "metadata.yaml"
+    text, none = said.read_text(), "compression_mode: ''"
+    assert none in text
+    said.write_text(text.replace(none, f"compression_mode: {mode}"))
+    with pytest.raises(InputFileError, match="`ros2 bag convert`"):
+        read_bag(tmp_path / "bag")
+
+
 def test_a_run_that_fails_leaves_no_bag(tmp_path):
     with pytest.raises(RuntimeError), state_bag(tmp_path / "out") as write:
         write(STATES[0])
