@@ -362,12 +362,13 @@ def neutral(evidence: SignatureEvidence, margin: float) -> SignatureEvidence:
     (1.0, 0.5)
     """
     ratios = np.array(evidence.hidden) - evidence.none
-    hidden = tuple((evidence.none + _beyond(ratios, margin)).tolist())
+    hidden = tuple((evidence.none + beyond(ratios, margin)).tolist())
     sides = evidence.sides
     if sides is not None:
-        sides = replace(sides, log_ratios=tuple(_beyond(np.array(sides.log_ratios), margin).tolist()))
+        sides = replace(sides, log_ratios=tuple(beyond(np.array(sides.log_ratios), margin).tolist()))
     return SignatureEvidence(evidence.directions, hidden, evidence.visible, evidence.none, sides)
 
 
-def _beyond(ratios: FloatArray, margin: float) -> FloatArray:
+def beyond(ratios: FloatArray, margin: float) -> FloatArray:
+    """Return the log ratios as far as they exceed a margin, nats, as `neutral` counts those of one hop."""
     return np.asarray(np.sign(ratios) * np.maximum(np.abs(ratios) - margin, 0.0))

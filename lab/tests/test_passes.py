@@ -31,9 +31,10 @@ from worldstate_lab.passes.pass_outcomes import (
 
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter, nanoseconds
 from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.road_users import Foreign, neutral
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.adapters.acoustic import asked_again
+from worldstate.adapters.acoustic import asked_again, beside_foreign
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import read_model
@@ -237,6 +238,37 @@ def test_the_worst_junction_is_the_worst_of_those_with_eight_cases() -> None:
     )
     worst = worst_of({"SA1": few, "SB1": bad, "SB2": good})
     assert (worst["detected"], worst["a: skill"], worst["hours"]) == (0.5, 0.5, None)
+
+
+def test_the_guard_speaks_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
+    """One that takes everything for foreign: as by `AcousticAdapter`, evidence and what was heard shrink."""
+    made_up, rng = stream([("left", "left", 12.0)], duration_s=16.0), np.random.default_rng(1)
+    n = len(made_up.hops)
+    refused = dict.fromkeys(
+        ("bearing_rad", "bearing_std_rad", "looming_hz", "looming_std_hz"), np.full(n, np.nan)
+    )
+    fully = {
+        "heard": np.ones(n),
+        "unheard": np.full(n, ""),
+        "excess_db": np.zeros(n),
+        "prominence": np.ones(n),
+    }
+    feature, energy = rng.uniform(0.1, 1.0, (n, 60)), rng.normal(size=(n, 16))
+    hops = made_up.hops.replace(feature=feature, band_log_energy=energy, **refused, **fully)
+    replace(made_up, hops=hops).save(tmp_path / "stream.npz")
+    model = read_model()
+    assert model.guard is not None
+    guard = replace(model.guard, threshold=-50.0, signal_nats=1e3)
+    plain, guarded = (
+        list(stream_measurements(tmp_path / "stream.npz", replace(model, guard=one), "none", 0)[1])
+        for one in (None, guard)
+    )
+    judged = [(one, other) for one, other in zip(plain, guarded, strict=True) if other.domain is not None]
+    assert len(plain) - len(judged) == 20  # two seconds of sound are judged
+    for one, other in judged:
+        assert isinstance(other.domain, Foreign)
+        assert other.signature == neutral(one.signature, guard.margin)
+        assert other.heard == beside_foreign(other.domain, one.heard)
 
 
 def test_boxes_stand_where_the_truth_has_a_vehicle_in_view() -> None:

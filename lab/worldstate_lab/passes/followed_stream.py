@@ -11,13 +11,14 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.road_users import DomainGuard, DomainVerdict, Foreign, beyond, neutral
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
 from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.adapters.acoustic import asked_again
+from worldstate.adapters.acoustic import asked_again, beside_foreign
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Row, frame_of_rows
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
@@ -25,9 +26,11 @@ from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import learn_passes
 from worldstate.adapters.source import street_listener
 from worldstate.commissioning.commission import parts_of, stream_evidence
+from worldstate.commissioning.guard_training import heard_characters
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.commissioning.sequence_training import StreamTruth, stream_truth
 from worldstate.core.filter import WorldFilter
+from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import (
@@ -106,11 +109,17 @@ def measurements(
     evidence: FloatArray,
     vision: CoEvidenceChannel | None,
     street: StreetListener | None = None,
+    guard: DomainGuard | None = None,
 ) -> Iterator[Measurement]:
     """Yield one measurement a hop, as the acoustic adapter makes them of the sound.
 
     `street` corrects the sides, and learns from the passes that the filter reports to it.
     """
+    domains = _judged(heard, guard)
+    if guard is not None:
+        foreign = np.array([isinstance(one, Foreign) for one in domains])
+        evidence = evidence.copy()
+        evidence[foreign, : len(SIDES)] = beyond(evidence[foreign, : len(SIDES)], guard.margin)
     hops, signature, groups = heard.hops, SiteSignature(model), sequence.posterior(evidence).groups
     for i in range(len(hops)):
         if street is not None and i + 1 >= LEAST_HOPS:
@@ -118,16 +127,30 @@ def measurements(
         else:
             told = groups[i]
         reading = SequenceReading(told, sequence.share, sequence.margin_s, sequence.alarm)
+        said, domain = signature.evidence(hops.feature[i]), domains[i]
+        share = Heard(float(hops.heard[i]), str(hops.unheard[i]) or None, float(hops.excess_db[i]))
+        if isinstance(domain, Foreign) and guard is not None:
+            said, share = neutral(said, guard.margin), beside_foreign(domain, share)
         measurement = Measurement(
             stamp_ns=nanoseconds(float(hops.time_s[i])),
-            signature=signature.evidence(hops.feature[i]),
+            signature=said,
             co_evidence=Unqueried("no camera"),
             bearing=_bearing(heard, i),
             approach=_approach(heard, i),
             sequence=reading if i + 1 >= LEAST_HOPS else TOO_FEW,
-            heard=Heard(float(hops.heard[i]), str(hops.unheard[i]) or None, float(hops.excess_db[i])),
+            heard=share,
+            domain=domain,
         )
         yield asked_again(measurement, vision)
+
+
+def _judged(heard: HeardStream, guard: DomainGuard | None) -> list[DomainVerdict | None]:
+    """Return what the guard says of every hop, None before it has heard enough."""
+    if guard is None:
+        return [None] * len(heard.hops)
+    rows, usable = heard_characters(heard)
+    told = iter(rows[:, : len(MEASURES)])
+    return [guard.judge(next(told)) if one else None for one in usable]
 
 
 def _bearing(heard: HeardStream, i: int) -> Bearing | NotUsable:
@@ -245,4 +268,4 @@ def stream_measurements(
             detections = without_passes(detections, heard)
         vision = VisionQuery(PinholeCamera.ovad(), detections, keep=boxes)
     evidence = stream_evidence(windows, heard)
-    return heard, measurements(heard, windows, sequence, evidence, vision, street)
+    return heard, measurements(heard, windows, sequence, evidence, vision, street, model.guard)
