@@ -6,6 +6,8 @@ SHELL := /bin/sh
 # Two test processes of one BLAS thread each: on two cores more threads only wait for one another.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
+# Where the surroundings forbid caches of bytecode, every command that a test starts compiles the library anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo check test slow mutations lint schema figures docs locked audit matrix dist clean
 

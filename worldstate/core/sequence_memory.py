@@ -434,8 +434,11 @@ def informed(
         return None
     # The chain of the hops since then was taken when the belief was carried here.
     states = next_belief(kept.states, said, np.eye(len(STATES)))
-    # A vehicle that has come into view is seen there but for a miss; one that is seen was handed over.
-    missed = math.prod(look.answer.miss_rate for look in looks if not isinstance(look.answer, Unqueried))
+    # A vehicle that has come into view is seen there but for a miss; one that is seen was handed over. What
+    # makes a camera miss most of them, dirt or darkness, makes it miss the same one again: ten such looks a
+    # second, each counted anew, would deny within a second what is heard.
+    rates = (look.answer.miss_rate for look in looks if not isinstance(look.answer, Unqueried))
+    missed = math.prod(rate for rate in rates if rate <= _MOSTLY_MISSED)
     held = {look.sensor: look for look in (*kept.looks, *looks)}
     kept = replace(
         kept,
