@@ -351,10 +351,9 @@ def test_who_came_into_view_unseen_is_there_as_long_as_it_sounds() -> None:
     said = approach()
 
     def beside(answer: CoEvidence) -> list[WorldFilter]:
-        looking = [UNASKED if hop < 30 else answer for hop in range(50)]
-        return run(
-            WorldFilter(), [heard(h + 1, one, a) for h, (one, a) in enumerate(zip(said, looking, strict=True))]
-        )
+        looking = 30 * [UNASKED] + 20 * [answer]
+        told = enumerate(zip(said, looking, strict=True))
+        return run(WorldFilter(), [heard(hop + 1, one, seen) for hop, (one, seen) in told])
 
     dead, empty = beside(UNASKED), beside(Absent(0.04, 0.01))
     (before,) = dead[28].state.entities
