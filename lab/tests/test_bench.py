@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from worldstate_lab.benchmarks.hop_costs import EVIDENCE, FRONT_END, RATE_HZ, made_up_adapter
 from worldstate_lab.benchmarks.tracker_costs import hops
 from worldstate_lab.cli.bench.cost import AGAINST, EVERYTHING, FEATURE_CHAIN, _source, processed, report_lines
@@ -30,6 +31,7 @@ def test_the_files_of_a_hop_are_those_that_it_executes(capsys):
     assert "worldstate/adapters/source.py" not in report["files"]
 
 
+@pytest.mark.slow
 def test_keys_and_consistency(capsys):
     assert main(["bench", "--rounds", "1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)

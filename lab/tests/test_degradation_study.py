@@ -248,6 +248,7 @@ def assert_the_sound_says_the_same(source, off):
     assert off.presence == pytest.approx(np.array(presence))
 
 
+@pytest.mark.slow
 def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(approach, video, rates, tmp_path):
     folder = tmp_path / "recording"
     shutil.copytree(approach.folder, folder)
@@ -315,6 +316,7 @@ def test_advisories_of_a_state_stand_beside_those_of_the_clean_camera():
     )
 
 
+@pytest.mark.slow
 def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
     found = staged_advisories(approach.folder, None, 0)
     names = found.condition.tolist()

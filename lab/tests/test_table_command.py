@@ -49,6 +49,7 @@ def test_line_of_sight_says_nothing_before_sight(smoke):
         assert rows[name]["detection"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, tmp_path, capsys):
     """With two streams that cannot be heard: they are named and left out, and every table says so."""
     out, report = smoke

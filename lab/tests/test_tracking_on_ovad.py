@@ -96,6 +96,7 @@ def test_rows_are_of_the_order_of_the_papers(rows, simulated, name):
     assert row["advisory_share"] < 0.5
 
 
+@pytest.mark.slow
 def test_who_was_heard_coming_is_who_comes(approaches, request, tmp_path):
     """The entity in view was there before T0 in most of the approaches that the world-state warned of."""
     heard = list(approaches)

@@ -69,6 +69,7 @@ def test_fewer_recordings_than_needed_give_no_finite_threshold(alpha, confidence
         assert conformal_threshold(scores[1:, None], alpha, 1, confidence) == math.inf
 
 
+@pytest.mark.slow
 def test_the_achieved_rate_is_beta_binomial_as_theory_says():
     """n calibration and m test scores, exchangeable: exceedances of the k-th largest are beta-binomial."""
     rng, n, m, alpha, trials = np.random.default_rng(3), 99, 200, 0.05, 800
@@ -121,6 +122,7 @@ def test_the_correlation_time_of_the_alarm_is_that_of_the_law(alpha):
     assert correlation_time_hops(alarm) == pytest.approx(ALARM_TIME_HOPS[alpha], rel=0.1)
 
 
+@pytest.mark.slow
 def test_confidence_holds_over_calibrations_and_the_plain_rule_does_not():
     rng, alpha = np.random.default_rng(8), 0.05
     exact, plain = [], []

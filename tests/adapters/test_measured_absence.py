@@ -300,6 +300,7 @@ def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_cl
         assert np.array(family.clutter) == pytest.approx(clutter * np.array(family.sectors))
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_and_figure(tmp_path, capsys):
     out, figure = tmp_path / "beta.json", tmp_path / "beta.png"
     video = write_video(tmp_path / "street.mp4", street(14, speed_px=16.0))

@@ -52,7 +52,7 @@ def in_one(model: Model) -> list[str]:
     return pushed(listener, 0, len(SOUND)) + [state.to_json() for state in listener.push(None)]
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(cut=st.integers(0, len(SOUND)))
 def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Model, in_one: list[str]) -> None:
     first = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad())

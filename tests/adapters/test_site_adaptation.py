@@ -163,6 +163,7 @@ def decided(model, gamma, stream):
     return np.array([[statistic(one, answer, prior) >= gamma for one in pair] for pair in pairs])
 
 
+@pytest.mark.slow
 def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model, monkeypatch):
     monkeypatch.setattr(site_estimate, "HOP_S", 1.0)  # Windows that do not overlap
     rng = np.random.default_rng(100)
