@@ -7,8 +7,8 @@ import pytest
 from worldstate_lab.cli.kinds import road_user_exam
 
 from worldstate.adapters.files.model_file import read_model
-from worldstate.commissioning import guard_training
 from worldstate.commissioning.guard_training import characters
+from worldstate.commissioning.heard_stream import junction_named
 from worldstate.commissioning.road_user_training import (
     CLASS_OF,
     CLASSES,
@@ -20,7 +20,9 @@ from worldstate.commissioning.road_user_training import (
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.typing import FloatArray
-from worldstate.simulation.stream.close_sounds import recorded
+from worldstate.simulation.scene.kinds import KINDS
+from worldstate.simulation.stream.close_sounds import close_vehicle, recorded
+from worldstate.simulation.stream.settings import StreamSettings
 
 N_INPUTS, EACH, SITES = len(MEASURES) + len(BANDS), 100, ("one", "two", "three")
 
@@ -70,9 +72,11 @@ def test_kinds_do_not_hang_on_a_recorder_that_rises_or_falls(kind: str) -> None:
     """Fresh clips through a filter of 6 dB from 80 to 2,700 Hz, by the model that ships."""
     model, rng, rate_hz = read_model().road_users, np.random.default_rng(3), 6000.0
     assert model is not None
+    street = StreamSettings(junction_named("SA1"), 1.0, sample_rate_hz=rate_hz)
     said = {tilt_db: list[FloatArray]() for tilt_db in (0.0, 6.0, -6.0)}
     for _ in range(12):
-        dry = recorded(guard_training._vehicle(kind, 4.0, rate_hz, rng), rate_hz, rng)
+        passing = close_vehicle(KINDS[kind], street.preset, street.site, 4.0, rate_hz, rng)
+        dry = recorded(passing, rate_hz, rng)
         octaves = np.log2(np.clip(np.fft.rfftfreq(len(dry), 1.0 / rate_hz), 80.0, 2700.0) / 80.0)
         for tilt_db, means in said.items():
             gain = 10.0 ** (tilt_db * octaves / np.log2(2700.0 / 80.0) / 20.0)
