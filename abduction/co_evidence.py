@@ -215,6 +215,8 @@ Rows = tuple[tuple[float, ...], ...]
 BORESIGHT_MISS_RATE = 0.04
 MISS_RATE_PER_DEG = (0.14 - 0.04) / 25.0
 HARSHEST_MISS_RATE = 0.97
+# A look that misses more watches nothing: one in view would be counted as none.
+MOSTLY_MISSED = 0.5
 
 
 @dataclass(frozen=True, slots=True)

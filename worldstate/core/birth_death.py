@@ -7,6 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from worldstate.abduction.co_evidence import MOSTLY_MISSED
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
@@ -327,7 +328,11 @@ def past_edges(
 
 
 def surviving(tracks: Tracks, settings: FilterSettings) -> Tracks:
-    """Return the tracks without seen entities of too little existence or too uncertain azimuth."""
+    """Return the tracks without seen entities of too little existence or too uncertain azimuth.
+
+    What a camera would mostly miss is not lost for being missed: its existence says how long it is believed.
+    """
     known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= _LOST_RAD**2
+    known |= tracks.miss_rate > MOSTLY_MISSED
     kept = known & (tracks.existence >= settings.delete_existence) | ~tracks.seen
     return tracks if kept.all() else tracks.taken(kept)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.co_evidence import MOSTLY_MISSED, Unqueried
 from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
 from worldstate.abduction.sequence.sequence_chain import (
     BEHIND,
@@ -109,7 +109,6 @@ _LOOK_NS = 500_000_000
 # just come into view, and says nothing of the next one.
 _MASKED_NS = 1_300_000_000
 _BET_GROUPS = COMING_S.index(BET_S) + 1
-_MOSTLY_MISSED = 0.5  # A look that misses more watches nothing: one in view would be counted as none
 _IN_VIEW_S = 6.0  # Two passages: before, it is the sound that tells whether it is still there
 _OTHERS = 0.1  # Vehicles in view from no side that is listened to
 _TWO = 0.5  # P(both) from which on the vehicles of two sides are two
@@ -438,7 +437,7 @@ def informed(
     # makes a camera miss most of them, dirt or darkness, makes it miss the same one again: ten such looks a
     # second, each counted anew, would deny within a second what is heard.
     rates = (look.answer.miss_rate for look in looks if not isinstance(look.answer, Unqueried))
-    missed = math.prod(rate for rate in rates if rate <= _MOSTLY_MISSED)
+    missed = math.prod(rate for rate in rates if rate <= MOSTLY_MISSED)
     held = {look.sensor: look for look in (*kept.looks, *looks)}
     kept = replace(
         kept,
@@ -475,7 +474,7 @@ def _as_heard(alone: FloatArray, said: FloatArray, share: float) -> FloatArray:
 def _watched(kept: SequenceMemory, over: BoolArray) -> WatchedHop:
     """Return what a hop says to the watch over the alarm; `over` its own threshold, by side."""
     answers = [look.answer for look in kept.looks if not isinstance(look.answer, Unqueried)]
-    looked = any(one.miss_rate <= _MOSTLY_MISSED for one in answers)
+    looked = any(one.miss_rate <= MOSTLY_MISSED for one in answers)
     within = kept.coming[:, :_BET_GROUPS].sum(axis=1).tolist()
     return WatchedHop(kept.stamp_ns, looked, tuple(over.tolist()), kept.emerged_ns, tuple(within))
 

@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Present, Unqueried
+from worldstate.abduction.co_evidence import MOSTLY_MISSED, Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.hidden_bearing import hidden_bearing, time_to_visible
 from worldstate.belief.kinematics.cartesian import EgoBelief
@@ -75,8 +75,6 @@ _ROUNDING = 1e-9
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
 # Of what is published: numbers in full precision take twice as long to write.
 _DIGITS = 9
-# A look that misses more than it finds tells little of absence.
-_MOSTLY_MISSED = 0.5
 
 
 # Mean and deviations of a track's motion, covariance of azimuth and rate, forecast, as Python numbers.
@@ -266,7 +264,7 @@ def _health(sensor: str, stamp_ns: int, fault: str | None, now_ns: int) -> Senso
 
 def _look_fault(look: CountedLook) -> str | None:
     answer = look.answer
-    if isinstance(answer, Unqueried) or answer.miss_rate < _MOSTLY_MISSED:
+    if isinstance(answer, Unqueried) or answer.miss_rate < MOSTLY_MISSED:
         return None
     return f"misses {answer.miss_rate:.0%} of what is in view"
 
