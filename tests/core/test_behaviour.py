@@ -225,6 +225,15 @@ def test_a_certain_entity_survives_a_checkpoint():
             assert WorldFilter.from_dict(world.to_dict()).state == world.state
 
 
+@pytest.mark.parametrize(("miss_rate", "stays"), [(0.9, True), (0.04, False)])
+def test_one_box_of_a_camera_that_misses_most_is_not_lost_for_want_of_another(miss_rate, stays):
+    world = after(WorldFilter(), measured(1.0, FRONT, car(0.1), answer=Present(miss_rate, 0.01)))
+    (seen,) = world.state.entities
+    for hop in range(1, 26):
+        world = after(world, measured(1.0 + hop / 10, FRONT, answer=Absent(miss_rate, 0.01)))
+    assert [one.id for one in world.state.entities if one.existence_probability > 0.5] == [seen.id] * stays
+
+
 @pytest.mark.parametrize(
     ("azimuth", "rate", "answer"), [(0.42, 0.4, "unqueried"), (0.42, -0.4, "absent"), (0.0, 0.4, "absent")]
 )

@@ -57,7 +57,7 @@ from .conditions import (
 )
 
 # Changes whenever the same sound and looks would give other beliefs.
-VERSION = 6
+VERSION = 7
 
 
 @dataclass(frozen=True, slots=True)
