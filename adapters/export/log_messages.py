@@ -372,7 +372,8 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
         at = _MAGIC_BYTES
         while at + _RECORD.size <= end:
             file.seek(at)
-            begin, (kind, length) = at, _RECORD.unpack(file.read(_RECORD.size))
+            begin = at
+            kind, length = _RECORD.unpack(file.read(_RECORD.size))
             at += _RECORD.size + length
             if kind == _INDEX and _INDEX_HEAD.size < length <= _LARGEST_RECORD:
                 first, last, place, sizes = _indexed(file.read(length))
@@ -403,8 +404,8 @@ def _indexed(index: bytes) -> tuple[int, int, int, tuple[int, int]]:
 
 
 def _compressed_bytes(chunk: bytes) -> int:
-    named = _CHUNK_HEAD.unpack_from(chunk)[4]
-    return int.from_bytes(chunk[_CHUNK_HEAD.size + named :][:8], "little")
+    at = _CHUNK_HEAD.size + _CHUNK_HEAD.unpack_from(chunk)[4]
+    return int.from_bytes(chunk[at : at + 8], "little")
 
 
 def _is_longer(chunk: bytes, claimed: int) -> bool:

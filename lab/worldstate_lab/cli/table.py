@@ -248,14 +248,14 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
     # A log of fewer recordings is that of a simulation that was interrupted.
-    if (root / LOG_NAME).is_file() and len(OvadDataset(root)) == static + dynamic:
+    kept = len(OvadDataset(root)) if (root / LOG_NAME).is_file() else 0
+    if kept == static + dynamic:
         return root
     # A moving ego has no video: its camera moves, and every box with it.
     streets = DatasetSettings(static, seed=arguments.seed, duration_s=length_s, video=True)
     parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
     if dynamic:
         parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
-    kept = len(OvadDataset(root)) if (root / LOG_NAME).is_file() else 0
     with progress_bar("simulating streets", static + dynamic - kept) as bar:
         for part in parts:
             write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance(), go_on=True)
