@@ -2,9 +2,10 @@
 
 import csv
 import io
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +25,7 @@ from worldstate.adapters.datasets.ovad import (
     OvadDataset,
 )
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.adapters.files.file_io import atomic_path, write_json, write_text
+from worldstate.adapters.files.file_io import atomic_path, read_json, write_json, write_text
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.extras import optional
@@ -251,7 +252,7 @@ def write_dataset(
     progress : callable, optional
         Called with every finished recording, in order.
     go_on : bool
-        Leave recordings that the log lists as they are: the same settings, interrupted, are finished.
+        Leave recordings that the log lists and that are of these settings: what was interrupted is finished.
 
     Returns
     -------
@@ -284,10 +285,15 @@ def write_dataset(
     if (folder / ARRAY_NAME).exists():
         _name_array(folder / ARRAY_NAME, listening)
     folders = [_log_row(plan.environment, plan.approach, plan.number, 0).folder for plan in plans]
-    if go_on:
-        plans = [plan for plan, at in zip(plans, folders, strict=True) if at not in listed]
     for at in folders:
         refuse_foreign(folder / at)
+    if go_on:
+        pairs = zip(plans, folders, strict=True)
+        plans = [
+            plan
+            for plan, at in pairs
+            if at not in listed or not _is_of(folder / at, _drawn(wanted, listening, plan)[0])
+        ]
     rows = []
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as unlisted:
         simulate = partial(_simulate_one, Path(unlisted), wanted, listening)
@@ -378,7 +384,10 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     write_text(Path(root) / LOG_NAME, text.getvalue())
 
 
-def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, plan: Plan) -> LogRow:
+def _drawn(
+    wanted: DatasetSettings, array: MicrophoneArray, plan: Plan
+) -> tuple[SimulationSettings, np.random.Generator]:
+    """Return what a recording is, and the generator that goes on to simulate it."""
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
     settings = replace(drawn, preset=replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder))
@@ -386,6 +395,17 @@ def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, p
         settings = replace(settings, sample_rate_hz=rate_for(wanted.bandwidth_hz))
     if wanted.sounds:
         settings = with_sounds(settings, wanted.sounds, array.n_microphones, rng.spawn(1)[0])
+    return settings, rng
+
+
+def _is_of(folder: Path, settings: SimulationSettings) -> bool:
+    """Whether a simulated recording is one of these settings."""
+    truth = read_json(folder / TRUTH_NAME, "a truth file")
+    return isinstance(truth, dict) and truth.get("settings") == json.loads(json.dumps(asdict(settings)))
+
+
+def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, plan: Plan) -> LogRow:
+    settings, rng = _drawn(wanted, array, plan)
     recording = simulate_recording(settings, rng, array)
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = None

@@ -212,6 +212,8 @@ def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp
     assert seen == rows
     shutil.rmtree(tmp_path / "two" / rows[-1].folder)  # as if interrupted
     assert write_dataset(tmp_path / "two", wanted, array=PAIR, go_on=True) == rows[-1:]
+    write_dataset(tmp_path / "three", replace(wanted, seed=6), array=PAIR)
+    assert write_dataset(tmp_path / "three", wanted, array=PAIR, go_on=True) == rows  # of another seed
     files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file())
     assert len(files) == 2 * 3 + 2 + 2  # and the log and the array
     for name in files:
