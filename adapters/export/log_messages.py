@@ -348,6 +348,8 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str]]:
 
 # Of an MCAP file: its magic number, the head of every record, and that of a chunk up to its compression.
 _MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
+# Of a message: its channel and number, then its time.
+_MESSAGE, _MESSAGE_HEAD = 5, struct.Struct("<6xQ")
 # Of the index of a chunk: its first and last time and where it stands; its last 16 bytes are its sizes.
 _INDEX, _INDEX_HEAD = 8, struct.Struct("<QQQ")
 # Readers of bags hold every chunk whose times overlap, decoded.
@@ -355,11 +357,12 @@ _MOST_AT_ONCE = 1 << 29
 
 
 def check_chunks(path: Path) -> None:
-    """Refuse an MCAP file with a chunk that fills the memory.
+    """Refuse an MCAP file with a chunk that fills the memory, or with an index of something else.
 
     Neither the reader of MCAP nor that of bags has a bound, and what a frame states of its own size may be
     wrong, missing, or followed by another frame. So a chunk is decoded here first, up to the size it claims.
-    The index, from which bags are read, has to name these chunks and no other bytes of the file.
+    The index, from which bags are read, has to name these chunks and no other bytes of the file, and times
+    between which all of their messages lie: readers of bags leave out the others.
     """
     about = path.stat()
     _check_chunks(path, about.st_size, about.st_mtime_ns)
@@ -367,7 +370,7 @@ def check_chunks(path: Path) -> None:
 
 @lru_cache(maxsize=8)  # a bag is opened several times in a run, and decoding takes seconds a gigabyte
 def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
-    chunks, times = dict[int, tuple[int, int]](), list[tuple[int, int, int]]()
+    chunks, times = dict[int, tuple[tuple[int, int], tuple[int, ...]]](), list[tuple[int, int, int]]()
     with path.open("rb") as file:
         at = _MAGIC_BYTES
         while at + _RECORD.size <= end:
@@ -377,8 +380,12 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
             at += _RECORD.size + length
             if kind == _INDEX and _INDEX_HEAD.size < length <= _LARGEST_RECORD:
                 first, last, place, sizes = _indexed(file.read(length))
-                if chunks.get(place) != sizes:
+                known, span = chunks.get(place, (None, ()))
+                if known != sizes:
                     raise InputFileError(path, f"expected an index of its chunks, got none at byte {place}")
+                if not first <= min(span, default=first) <= max(span, default=last) <= last:
+                    problem = f"expected an index with the times of its messages, got {first} to {last} ns"
+                    raise InputFileError(path, problem)
                 times += [(first, 0, sizes[1]), (last, 1, -sizes[1])]
             # What was cut short the readers refuse or leave out before they decode it.
             if kind == _CHUNK and length >= _CHUNK_HEAD.size and at <= end:
@@ -388,9 +395,9 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
                     limit = f"expected chunks of at most {_LARGEST_RECORD >> 20} MiB"
                     raise InputFileError(path, f"{limit}, got one of {size >> 20}")
                 chunk = head + file.read(length - len(head))
-                if _is_longer(chunk, claimed):
+                if len(decoded := _decoded(chunk, claimed)) > claimed:
                     raise InputFileError(path, f"expected {claimed} bytes in a chunk as it claims, got more")
-                chunks[begin] = _compressed_bytes(chunk), claimed
+                chunks[begin] = (_compressed_bytes(chunk), claimed), _message_span(path, decoded)
     if (most := max(accumulate(size for *_, size in sorted(times)), default=0)) > _MOST_AT_ONCE:
         limit = f"expected at most {_MOST_AT_ONCE >> 20} MiB in chunks of one time"
         raise InputFileError(path, f"{limit}, got {most >> 20}")
@@ -408,21 +415,34 @@ def _compressed_bytes(chunk: bytes) -> int:
     return int.from_bytes(chunk[at : at + 8], "little")
 
 
-def _is_longer(chunk: bytes, claimed: int) -> bool:
-    """Return whether a chunk holds more than its record or, decoded, more than it claims."""
+def _decoded(chunk: bytes, claimed: int) -> bytes:
+    """Return what a chunk holds: longer than it claims where it is, nothing where it is damaged."""
     named = _CHUNK_HEAD.unpack_from(chunk)[4]
     name, rest = chunk[_CHUNK_HEAD.size :][:named], chunk[_CHUNK_HEAD.size + named :]
     data = rest[8:]
     if _compressed_bytes(chunk) > len(data):
-        return True
+        return bytes(claimed + 1)
     try:
         if name == b"zstd":
             decoder = optional("zstandard").ZstdDecompressor()
-            return len(decoder.stream_reader(data, read_across_frames=True).read(claimed + 1)) > claimed
+            return bytes(decoder.stream_reader(data, read_across_frames=True).read(claimed + 1))
         if name == b"lz4":
-            return len(optional("lz4.frame").LZ4FrameFile(BytesIO(data)).read(claimed + 1)) > claimed
+            return bytes(optional("lz4.frame").LZ4FrameFile(BytesIO(data)).read(claimed + 1))
     except MissingExtraError:
         raise
     except Exception:  # a damaged frame, which the reader refuses with an error of its own
-        return False
-    return False
+        return b""
+    return data[:claimed]
+
+
+def _message_span(path: Path, decoded: bytes) -> tuple[int, ...]:
+    """Return the first and the last time of the messages among records, nothing without one."""
+    at, times = 0, list[int]()
+    while at + _RECORD.size <= len(decoded):
+        kind, length = _RECORD.unpack_from(decoded, at)
+        if not kind:  # zeros are cheap to pack, and as records many to read
+            raise InputFileError(path, "expected records in a chunk, got zeros")
+        at += _RECORD.size + length
+        if kind == _MESSAGE and length >= _MESSAGE_HEAD.size and at <= len(decoded):
+            times += _MESSAGE_HEAD.unpack_from(decoded, at - length)
+    return (min(times), max(times)) if times else ()

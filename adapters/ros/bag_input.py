@@ -5,6 +5,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from worldstate.adapters.audio import sound_file
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.export.log_messages import check_chunks
 from worldstate.adapters.files.array_file import named_arrays
-from worldstate.adapters.files.file_io import refused_as_file
+from worldstate.adapters.files.file_io import MAX_BYTES, read_text, refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, WorldstateError, seconds
@@ -126,7 +127,8 @@ def open_bag(path: Path) -> Iterator[BagReader]:
     with refused_as_bag(path):
         for file in path.glob("*.mcap") if path.is_dir() else [path] * (path.suffix == ".mcap"):
             check_chunks(file)
-        _check_packing(path)
+        if (metadata := path / METADATA_NAME).is_file():
+            _check_packing(metadata, metadata.stat().st_mtime_ns)
         # Bags of before ROS 2 Iron hold no definitions; then those that ship here count.
         reader = AnyReader([path], default_typestore=store)
         reader.open()
@@ -136,15 +138,14 @@ def open_bag(path: Path) -> Iterator[BagReader]:
         reader.close()
 
 
-def _check_packing(path: Path) -> None:
+@lru_cache(maxsize=8)  # a bag is opened several times in a run, and its reader parses the file each time
+def _check_packing(metadata: Path, modified_ns: int) -> None:
     """Refuse a bag whose files or messages are compressed: its reader decodes them without a bound."""
-    if not (path / METADATA_NAME).is_file():
-        return
-    about = optional("ruamel.yaml").YAML(typ="safe").load((path / METADATA_NAME).read_text())
+    about = optional("ruamel.yaml").YAML(typ="safe").load(read_text(metadata, "metadata", MAX_BYTES))
     mode = about["rosbag2_bagfile_information"].get("compression_mode") or "none"
     if mode.lower() != "none":
         problem = f"expected a bag that is compressed by chunks of MCAP or not at all, got by {mode:.20}"
-        raise InputFileError(path, f"{problem}: `ros2 bag convert` writes one")
+        raise InputFileError(metadata.parent, f"{problem}: `ros2 bag convert` writes one")
 
 
 @contextmanager

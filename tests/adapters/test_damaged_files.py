@@ -199,10 +199,12 @@ def many_zip(path: Path) -> None:
 
 
 def zstd_frame(mib: int, *, stated: bool = True) -> bytes:
-    """Return zeros as a frame, of which the head may leave out how many they are."""
+    """Return a record of zeros as a frame, of which the head may leave out how many they are."""
     told = {"size": mib << 20} if stated else {}
     writing = zstandard.ZstdCompressor().compressobj(**told)
-    return b"".join([writing.compress(bytes(1 << 20)) for _ in range(mib)] + [writing.flush()])
+    head = struct.pack("<BQ", 0x80, (mib << 20) - 9)
+    parts = [head.ljust(1 << 20, b"\0"), *[bytes(1 << 20)] * (mib - 1)]
+    return b"".join([*map(writing.compress, parts), writing.flush()])
 
 
 def lz4_frame(mib: int) -> bytes:

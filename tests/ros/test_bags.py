@@ -622,6 +622,46 @@ def test_a_bag_whose_reader_would_decode_without_a_bound_is_refused(tmp_path, mo
         read_bag(tmp_path / "bag")
 
 
+def indices_of(mcap: bytes) -> list[int]:
+    """Return where the index of each chunk begins, with its first and its last time."""
+    at, found = 8, []
+    while at + 9 <= len(mcap):
+        kind, length = struct.unpack_from("<BQ", mcap, at)
+        found += [at + 9] * (kind == 8)
+        at += 9 + length
+    return found
+
+
+@pytest.mark.parametrize(("first_ns", "last_ns"), [(1, 0), (0, -1), (-(10**18), -(10**18)), (2 * 10**9, 0)])
+def test_an_index_that_lies_about_the_times_of_its_messages_is_refused(tmp_path, first_ns, last_ns):
+    """By them a reader leaves messages out, and holds chunks together."""
+    with bag_writer(tmp_path / "bag") as write:
+        for k in range(20):
+            samples = np.random.default_rng(k).uniform(-0.5, 0.5, (40_000, CHANNELS)).astype(np.float32)
+            write("/mics", AUDIO, 10**18 + k * 10**8, block(samples, 10**18 + k * 10**8, sample_rate=400_000))
+    (file,) = (tmp_path / "bag").glob("*.mcap")
+    data = bytearray(file.read_bytes())
+    indices = indices_of(data)
+    assert len(indices) > 1
+    assert len(read_bag(file).sound.open().silent_channels) == 0
+    first, last = struct.unpack_from("<QQ", data, indices[-1])
+    struct.pack_into("<QQ", data, indices[-1], first + first_ns, last + last_ns)
+    file.write_bytes(data)
+    with pytest.raises(InputFileError, match="expected an index with the times of its messages"):
+        read_bag(file)
+
+
+def test_the_metadata_of_a_bag_are_parsed_once_more_in_all_than_by_its_reader(tmp_path, monkeypatch):
+    from ruamel.yaml import YAML
+
+    path, parsed, load = write_blocks(tmp_path / "bag", sound_of(RATE_HZ)), [], YAML.load
+    monkeypatch.setattr(YAML, "load", lambda yaml, text: parsed.append(text) or load(yaml, text))
+    with open_sound(read_bag(path).sound) as audio:
+        assert sum(map(len, audio.blocks())) == RATE_HZ
+    opened = 3  # to find out what it holds, for its first second, and for its blocks
+    assert len(parsed) == opened + 1
+
+
 def test_a_run_that_fails_leaves_no_bag(tmp_path):
     with pytest.raises(RuntimeError), state_bag(tmp_path / "out") as write:
         write(STATES[0])
