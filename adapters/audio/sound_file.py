@@ -224,11 +224,17 @@ def open_audio(
     (4, 1.2, [(4800, 4), (4800, 4)])
     """
     with ExitStack() as opened:
-        source = opened.enter_context(AudioSource(Path(path), _open_file(Path(path))))
-        _check(source)
+        source = _opened(Path(path), opened)
         (source.check_channels if short else source.check_size)(expect_channels)
         source.check_silence(strict)
         opened.pop_all()  # what is fit to be read stays open
+    return source
+
+
+def _opened(path: Path, opened: ExitStack) -> AudioSource:
+    """Open a file on the stack that closes it, whatever is silent in it."""
+    source = opened.enter_context(AudioSource(path, _open_file(path)))
+    _check(source)
     return source
 
 
@@ -492,7 +498,8 @@ class MonoFiles(Audio):
         self.path, self.sample_rate_hz, self.frames = first.path, first.sample_rate_hz, first.frames
         self.channels = len(self._sources)
         self.silent_channels = tuple(i for i, one in enumerate(self._sources, 1) if one.silent_channels)
-        for other in self._sources[1:]:
+        for other in self._sources:
+            other.check_channels(1)
             if (other.sample_rate_hz, other.frames) != (first.sample_rate_hz, first.frames):
                 expected = f"{first.frames} samples at {first.sample_rate_hz} Hz as in {first.path.name}"
                 got = f"{other.frames} at {other.sample_rate_hz} Hz"
@@ -564,10 +571,10 @@ def open_sound(
 
 def _unchecked(sound: Path | tuple[Path, ...] | SoundStream, opened: ExitStack) -> Audio:
     """Open what can be read, whatever is silent, on the stack that closes it."""
-    if isinstance(sound, tuple):
-        return MonoFiles([opened.enter_context(open_audio(path, 1, strict=False)) for path in sound])
     if isinstance(sound, SoundStream):
         return opened.enter_context(sound.open())
-    source = opened.enter_context(AudioSource(sound, _open_file(sound)))
-    _check(source)
-    return source
+    return (
+        MonoFiles([_opened(one, opened) for one in sound])
+        if isinstance(sound, tuple)
+        else _opened(sound, opened)
+    )

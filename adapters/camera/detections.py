@@ -57,6 +57,11 @@ class DetectionFrame:
     labels : tuple of str
         n class names, as the detector says them.
 
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, a box turned inside out, a score out of range, NaN.
+
     Examples
     --------
     >>> frame = DetectionFrame(np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.9]), ("car",))
@@ -76,6 +81,10 @@ class DetectionFrame:
             check_shape(name, numbers.shape, shape)
             object.__setattr__(self, name, numbers)
         object.__setattr__(self, "labels", tuple(self.labels))
+        left, top, right, bottom = self.boxes_px.T
+        # Written so that NaN, for which every comparison is false, is refused.
+        if not ((left <= right) & (top <= bottom) & (self.scores >= 0.0) & (self.scores <= 1.0)).all():
+            raise InvalidArgumentError("expected left <= right, top <= bottom and scores in [0, 1]")
 
     def __len__(self) -> int:
         return len(self.labels)

@@ -20,7 +20,7 @@ from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
-from .detections import DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
+from .detections import PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
@@ -32,8 +32,9 @@ BORDER_PX = 1.0
 
 
 # Looks of a running camera that are remembered: whether a box stands still is asked over the last second, and
-# more than 60 images a second bring nothing to a decision every 0.1 s.
+# more than 60 images a second bring nothing to a decision every 0.1 s. So what comes sooner is left out.
 REMEMBERED = 64
+LEAST_APART_NS = nanoseconds(PARKED_S / (REMEMBERED - 1))
 # Half the width of the sector around a bearing, and the probability that a moving object of the class is
 # reported where there is none, unless it was measured.
 _HALF_WIDTH_RAD, _CLUTTER_RATE = math.radians(10.0), 0.01
@@ -139,7 +140,7 @@ class VisionQuery:
         self._take(before.detections)
 
     def see(self, stamp_ns: int, frame: DetectionFrame) -> None:
-        """Take what a running detector found in an image; one that is no later than the last is left out.
+        """Take what a running detector found in an image; one less than 16 ms after the last is left out.
 
         Parameters
         ----------
@@ -162,7 +163,7 @@ class VisionQuery:
         'Absent'
         """
         before, taken_ns = self.detections, stamp_ns + nanoseconds(self.camera.stamp_offset_s)
-        if len(before) and taken_ns <= before.stamps_ns[-1]:
+        if len(before) and taken_ns < before.stamps_ns[-1] + LEAST_APART_NS:
             return
         _check_size(self.camera, DetectionLog((frame,), np.array([taken_ns]), before.source))
         self._asked = True

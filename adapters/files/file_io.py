@@ -146,7 +146,8 @@ class GrowingFile:
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            self._file.truncate(self._bytes)
+            self._file.seek(self._bytes)  # else what comes next would follow a hole
+            self._file.truncate()
             raise InputFileError(self.path, f"expected room to write ({error.strerror})") from error
         self._bytes += len(record)
         return len(record)

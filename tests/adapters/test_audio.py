@@ -8,7 +8,7 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.adapters.audio.sound_file import data_size, open_audio
+from worldstate.adapters.audio.sound_file import SilentChannelsError, data_size, open_audio, open_sound
 from worldstate.ground.errors import InvalidArgumentError
 
 RATE_HZ = 8000
@@ -108,3 +108,14 @@ def test_size_left_open_by_a_stream_is_no_cut(tmp_path: Path) -> None:
     data[data.index(b"data") + 4 : data.index(b"data") + 8] = b"\xff" * 4
     name.write_bytes(data)
     assert data_size(name) is None
+
+
+def test_a_silent_file_among_those_of_single_microphones_is_a_silent_channel(tmp_path: Path) -> None:
+    samples = noise(channels=4)
+    samples[:, 2] = 0.0
+    files = tuple(write(tmp_path / f"{k}.wav", samples[:, k]) for k in range(4))
+    with open_sound(files, 4, strict=False) as source:
+        assert source.silent_channels == (3,)
+        assert np.array_equal(np.concatenate(list(source.blocks()))[:, 2], samples[:, 2])
+    with pytest.raises(SilentChannelsError, match="every channel"):
+        open_sound(files, 4)

@@ -66,6 +66,35 @@ def test_it_answers_as_the_camera_of_a_recording(source):
     assert not any(seen.moving for seen in recorded.sightings(stamp(34)))
 
 
+@pytest.mark.parametrize("rate_hz", [60, 100, 400])
+def test_a_fast_camera_finds_a_parked_car_parked_as_well(source, rate_hz):
+    camera = replace(source, detections=NO_LOOKS).camera_channel()
+    for number in range(2 * rate_hz):
+        camera.see(nanoseconds(number / rate_hz), box(300.0))
+    assert [seen.moving for seen in camera.sightings(nanoseconds(2.0))] == [False]
+    assert len(camera.detections) <= REMEMBERED
+
+
+@pytest.mark.parametrize(
+    ("places", "score"),
+    [
+        ((np.nan, 100.0, 400.0, 300.0), 0.9),
+        ((300.0, 100.0, 400.0, 300.0), np.nan),
+        ((300.0, 100.0, 400.0, 300.0), 1.7),
+        ((400.0, 100.0, 300.0, 300.0), 0.9),
+    ],
+)
+def test_boxes_that_cannot_be_are_refused_and_the_run_goes_on(source, places, score):
+    class Broken:
+        def detect(self, image):
+            return DetectionFrame(np.array([places]), np.array([score]), ("car",))
+
+    camera, images = replace(source, detections=NO_LOOKS).camera_channel(), image_channel()
+    images.put((0.9, np.zeros((480, 640, 3), np.uint8)))
+    assert ImageLooks(images, Broken(), nanoseconds, (640, 480)).deliver(camera.see) == 1
+    assert camera.sightings(stamp(10)) == ()
+
+
 def test_without_an_image_it_was_not_asked(source):
     camera = replace(source, detections=NO_LOOKS).camera_channel()
     assert isinstance(camera.ask(0, AHEAD), Unqueried)

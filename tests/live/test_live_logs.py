@@ -162,6 +162,20 @@ def test_a_log_that_was_there_is_kept(tmp_path):
     assert path.read_text() == "now\n"
 
 
+def test_what_is_written_once_there_is_room_again_follows_the_last_whole_record(tmp_path):
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with GrowingFile(path := tmp_path / "log.jsonl") as log:
+        log.write(b"first\n")
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10, unlimited[1]))
+            with pytest.raises(InputFileError, match="expected room to write"):
+                log.write(b"second\n")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+        log.write(b"third\n")
+    assert path.read_bytes() == b"first\nthird\n"
+
+
 def test_a_full_mcap_goes_on_in_a_new_file(street, tmp_path, monkeypatch):
     monkeypatch.setattr("worldstate.cli.common.exports.most_bytes", lambda arguments: 30_000)
     assert main(words(street, tmp_path, "--speed", 20, "--duration", 8)) == 0
