@@ -15,6 +15,7 @@ from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.direction.bearing import (
     BearingScatter,
     Peak,
+    about_the_peak,
     bearing_of,
     find_peaks,
     noise_prominence,
@@ -355,9 +356,9 @@ class FrontEnd:
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
         heard = self._heard(BEARING_HOPS)
-        spectrum, floor = self._srp(heard), self._least_prominence
-        peaks = find_peaks(spectrum, self._azimuths)
-        bearing = self._scatter.widened(bearing_of(spectrum, peaks, self._azimuths, floor))
+        spectrum, azimuths = about_the_peak(self._srp(heard), self._azimuths)
+        peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
+        bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
         window = sum(hop.share for hop in self._hops) / WINDOW_HOPS
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.heard_rate_hz),

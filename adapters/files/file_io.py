@@ -15,9 +15,9 @@ import uuid
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Self, TypeVar
+from typing import Any, BinaryIO, Self, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -216,9 +216,21 @@ def read_record(kind: type[T], path: str | Path, what: str) -> T:
 
 def check_keys(given: object, kind: type, where: str) -> None:
     """Refuse keys that mean nothing in what is written by hand: a wrong name would be left out in silence."""
-    known = {one.name for one in fields(kind)}
-    if isinstance(given, dict) and (unknown := sorted(set(given) - known)):
-        raise InvalidArgumentError(f"{where}: expected keys among {sorted(known)}, got {unknown}")
+    if not isinstance(given, dict):  # the decoder says what it is
+        return
+    hints = {one.name: get_type_hints(kind)[one.name] for one in fields(kind)}
+    if unknown := sorted(set(given) - set(hints)):
+        raise InvalidArgumentError(f"{where}: expected keys among {sorted(hints)}, got {unknown}")
+    for key, value in given.items():
+        several, part = isinstance(value, list), _record_in(hints[key])
+        for number, one in enumerate(value if several else [value]):
+            if part is not None:
+                check_keys(one, part, f"{where}.{key}" + f"[{number}]" * several)
+
+
+def _record_in(hint: Any) -> Any:
+    """Return the dataclass of which a hint allows one or several, None without one."""
+    return hint if is_dataclass(hint) else next(filter(None, map(_record_in, get_args(hint))), None)
 
 
 @contextmanager

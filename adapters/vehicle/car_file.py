@@ -180,7 +180,7 @@ def read_car(path: str | Path) -> CarSensors:
     """
     with refused_as_file(path):
         given = read_json(path, "a car file")
-        _check_all_keys(given)
+        check_keys(given, _CarFile, "car")
         record = decode(_CarFile, given, "car")
         return record.car(Path(path))
 
@@ -307,7 +307,9 @@ def _beside(folder: Path, file: str | None) -> Path | None:
 
 def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:
     """Return a camera with its position relative to the array."""
-    there = Mounting(record.position_m or (0.0, 0.0, 0.0)).position_m
+    if record.position_m is None:
+        return record.camera()  # which refuses it
+    there = Mounting(record.position_m).position_m
     x, y, z = (one - origin for one, origin in zip(there, array_m, strict=True))
     return replace(record, position_m=(x, y, z)).camera()
 
@@ -319,12 +321,3 @@ def _placed_at(where: str) -> Iterator[None]:
         yield
     except InvalidArgumentError as error:
         raise InvalidArgumentError(f"{where}: {str(error).removeprefix('camera: ')}") from error
-
-
-def _check_all_keys(given: object) -> None:
-    check_keys(given, _CarFile, "car")
-    if isinstance(given, dict):  # else the decoder says what it is
-        check_keys(given.get("array"), _ArrayRecord, "car.array")
-        cameras = given.get("cameras")
-        for number, camera in enumerate(cameras if isinstance(cameras, list) else ()):
-            check_keys(camera, _CameraEntry, f"car.cameras[{number}]")

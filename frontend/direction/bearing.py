@@ -233,6 +233,25 @@ def find_peaks(values: FloatArray, azimuths_rad: FloatArray, max_peaks: int = 4)
     return tuple(peak for peak in peaks if peak.prominence >= 1.0)
 
 
+def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a spectrum (A,) all round, and its grid, cut open behind its peak; any other as it is.
+
+    Where the search begins and ends is the same direction: a source there has one peak, not half of two.
+
+    Examples
+    --------
+    >>> values, grid = about_the_peak(np.array([4.0, 3.0, 1.0, 2.0, 4.0]), np.radians([-180, -90, 0, 90, 180]))
+    >>> values.tolist(), np.degrees(grid).round().tolist()
+    ([1.0, 2.0, 4.0, 3.0], [-360.0, -270.0, -180.0, -90.0])
+    """
+    step = azimuths_rad[1] - azimuths_rad[0]
+    if azimuths_rad[-1] - azimuths_rad[0] < 2.0 * math.pi - 0.5 * step:
+        return values, azimuths_rad
+    count = len(values) - 1
+    order = int(values[:-1].argmax()) - count // 2 + np.arange(count)
+    return values[:-1].take(order, mode="wrap"), azimuths_rad[0] + step * order
+
+
 def _local_maxima(values: FloatArray) -> IndexArray:
     """Return the indices of local maxima; of a plateau the first."""
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
@@ -245,8 +264,8 @@ def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: f
         left, right = float(values[index - 1]), float(values[index + 1])
         shift = vertex(left, height, right)
         height -= 0.25 * (left - right) * shift
-    azimuth = azimuths[index] + shift * (azimuths[1] - azimuths[0])
-    return Peak(float(azimuth), height, height / median)
+    azimuth = float(azimuths[index] + shift * (azimuths[1] - azimuths[0]))
+    return Peak(azimuth if abs(azimuth) <= math.pi else wrap_angle(azimuth), height, height / median)
 
 
 # Fitted with _APART to sources in rooms and in the open on rings of 4 to 8 microphones, 3 to 10 cm, and to

@@ -84,6 +84,8 @@ def rates() -> dict[str, float]:
     ("keys", "said"),
     [
         ({"arm": [LEFT, RIGHT]}, "expected keys among"),
+        ({"arms": [LEFT, {**RIGHT, "speed": 12.0}]}, r"context.arms\[1\]: expected keys among .*\['speed'\]"),
+        ({"rates": {**rates(), "arrivals_hz": 0.01}}, r"context.rates: expected keys among .*'arrivals_hz'"),
         ({"arms": [LEFT]}, "priors for"),
         ({"arms": [LEFT, LEFT]}, "different"),
         ({"arms": [{**LEFT, "corner_m": [5.0, 0.0]}, RIGHT]}, "corner_m"),

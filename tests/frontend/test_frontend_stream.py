@@ -16,13 +16,13 @@ from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.bearing import srp_phat
+from worldstate.frontend.direction.bearing import direct_probability, srp_phat
 from worldstate.frontend.hop_spectra import BANDS, NoiseMeter
 from worldstate.frontend.settings import ELEVATIONS_RAD, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import NotUsable
+from worldstate.ground.values import NotUsable, wrap_angle
 
 SQUARE = MicrophoneArray([[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]])
 RATE = 16_000
@@ -402,3 +402,18 @@ def test_what_noise_covers_is_left_out_of_the_window(first: int, length: int, sa
             np.testing.assert_allclose(one.feature, other.feature, atol=0.3)
             assert one.band_log_energy.mean() < other.band_log_energy.mean() + 2.3
     assert ours[-1].heard == 1.0 and theirs[-1].heard == min(one.heard for one in theirs) == 1.0
+
+
+@pytest.mark.parametrize("azimuth_deg", [60.0, 85.0, 90.0, 95.0])
+def test_all_round_a_source_behind_is_heard_as_one_at_the_side(azimuth_deg: float) -> None:
+    """Oracle: the array turned by a right angle is the array, with its channels in another order."""
+    all_round = FrontEndSettings(azimuth_span_deg=(-180.0, 180.0))
+    beside = noise_from(SQUARE, np.radians(azimuth_deg), RATE, 1.0)
+    behind = beside[:, [1, 2, 3, 0]]
+    one, other = (FrontEnd(SQUARE, RATE, all_round).process(sound)[0] for sound in (beside, behind))
+    turned = wrap_angle(other.bearing_rad - one.bearing_rad)
+    assert abs(turned) == pytest.approx(np.pi / 2, abs=1e-3)
+    assert abs(wrap_angle(other.bearing_rad)) > np.radians(145.0)
+    assert other.bearing_std_rad == pytest.approx(one.bearing_std_rad, rel=0.02)
+    assert direct_probability(other.peaks) == pytest.approx(direct_probability(one.peaks), abs=0.02)
+    assert [round(p.value, 2) for p in other.peaks] == [round(p.value, 2) for p in one.peaks]
