@@ -240,7 +240,8 @@ def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatA
 
     Examples
     --------
-    >>> values, grid = about_the_peak(np.array([4.0, 3.0, 1.0, 2.0, 4.0]), np.radians([-180, -90, 0, 90, 180]))
+    >>> grid = np.radians([-180, -90, 0, 90, 180])
+    >>> values, grid = about_the_peak(np.array([4.0, 3.0, 1.0, 2.0, 4.0]), grid)
     >>> values.tolist(), np.degrees(grid).round().tolist()
     ([1.0, 2.0, 4.0, 3.0], [-360.0, -270.0, -180.0, -90.0])
     """
