@@ -84,7 +84,7 @@ class DetectionFrame:
         left, top, right, bottom = self.boxes_px.T
         # Written so that NaN, for which every comparison is false, is refused.
         if not ((left <= right) & (top <= bottom) & (self.scores >= 0.0) & (self.scores <= 1.0)).all():
-            raise InvalidArgumentError("expected left <= right, top <= bottom and scores in [0, 1]")
+            raise InvalidArgumentError("boxes: expected x1 <= x2, y1 <= y2 and scores in [0, 1]")
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -173,10 +173,9 @@ class DetectionLog:
         cls,
         frames: Collection[DetectionFrame],
         frame_rate_hz: float,
-        start_ns: int = 0,
         source: str = "detections",
     ) -> "DetectionLog":
-        """Stamp frame i with start + i / rate, counted from the start of the recording.
+        """Stamp frame i with i / rate, counted from the start of the recording.
 
         Raises
         ------
@@ -184,7 +183,7 @@ class DetectionLog:
             If the rate is not above 0 and at most 1000.
         """
         in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
-        stamps = [start_ns + nanoseconds(i / frame_rate_hz) for i in range(len(frames))]
+        stamps = [nanoseconds(i / frame_rate_hz) for i in range(len(frames))]
         return cls(tuple(frames), np.array(stamps, dtype=np.int64), source)
 
     def __len__(self) -> int:
@@ -343,10 +342,7 @@ class _OvadFrame:
         if not len(self.boxes) == len(self.scores) == len(self.classes_str) <= MAX_BOXES_A_FRAME:
             got = f"{len(self.boxes)} boxes, {len(self.scores)} scores, {len(self.classes_str)} classes_str"
             raise InvalidArgumentError(f"expected as many of each, at most {MAX_BOXES_A_FRAME}, got {got}")
-        for left, top, right, bottom in self.boxes:
-            if left > right or top > bottom:
-                got = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
-                raise InvalidArgumentError(f"boxes: expected x1 <= x2 and y1 <= y2, got {got}")
+        self.frame()  # which refuses boxes that cannot be
 
     def frame(self) -> DetectionFrame:
         boxes_px = np.array(self.boxes, dtype=np.float64).reshape(-1, 4)

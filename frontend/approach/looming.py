@@ -63,19 +63,16 @@ class Looming:
         Its standard error, 1/s, > 0.
     log_slope_hz : float
         Slope of log E over the window, 1/s: 2 / TTA near its middle.
-    log_slope_std_hz : float
-        Its standard error, 1/s.
 
     Examples
     --------
-    >>> Looming(0.5, 0.05, 0.8, 0.1).inverse_tta_hz
+    >>> Looming(0.5, 0.05, 0.8).inverse_tta_hz
     0.5
     """
 
     inverse_tta_hz: float
     std_hz: float
     log_slope_hz: float
-    log_slope_std_hz: float
 
 
 def looming(
@@ -157,10 +154,7 @@ def looming(
         return NotUsable("range reaches zero within the error of the window")
     rate = -source.slope / source.level
     gradient = np.array([-rate, -1.0]) / source.level
-    log_std = max(exponential.scatter, floor_std)
-    std_hz = float(np.sqrt(gradient @ covariance @ gradient))
-    slope_std_hz = float(log_std * np.sqrt(exponential.slope_variance))
-    return Looming(rate, std_hz, exponential.slope, slope_std_hz)
+    return Looming(rate, float(np.sqrt(gradient @ covariance @ gradient)), exponential.slope)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,12 +196,11 @@ def _fit_source(times: FloatArray, energy: FloatArray, noise: float) -> _Source 
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """Line ``value = level + slope t``, and its slope's variance for relative errors of unit variance."""
+    """Line ``value = level + slope t``."""
 
     slope: float
     level: float
     scatter: float
-    slope_variance: float
 
 
 def _fit_line(times: FloatArray, values: FloatArray, scale: FloatArray) -> _Line:
@@ -219,7 +212,7 @@ def _fit_line(times: FloatArray, values: FloatArray, scale: FloatArray) -> _Line
     slope, level = (s0 * v1 - s1 * v0) / determinant, (s2 * v0 - s1 * v1) / determinant
     residual = (values - level - slope * times) / scale
     scatter = float(np.sqrt(residual @ residual / (len(times) - 2)))
-    return _Line(slope, level, scatter, s0 / determinant)
+    return _Line(slope, level, scatter)
 
 
 # An approach is heard for three to six seconds: of half a minute it leaves the lower third to the noise, of

@@ -94,9 +94,7 @@ def feature_steering(
     return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD)
 
 
-def pair_sum(
-    whitened: Complex64Array, steering: Steering, order: tuple[int, ...] | None = None
-) -> Complex128Array:
+def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:
     r"""Return the complex sum over frames, bins and microphone pairs i < j.
 
     .. math:: S(\theta) = \sum_{t,k} \sum_{i<j}
@@ -104,7 +102,7 @@ def pair_sum(
 
     Shapes: whitened (frames, bins, M).
     """
-    return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering, order)
+    return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering)
 
 
 def pair_sum_of(

@@ -67,7 +67,7 @@ class EgoNoise:
         frames_per_s: float,
         n_microphones: int,
         beams: Sequence[Steering],
-        elevation_split: "ElevationSplit | None" = None,
+        elevation_split: "ElevationSplit",
     ) -> None:
         self.weight = 0.0
         self.ego_share = 0.0
@@ -168,12 +168,10 @@ class EgoNoise:
 
     def _share_used(self) -> float:
         """Share of the covariance that is used: 0 for a street, 1 for ego-noise."""
-        return 1.0 if self._split is None else _use_of(*self._split.powers(self._covariance.total))
+        return _use_of(*self._split.powers(self._covariance.total))
 
     def _recent_share(self, total: Complex64Array) -> float:
         """Share of ego-noise in the hops accepted for learning of late."""
-        if self._split is None:
-            return 1.0
         kept = math.exp(-1.0 / _RECENT_HOPS)
         self._recent = kept * self._recent + self._split.powers(total)
         return _use_of(*self._recent)

@@ -37,7 +37,7 @@ class Flat:
 def frame(approach):
     """One frame with a bearing, a looming rate and an engine line, whatever the recording has there."""
     frame, _ = next(iter(measure_steps(open_source(approach.folder))))
-    looming = Looming(inverse_tta_hz=0.4, std_hz=0.05, log_slope_hz=0.8, log_slope_std_hz=0.1)
+    looming = Looming(inverse_tta_hz=0.4, std_hz=0.05, log_slope_hz=0.8)
     tone = ToneReading(57.0, 0.3, 0.5)
     return replace(frame, bearing_rad=0.2, bearing_std_rad=0.05, prominence=2.0, looming=looming, tone=tone)
 

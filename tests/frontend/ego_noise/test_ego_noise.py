@@ -18,6 +18,7 @@ from worldstate.frontend.direction.music import Subspace, music_spectrum
 from worldstate.frontend.ego_noise import ego_noise as whitening
 from worldstate.frontend.ego_noise.ego_noise import (
     EgoNoise,
+    ElevationSplit,
     shrunk_inverse_root,
     white_share,
 )
@@ -267,7 +268,9 @@ def test_the_published_feature_is_left_alone() -> None:
 
 
 def whitener(n_microphones: int, beams: Steering) -> EgoNoise:
-    return EgoNoise(125.0, n_microphones, [beams])
+    # Of an array that cannot separate them all noise is taken for that of the own vehicle.
+    fields = np.zeros((len(beams.weights), 2 * n_microphones**2), np.float32)
+    return EgoNoise(125.0, n_microphones, [beams], ElevationSplit(fields, fields, is_separable=False))
 
 
 def correlated_hops(rng: np.random.Generator, hops: int, array: MicrophoneArray = ROOF) -> np.ndarray:
