@@ -9,15 +9,12 @@ A package names them in its pyproject.toml, and the command line names one of th
 | `worldstate.measurements` | `MeasurementsPart` | ``--measurements NAME=FILE`` |
 
 A part has a minute for each call: one that hangs ends the command as one that fails. Code below Python that
-does not come back then either ends the process, with exit code 2 and where it hangs.
+does not come back then either ends the process, with exit code 1 and where it hangs.
 """
 
-import ctypes
 import faulthandler
 import signal
-import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
@@ -38,7 +35,6 @@ SIGNALLED = 128
 LONGEST_S = 60.0
 # What Python raises then reaches no code below it: so long after, the process ends.
 BELOW_PYTHON_S = 10.0
-_WRITTEN_S = 0.5  # In which it is written where it hangs
 _STDERR = 2  # Where it hangs is written without Python: to the descriptor, whatever `sys.stderr` is by then
 Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
 # What other modalities say, each time it is asked for anew.
@@ -128,45 +124,13 @@ def _limited() -> Iterator[None]:
 
     signal.signal(signal.SIGALRM, end)
     signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
-    after_s = LONGEST_S + BELOW_PYTHON_S
-    timer = _exit_timer(after_s + _WRITTEN_S)
-    faulthandler.dump_traceback_later(after_s, exit=timer is None, file=_STDERR)
+    faulthandler.dump_traceback_later(LONGEST_S + BELOW_PYTHON_S, exit=True, file=_STDERR)
     try:
         yield
     finally:
         faulthandler.cancel_dump_traceback_later()
-        if timer is not None:
-            ctypes.CDLL(None).timer_delete(timer)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-
-
-class _TimerEvent(ctypes.Structure):
-    """What a timer does: `sigevent` of <signal.h>, as Linux of 64 bits has it."""
-
-    _fields_ = (
-        ("value", ctypes.c_size_t),
-        ("signal", ctypes.c_int),
-        ("kind", ctypes.c_int),
-        ("function", ctypes.c_void_p),
-        ("rest", ctypes.c_byte * 40),
-    )
-
-
-def _exit_timer(after_s: float) -> ctypes.c_void_p | None:
-    """Let the system end the process with exit code 2 so much later; None where it has no such timers."""
-    # While code below Python holds the lock of the interpreter, no thread of Python could: faulthandler alone
-    # can, with exit code 1.
-    system, timer = ctypes.CDLL(None), ctypes.c_void_p()
-    if sys.platform != "linux" or not hasattr(system, "timer_create"):
-        return None
-    in_a_thread = 2  # SIGEV_THREAD: a thread of the C library calls the function with the value
-    event = _TimerEvent(2, 0, in_a_thread, ctypes.cast(system._exit, ctypes.c_void_p))
-    if system.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)):
-        return None
-    once = (ctypes.c_long * 4)(0, 0, int(after_s), int(after_s % 1.0 * 1e9))
-    system.timer_settime(timer, 0, ctypes.byref(once), None)
-    return timer
 
 
 @dataclass(frozen=True, slots=True)
