@@ -185,9 +185,7 @@ def test_the_bag_of_a_recording_says_where_array_and_camera_stand(bag_of_approac
     assert stamp_ns == min(time for _, time, _ in read), "before all that stands in these frames"
     found = {one.child_frame_id: one for one in told.transforms}
     assert {one.header.frame_id for one in told.transforms} == {"base_link"}
-    frames = {
-        message.header.frame_id for name, _, message in read if name.endswith(("audio", "detections"))
-    }
+    frames = {message.header.frame_id for name, _, message in read if name.endswith(("audio", "detections"))}
     assert frames == set(found)
     (places,) = (message.positions for name, _, message in read if name.endswith("array"))
     middle = np.mean([[one.x, one.y, one.z] for one in places], axis=0)
