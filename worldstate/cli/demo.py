@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 # Louder than a car, so that the first recording that a newcomer sees is not a marginal one.
 VAN_OVER_CAR_DB = 6.0
 
+NEEDS = ("matplotlib",)
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""

@@ -51,7 +51,6 @@ from worldstate.cli.common.output import CommandResult, output_folder, write_rep
 from worldstate.cli.common.progress import progress_bar, track
 from worldstate.cli.common.sensors import detector_maker, detector_name
 from worldstate.frontend.array.microphone_array import ovad_array
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.simulation.dataset.dataset import write_dataset
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES
@@ -178,7 +177,6 @@ def _is_foreign(take: Take) -> bool:
 
 def _check(arguments: argparse.Namespace) -> None:
 
-    in_range("--jobs", arguments.jobs, 1, 256)
     if arguments.stage_streams and not arguments.hazard_free:
         raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
     if arguments.dataset is not None and arguments.smoke:
