@@ -188,7 +188,10 @@ def commission(
     open_field = open_field_windows(
         open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs, settings.moving_ego)
     )
-    fit = partial(_windows_learned, real, open_field, domain)
+
+    def fit(some: Sequence[HeardStream]) -> EnsembleModel:
+        return window_model(*_table_and_beside(real, open_field, domain, some))
+
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
     model = train_model(
@@ -254,15 +257,6 @@ def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
     if model.sequence is None or not isinstance(model.signature, EnsembleModel):
         raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
     return model.signature, model.sequence
-
-
-def _windows_learned(
-    real: FeatureTable | None,
-    open_field: SimulatedWindows,
-    domain: ModelDomain,
-    streams: Sequence[HeardStream],
-) -> EnsembleModel:
-    return window_model(*_table_and_beside(real, open_field, domain, streams))
 
 
 def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:
