@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 from worldstate.adapters.export.log_messages import IMAGE_TOPIC, SNAPSHOT_TOPIC, SOUND_TOPIC, read_messages
 from worldstate.adapters.export.scene import CompressedImage, RawAudio
@@ -20,7 +19,6 @@ _SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
 _HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
-Media = TypeVar("Media", CompressedImage, RawAudio)
 
 
 def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
@@ -34,17 +32,18 @@ def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
         raise InputFileError(path, _EMPTY)
 
 
-def read_media(path: Path, kind: type[Media]) -> Iterator[tuple[int, Media]]:
+def read_media(path: Path) -> Iterator[tuple[int, CompressedImage | RawAudio]]:
     """Yield each image or block of sound of a log with its stamp, ns; only MCAP of `--export` holds any."""
-    topic = IMAGE_TOPIC if kind is CompressedImage else SOUND_TOPIC
+    kinds: dict[str, type[CompressedImage] | type[RawAudio]]
+    kinds = {IMAGE_TOPIC: CompressedImage, SOUND_TOPIC: RawAudio}
     with refused_as_file(path):
-        for stamp_ns, text in read_messages(path, topic) if _is_own_mcap(path) else ():
-            yield stamp_ns, decode(kind, decode_json(text, topic), topic)
+        for stamp_ns, topic, text in read_messages(path, *kinds) if _is_own_mcap(path) else ():
+            yield stamp_ns, decode(kinds[topic], decode_json(text, topic), topic)
 
 
 def _lines(path: Path) -> Iterator[str]:
     if _is_own_mcap(path):
-        return (text for _, text in read_messages(path, SNAPSHOT_TOPIC))
+        return (text for _, _, text in read_messages(path, SNAPSHOT_TOPIC))
     return bag_snapshot_lines(path) if is_bag(path) else _json_lines(path)
 
 

@@ -344,7 +344,9 @@ class EnsembleModel:
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
         in_range("prior_s", self.prior_s, 0.0, math.inf, open_high=True)
-        finite_array("home", self.home.row, (len(KINDS) * self.n_features,))
+        home = finite_array("home", self.home.row, (len(KINDS) * self.n_features,))
+        home.flags.writeable = False
+        object.__setattr__(self, "home", SiteReference.from_row(home))
         views = expert_views(VIEWS, self.home.mean[None], self.home.row[None])
         for expert in self.experts:
             inputs = views[expert.view].shape[1]

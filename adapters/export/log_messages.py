@@ -321,8 +321,8 @@ class _McapMessages:
 _LARGEST_RECORD = 1 << 28
 
 
-def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str]]:
-    """Yield stamp and text of the messages of a topic of an MCAP file, in the order of their writing.
+def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
+    """Yield stamp, topic and text of messages of an MCAP file, in the order of their writing.
 
     Of a file that was not finished those are read whose chunk is whole.
     """
@@ -335,8 +335,8 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str]]:
             messages = reader(file, validate_crcs=True, record_size_limit=_LARGEST_RECORD)
             for _, channel, message in messages.iter_messages(log_time_order=False):
                 found = True
-                if channel.topic == topic:
-                    yield message.log_time, message.data.decode()
+                if channel.topic in topics:
+                    yield message.log_time, channel.topic, message.data.decode()
         except GeneratorExit:
             raise
         except (

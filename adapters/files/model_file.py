@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import as_file, files
 from operator import attrgetter
@@ -130,7 +130,10 @@ def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> M
     """
     if path is not None:
         return read_record(Model, path, "model")
-    return _shipped("moving_model.json" if moving_ego else "default_model.json")
+    shipped = _shipped("moving_model.json" if moving_ego else "default_model.json")
+    # All else of it is read-only.
+    figures = dict(shipped.provenance.figures)
+    return replace(shipped, provenance=replace(shipped.provenance, figures=figures))
 
 
 @cache

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeAlias
 
 from worldstate.adapters.audio.sound_file import Audio, SoundInput, open_audio, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME, Recording
 from worldstate.adapters.export.other_stacks import CROSSING_M, autoware_objects, is_localised
 from worldstate.adapters.export.scene import SceneItem, SceneLine, SceneTriangles, scene_update
@@ -21,7 +22,7 @@ from worldstate.measurement.odometry import Odometry
 from worldstate.state import RiskCue, WorldState
 
 from . import message_types as types
-from .bag_input import open_bag
+from .bag_input import STATIC_TOPIC, open_bag
 from .message_types import header, message, time_of, typestore
 
 Storage = Literal["mcap", "sqlite3"]
@@ -31,6 +32,7 @@ WriteMessage: TypeAlias = Callable[[str, str, int, Mapping[str, Any]], None]
 _VERSION: Literal[8] = 8
 AUDIO_TOPIC, ARRAY_TOPIC = "/microphones/audio", "/microphones/array"
 DETECTIONS_TOPIC, ODOMETRY_TOPIC = "/camera/detections", "/odometry"
+MICROPHONES_FRAME, CAMERA_FRAME = "microphones", "camera"
 # Of a second, as drivers deliver sound.
 _BLOCKS_PER_SECOND = 10
 
@@ -75,13 +77,25 @@ def bag_writer(path: Path, storage: Storage = "mcap") -> Iterator[WriteMessage]:
 
             def write(topic: str, kind: str, stamp_ns: int, values: Mapping[str, Any]) -> None:
                 if topic not in connections:
-                    connections[topic] = bag.add_connection(topic, kind, typestore=store)
+                    kept = [_kept_for_late()] if topic == STATIC_TOPIC else []
+                    connections[topic] = bag.add_connection(
+                        topic, kind, typestore=store, offered_qos_profiles=kept
+                    )
                 bag.write(connections[topic], stamp_ns, store.serialize_cdr(message(kind, values), kind))
 
             yield write
         for file in inner.iterdir():
             file.rename(temporary / file.name)
         inner.rmdir()
+
+
+def _kept_for_late() -> Any:
+    """Return the quality of service of static transforms: who listens later is sent them, too."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    ever = QosTime(9_223_372_036, 854_775_807)  # as ROS 2 writes that there is no end
+    sent = QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL
+    return Qos(*sent, ever, ever, QosLiveliness.AUTOMATIC, ever, avoid_ros_namespace_conventions=False)
 
 
 def write_bag(
@@ -91,6 +105,7 @@ def write_bag(
     detections: DetectionLog | None = None,
     ego: OdometryLog | None = None,
     *,
+    camera: PinholeCamera | None = None,
     start_ns: int = 0,
     storage: Storage = "mcap",
 ) -> Iterator[float]:
@@ -99,6 +114,7 @@ def write_bag(
     The stamps of detections and speeds count from the start of the recording; `start_ns` is added to all.
     """
     with open_sound(sound, array.n_microphones, strict=False) as audio, bag_writer(path, storage) as write:
+        write(STATIC_TOPIC, types.TRANSFORMS, start_ns, {"transforms": _frames(array, camera, start_ns)})
         write(ARRAY_TOPIC, types.ARRAY, start_ns, _array(array, start_ns))
         rate_hz, taken = audio.sample_rate_hz, 0
         events = heapq.merge(
@@ -128,6 +144,26 @@ def _simulated_speeds(path: Path) -> list[float]:
     return speeds if isinstance(speeds, list) else []
 
 
+def _frames(array: MicrophoneArray, camera: PinholeCamera | None, stamp_ns: int) -> list[dict[str, Any]]:
+    """Return where the frames of sound and boxes stand in `base_link`; x of the camera is its axis."""
+    from scipy.spatial.transform import Rotation
+
+    placed = {MICROPHONES_FRAME: (array.positions_m.mean(axis=0).tolist(), (0.0, 0.0, 0.0))}
+    if camera is not None:
+        placed[CAMERA_FRAME] = camera.position_m, (camera.yaw_rad, -camera.pitch_rad, camera.roll_rad)
+    return [
+        {
+            "header": header(stamp_ns),
+            "child_frame_id": frame,
+            "transform": {
+                "translation": dict(zip("xyz", at_m, strict=True)),
+                "rotation": dict(zip("xyzw", Rotation.from_euler("ZYX", turn).as_quat(), strict=True)),
+            },
+        }
+        for frame, (at_m, turn) in placed.items()
+    ]
+
+
 def _array(array: MicrophoneArray, stamp_ns: int) -> dict[str, Any]:
     places = [{"x": x, "y": y, "z": z} for x, y, z in array.positions_m.tolist()]
     return {"header": header(stamp_ns), "name": array.name, "positions": places}
@@ -138,7 +174,8 @@ def _heard(audio: Audio, start_ns: int) -> Iterator[_Event]:
     taken = 0
     for block in audio.blocks(max(audio.sample_rate_hz // _BLOCKS_PER_SECOND, 1)):
         stamp_ns = start_ns + round(taken * 1_000_000_000 / audio.sample_rate_hz)
-        yield stamp_ns, AUDIO_TOPIC, types.AUDIO, about | {"header": header(stamp_ns), "data": block.ravel()}
+        head = header(stamp_ns, MICROPHONES_FRAME)
+        yield stamp_ns, AUDIO_TOPIC, types.AUDIO, about | {"header": head, "data": block.ravel()}
         taken += len(block)
 
 
@@ -147,7 +184,7 @@ def _seen(detections: DetectionLog | None, start_ns: int) -> Iterator[_Event]:
         return
     for stamp_ns, frame in zip(detections.stamps_ns.tolist(), detections.frames, strict=True):
         stamp_ns += start_ns
-        head = header(stamp_ns, "camera")
+        head = header(stamp_ns, CAMERA_FRAME)
         boxes = [{"header": head} | one for one in _boxes(frame)]
         yield stamp_ns, DETECTIONS_TOPIC, types.DETECTIONS, {"header": head, "detections": boxes}
 

@@ -1,5 +1,6 @@
 """`worldstate-lab table` from end to end on four simulated recordings."""
 
+import argparse
 import json
 import os
 import shutil
@@ -8,6 +9,7 @@ import time
 import numpy as np
 import pytest
 import soundfile
+from worldstate_lab.cli import table
 from worldstate_lab.cli.main import main
 
 from worldstate.adapters.files.array_file import write_array_xml
@@ -167,3 +169,19 @@ def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
     assert main(["table", str(root), "--out", str(tmp_path / "no"), *model]) == 2
     said = capsys.readouterr().err
     assert "not the array of the model" in said and "--uncalibrated" not in said
+
+
+def test_finished_streets_of_another_seed_are_simulated_anew(tmp_path, monkeypatch):
+    for name, value in {"SMOKE_STATIC": 1, "SMOKE_S": 0.5, "SMOKE_VIDEO_PX": 64}.items():
+        monkeypatch.setattr(table, name, value)
+
+    def simulated(seed):
+        root = table._simulated(argparse.Namespace(out=tmp_path, smoke=True, seed=seed, jobs=1))
+        (truth,) = root.rglob("truth.json")
+        return json.loads(truth.read_text())["settings"], truth.stat().st_mtime_ns
+
+    first = simulated(1)
+    assert simulated(1) == first, "what is there is kept"
+    other = simulated(2)
+    assert other[0] != first[0]
+    assert simulated(2) == other

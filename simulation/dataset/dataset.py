@@ -28,7 +28,7 @@ from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.file_io import atomic_path, read_json, write_json, write_text
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
-from worldstate.ground.extras import optional
+from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
 from worldstate.simulation.camera.street_view import View, paint_street
@@ -279,6 +279,8 @@ def write_dataset(
     """
     in_range("jobs", jobs, 1, 256)
     wanted = settings or DatasetSettings()
+    if wanted.video:
+        check_extra("cv2")
     folder, plans = Path(root), wanted.plans()
     folder.mkdir(parents=True, exist_ok=True)
     listed, listening = _listed(folder), ovad_array() if array is None else array

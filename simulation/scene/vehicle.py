@@ -213,12 +213,21 @@ def drive(
     Shapes: time_s (T,).
     """
     heading = -1 if entry_y_m > 0 else 1
-    slowed = braking_mps2 * np.clip(time_s - (entry_s - 2.0), 0.0, 2.0)
+    step = time_s[1] - time_s[0]
+    # Where it passes before the first time or after the last, it is followed to there.
+    before, after = (
+        int(np.ceil(max(out_s, 0.0) / step)) for out_s in (time_s[0] - entry_s, entry_s - time_s[-1])
+    )
+    clock = np.r_[
+        time_s[0] - step * np.arange(before, 0, -1), time_s, time_s[-1] + step * np.arange(1, after + 1)
+    ]
+    slowed = braking_mps2 * np.clip(clock - (entry_s - 2.0), 0.0, 2.0)
     speed = np.maximum(speed_mps - slowed, 0.25 * speed_mps)
     mean = np.r_[0.0, 0.5 * (speed[1:] + speed[:-1])]
-    driven = np.cumsum(mean) * (time_s[1] - time_s[0])
-    front = entry_y_m + heading * (driven - np.interp(entry_s, time_s, driven))
-    return Trajectory(time_s, front, speed, lane_x_m, heading, kind)
+    driven = np.cumsum(mean) * step
+    front = entry_y_m + heading * (driven - np.interp(entry_s, clock, driven))
+    asked = slice(before, before + len(time_s))
+    return Trajectory(time_s, front[asked], speed[asked], lane_x_m, heading, kind)
 
 
 def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = np.inf) -> Trajectory:

@@ -9,8 +9,6 @@ any loss, and so as loud as the screened sources themselves. Reflections in the 
 rendered.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -73,14 +71,6 @@ KNOT = 1024  # levels are evaluated so often, samples
 FASTEST_MPS = 70.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EgoSound:
-    """What the moving ego adds to every microphone."""
-
-    pressure_pa: Float32Array  # shape (n, M)
-    firing_hz: FloatArray  # shape (n,): Firing frequency of the engine, whose multiples are its lines
-
-
 def ego_noise(
     positions_m: ArrayLike,
     speed_mps: ArrayLike,
@@ -89,19 +79,7 @@ def ego_noise(
     engine_db: float = 0.0,
     tyre_db: float = 0.0,
 ) -> Float32Array:
-    """Render the noise of the ego vehicle at its own microphones: `ego_sound` without the engine's speed."""
-    return ego_sound(positions_m, speed_mps, sample_rate_hz, rng, engine_db, tyre_db).pressure_pa
-
-
-def ego_sound(
-    positions_m: ArrayLike,
-    speed_mps: ArrayLike,
-    sample_rate_hz: float,
-    rng: np.random.Generator,
-    engine_db: float = 0.0,
-    tyre_db: float = 0.0,
-) -> EgoSound:
-    r"""Render the noise of the ego vehicle at its own microphones.
+    r"""Render the noise of the ego vehicle at its own microphones, shape (n, M), Pa.
 
     .. math:: n_m(t) = w_m(t) + \sum_q \sum_{i \in \{0, 1\}} \frac{\rho^i\, g_{q,i}}{d_{q,i,m}}\,
               s_q\Big(t - \frac{d_{q,i,m}}{c}\Big)
@@ -128,7 +106,7 @@ def ego_sound(
     out = np.zeros((len(positions), len(driven)), np.float32)
     _add_sources(out, positions, driven, firing, rate, to_noise, (engine_db, tyre_db))
     _add_wind(out, driven, rate, to_wind)
-    return EgoSound(np.ascontiguousarray(out[:, lead:].T), firing[lead:])
+    return np.ascontiguousarray(out[:, lead:].T)
 
 
 def add_ego(

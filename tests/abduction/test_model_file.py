@@ -73,11 +73,21 @@ def test_the_default_model_ships_and_says_where_it_comes_from():
     assert "Schulz" in model.provenance.dataset
     assert len(model.provenance.excluded_lists) == 2
     # Every listener of a process shares it, so that nobody may write into it.
-    assert read_model() is model and not model.sequence.trees.split.flags.writeable
+    assert read_model().sequence is model.sequence and not model.sequence.trees.split.flags.writeable
     signature, policies = model.signature, model.policies
     assert policies.for_alpha(0.02).reference_prior == signature.reference_prior
     thresholds = [policies.for_alpha(alpha).gamma for alpha in (0.05, 0.02, 0.01)]
     assert thresholds == sorted(thresholds)
+
+
+def test_what_a_caller_writes_into_the_shipped_model_changes_no_other_caller():
+    once, again = read_model(), read_model()
+    for array in (once.signature.home.mean, once.signature.home.median, once.signature.home.quiet):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 99.0
+    once.provenance.figures["accuracy"] = 2.0
+    assert read_model().provenance.figures["accuracy"] < 1.0
+    assert again.provenance.figures["accuracy"] < 1.0
 
 
 def test_written_and_read_back_to_the_bit(tmp_path):

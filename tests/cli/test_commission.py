@@ -82,11 +82,15 @@ def clips_of(folder: Path, road_user: str) -> list[str]:
     return ["--sounds", str(folder), "--kinds", str(folder / "clips.csv")]
 
 
-def test_clips_that_cannot_be_learned_are_refused_before_anything_is_rendered(
+def test_what_cannot_be_learned_from_is_refused_before_anything_is_rendered(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["model", "make", "--quick", "--out", str(tmp_path / "model.json")]
+    short = np.random.default_rng(1).uniform(-0.1, 0.1, (12_000, 56))
+    soundfile.write(tmp_path / "night.wav", short, 6000)
     for options, told in (
+        (["--quiet", str(tmp_path / "missing.wav")], "missing.wav"),
+        (["--quiet", str(tmp_path / "night.wav")], "quiet: expected 0.10 hours"),
         (["--kinds", "clips.csv"], "--sounds, --kinds: expected both"),
         (clips_of(tmp_path, "ufo"), "clips.csv: line 2: road_user"),
     ):

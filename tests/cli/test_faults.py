@@ -1,5 +1,6 @@
 """Faults of files, disks and users: one line and exit code 2, nothing destroyed, nothing left behind."""
 
+import json
 import os
 import resource
 import signal
@@ -17,6 +18,7 @@ from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground import extras
 from worldstate.simulation.dataset.dataset import LogRow, write_log
 
 COMMAND = (sys.executable, "-m", "worldstate.cli.main")
@@ -97,6 +99,74 @@ def files(tmp_path, monkeypatch) -> Path:
 )
 def test_an_output_that_cannot_be_is_refused_before_the_work(line, named, files, capsys):
     assert named in refusal(line.split(), files, capsys)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("demo --out new --seed -1", "--seed: expected"),
+        ("model fit t.csv --seed -1 --out m2.json", "--seed: expected"),
+        ("model make --jobs 0 --out m2.json", "--jobs: expected"),
+        ("model make --no-exam --figure f.png --out m2.json", "--figure: expected --exam with it"),
+        ("model make --exclude ids.csv --out m2.json", "--exclude: expected --labelled with it"),
+        ("model make --source mine --out m2.json", "--source: expected --labelled with it"),
+        ("model fit t.csv --sample-rate 16000 --out m2.json", "--sample-rate: expected --array with it"),
+        ("model detector v.mp4 --most 0 --out b.json", "--most: expected"),
+        ("sim make --out new --site SB1", "--site: expected --minutes with it"),
+        ("sim make --out new --traffic busy", "--traffic: expected --minutes with it"),
+        ("sim make --out new --video-width 320", "--video-width: expected --video with it"),
+        ("sim make --out new --minutes 1 --kind tram", "--minutes: expected without --kind"),
+        ("sim make --out new --minutes 1 --duration 5", "--minutes: expected without --duration"),
+        ("sim make --out new --minutes 1 --scene merge --static 2", "without --static, --scene"),
+        ("log plot m.json --animate a.gif --recording a.wav", "--recording: expected --out with it"),
+        ("log plot m.json --out o.png --time 3", "--time: expected --birds-eye with it"),
+        ("run a.wav --images 5", "--images: expected --detections with it"),
+        ("log replay m.json --export mcap=b --export mcap=b", "b: expected another file"),
+        ("log replay m.json --export osi=m.json --export osi=b", "m.json: expected another file"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused_before_the_work(line, said, files, capsys):
+    assert said in refusal(line.split(), files, capsys)
+
+
+def test_the_boxes_of_one_recording_are_not_those_of_several(tmp_path, capsys):
+    """A car's camera may name what it detected, which is of one recording as --detections is."""
+    camera = {"name": "front", "width_px": 640, "height_px": 480, "horizontal_fov_deg": 90}
+    camera |= {"position_m": [0, 0, 0], "detections": "boxes.json"}
+    (tmp_path / "car.json").write_text(json.dumps({"cameras": [camera]}))
+    for name in ("a.wav", "b.wav", "boxes.json"):
+        (tmp_path / name).touch()
+    several = [str(tmp_path / name) for name in ("a.wav", "b.wav")]
+    for command in (["array", "align"], ["street", "learn", "--out", str(tmp_path / "s.json")]):
+        for given in (["--car", "car.json"], ["--detections", "boxes.json"]):
+            words = [*command, *several, given[0], str(tmp_path / given[1])]
+            assert "expected one recording with boxes" in refusal(words, tmp_path, capsys)
+
+
+def test_reference_boxes_of_one_video_are_not_those_of_several(tmp_path, capsys):
+    rows = [LogRow(f"1_00_000{number}", "SA1", "left", 5) for number in (0, 1)]
+    for row in rows:
+        (tmp_path / row.folder).mkdir(parents=True)
+        for name in ("out_multi.wav", "ueye_stereo_vid.mp4", "camera_baseline_results.json"):
+            (tmp_path / row.folder / name).write_text("{}")
+    write_log(tmp_path, rows)
+    words = ["model", "detector", str(tmp_path), "--reference", str(tmp_path / rows[0].folder)]
+    said = refusal([*words, "--out", str(tmp_path / "b.json")], tmp_path, capsys)
+    assert "--reference: expected one video with it, got 2" in said
+
+
+@pytest.mark.parametrize(
+    ("line", "extra"),
+    [
+        ("demo --out new", "matplotlib"),
+        ("sim make --out new --minutes 1", "matplotlib"),
+        ("sim make --out new --static 1 --video", "cv2"),
+    ],
+)
+def test_a_package_that_is_missing_is_named_before_the_work(line, extra, files, capsys, monkeypatch):
+    real = extras.find_spec
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == extra else real(name))
+    assert "pip install" in refusal(line.split(), files, capsys)
 
 
 @pytest.mark.parametrize("file", ["timeline.png", "states.jsonl"])

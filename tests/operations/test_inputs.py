@@ -135,6 +135,15 @@ def test_two_sources_are_counted(tmp_path: Path) -> None:
     assert rows_of(tmp_path / "b.csv")[0, 4] == 2
 
 
+def test_a_dead_microphone_is_no_reason_for_waves(tmp_path: Path) -> None:
+    noise = np.random.default_rng(3).normal(0, 0.05, (3 * RATE, 4)) * [1.0, 1.0, 0.0, 1.0]
+    soundfile.write(tmp_path / "a.wav", noise, RATE)
+    file = write_array(tmp_path / "ring.csv", ring(4, 0.2))
+    options = ["--array", str(file), "--sources", "--out", str(tmp_path / "b.csv")]
+    assert main(["array", "bearings", str(tmp_path / "a.wav"), *options]) == 0
+    assert not rows_of(tmp_path / "b.csv")[:, 4].any()
+
+
 def test_whole_numbers_of_a_converter_are_brought_to_full_scale() -> None:
     array = MicrophoneArray(ring(4, 0.2))
     sound = wave(array, 20.0)

@@ -58,7 +58,7 @@ class Elements(HTMLParser):
 
 
 def written(states, tmp_path, **parts):
-    write_log_page(states, tmp_path / "log.html", **parts)
+    write_log_page(tmp_path / "log.html", page_data(states, **parts))
     return (tmp_path / "log.html").read_text("utf-8")
 
 
@@ -179,7 +179,7 @@ def of_wave(uri):
 def test_the_sound_of_the_page_is_that_of_the_log_from_the_first_snapshot_on(states, since_ns, rate_hz):
     noise = np.random.default_rng(0).uniform(-1.0, 1.0, 2 * rate_hz).astype(np.float32)
     later = [replace(state, stamp_ns=state.stamp_ns + since_ns) for state in states]
-    got_hz, got = of_wave(page_data(later, sound=logged_sound(noise, rate_hz, since_ns))["sound"])
+    got_hz, got = of_wave(page_data(later, media=logged_sound(noise, rate_hz, since_ns))["sound"])
     first, last = (round(rate_hz * states[k].stamp_ns / 1e9) for k in (0, -1))
     assert got_hz == rate_hz
     assert len(got) == pytest.approx(last - first, abs=1)
@@ -193,7 +193,7 @@ def test_sound_of_a_high_rate_is_resampled_and_what_the_log_lacks_is_silent(stat
     time_s = np.arange(48_000) / 48_000
     both = 0.4 * np.sin(2 * np.pi * 1000 * time_s) + 0.4 * np.sin(2 * np.pi * 12_000 * time_s)
     blocks = logged_sound(both.astype(np.float32), 48_000)
-    rate_hz, samples = of_wave(page_data(states, sound=[*blocks[:4], *blocks[5:]])["sound"])
+    rate_hz, samples = of_wave(page_data(states, media=[*blocks[:4], *blocks[5:]])["sound"])
     assert (rate_hz, len(samples)) == (16_000, 8000)
     whole = samples / 32768
     tones = 2 / 1600 * np.abs(np.fft.rfft(whole[4800:6400]))
@@ -205,9 +205,9 @@ def test_sound_of_a_high_rate_is_resampled_and_what_the_log_lacks_is_silent(stat
 
 def test_a_long_sound_is_cut_and_says_so(states, monkeypatch):
     blocks = logged_sound(np.full(8000, 0.5, np.float32), 8000)
-    assert page_data(states, sound=blocks)["remarks"] == []
+    assert page_data(states, media=blocks)["remarks"] == []
     monkeypatch.setattr(log_page, "MOST_SOUND_S", 0.2)
-    data = page_data(states, sound=blocks)
+    data = page_data(states, media=blocks)
     assert len(of_wave(data["sound"])[1]) == 1600
     assert "sound is that of the first 0.2 s" in data["remarks"][-1]
 
@@ -227,14 +227,14 @@ def test_sound_that_would_be_played_wrongly_is_refused(states):
             with pytest.raises(
                 InvalidArgumentError, match="sound: expected pcm-s16 of one channel at one rate"
             ):
-                page_data(states, sound=spoiled)
+                page_data(states, media=spoiled)
 
 
 def test_the_image_of_a_snapshot_is_the_last_one_at_or_before_it(states):
     stamps_ns = [one.stamp_ns for one in states]
     given = [stamps_ns[1], stamps_ns[2] + 1, stamps_ns[4] - 1, stamps_ns[4], stamps_ns[-1] + 1]
     for early in ([], [0, stamps_ns[0] - 5]):
-        data = page_data(states, images=logged_images([*early, *given]))
+        data = page_data(states, media=logged_images([*early, *given]))
         assert not data["remarks"]
         assert len(data["images"]) == 4 + bool(early), (
             "no other one before the first snapshot or after the last"
@@ -253,7 +253,7 @@ def test_many_images_are_thinned_evenly_and_the_page_says_so(states, monkeypatch
     for name, value in bound.items():
         monkeypatch.setattr(log_page, name, value)
     many = [replace(states[0], stamp_ns=10**8 * k) for k in range(90)]
-    data = page_data(many, images=logged_images(range(0, 9 * 10**9, 10**8)))
+    data = page_data(many, media=logged_images(range(0, 9 * 10**9, 10**8)))
     times = [one["t"] for one in data["images"]]
     assert 10 <= len(times) <= 25
     assert np.ptp(np.diff(times)) == pytest.approx(0.0, abs=1e-9)
@@ -264,7 +264,7 @@ def test_many_images_are_thinned_evenly_and_the_page_says_so(states, monkeypatch
 
 def test_an_image_larger_than_the_page_is_left_out(states, monkeypatch):
     monkeypatch.setattr(log_page, "MOST_CHARACTERS", 10)
-    data = page_data(states, images=logged_images([0, states[1].stamp_ns]))
+    data = page_data(states, media=logged_images([0, states[1].stamp_ns]))
     assert "images" not in data
     assert "0 of 2 images" in data["remarks"][-1]
 
@@ -300,6 +300,21 @@ def test_the_command_shows_images_and_sound_of_a_log_that_holds_them(states, log
     assert not {"img", "audio"} & {tag for tag, _ in plain.found}
     assert not {"images", "sound"} & set(json.loads(plain.data))
     assert not any("image" in row for row in json.loads(plain.data)["states"])
+
+
+def test_a_log_is_read_once_for_its_snapshots_and_once_for_images_and_sound(log_with_media, monkeypatch):
+    from mcap import reader
+
+    log, readings = log_with_media[0], []
+
+    class Counted(reader.NonSeekingReader):
+        def __init__(self, *args, **options):
+            readings.append(self)
+            super().__init__(*args, **options)
+
+    monkeypatch.setattr(reader, "NonSeekingReader", Counted)
+    assert main(["log", "view", str(log)]) == 0
+    assert len(readings) == 2
 
 
 def test_media_that_is_no_base64_is_refused_in_one_line(states, tmp_path, capsys):
@@ -382,7 +397,8 @@ needs_browser = pytest.mark.skipif(
 def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states, tmp_path):
     heard = [replace(one, bearing=None if k == 2 else Bearing(0.3, 0.1, 2.0)) for k, one in enumerate(states)]
     low = replace(states[0].cues[0], evidence=replace(states[0].cues[0].evidence, compared_nats=-20.0))
-    write_log_page([replace(heard[0], cues=(low, *heard[0].cues[1:])), *heard[1:]], tmp_path / "log.html")
+    shown = [replace(heard[0], cues=(low, *heard[0].cues[1:])), *heard[1:]]
+    write_log_page(tmp_path / "log.html", page_data(shown))
     with browser(tmp_path / "profile") as page:
         page.open(tmp_path / "log.html")
         page.press("End")
@@ -428,7 +444,7 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
         page.call("Emulation.setDeviceMetricsOverride", **screen)
         for name, (shown, parts) in pages.items():
             path = tmp_path / f"{name}.html"
-            write_log_page(shown, path, **parts)
+            write_log_page(path, page_data(shown, **parts))
             page.events.clear()
             page.open(path)
             assert page.value(dashes) == (2 if name in ("whole", "since") else 0)
@@ -451,7 +467,7 @@ def test_the_sound_plays_in_step_with_the_slider_and_the_image(states, log_with_
     log, _ = log_with_media
     assert main(["log", "view", str(log)]) == 0
     path = log.with_suffix(".html")
-    write_log_page(states, tmp_path / "plain.html")
+    write_log_page(tmp_path / "plain.html", page_data(states))
     held = "[document.querySelector('audio').currentTime, +document.getElementById('slider').value]"
     with browser(tmp_path / "profile") as page:
         page.open(path)

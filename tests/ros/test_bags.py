@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from scripted_states import scripted_states
 
 from worldstate.adapters.audio.sound_file import open_sound
+from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.export.other_stacks import autoware_objects
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.files.array_file import read_array
@@ -175,6 +176,30 @@ def bag_of_approach(approach, tmp_path_factory):
     path = tmp_path_factory.mktemp("approach") / "street"
     assert main(["sim", "to-bag", str(approach.folder), str(path), "--start", "1700000000"]) == 0
     return path
+
+
+def test_the_bag_of_a_recording_says_where_array_and_camera_stand(bag_of_approach):
+    """The chain of frames ends at `base_link`; SciPy's rotations are the oracle of the camera's axis."""
+    read = read_by_others(bag_of_approach)
+    ((_, stamp_ns, told),) = (one for one in read if one[0] == "/tf_static")
+    assert stamp_ns == min(time for _, time, _ in read), "before all that stands in these frames"
+    found = {one.child_frame_id: one for one in told.transforms}
+    assert {one.header.frame_id for one in told.transforms} == {"base_link"}
+    frames = {message.header.frame_id for name, _, message in read if name.endswith(("audio", "detections"))}
+    assert frames == set(found)
+    (places,) = (message.positions for name, _, message in read if name.endswith("array"))
+    middle = np.mean([[one.x, one.y, one.z] for one in places], axis=0)
+    at = found["microphones"].transform
+    assert [at.translation.x, at.translation.y, at.translation.z] == pytest.approx(middle)
+    assert at.rotation.w == 1.0
+    seen, camera = found["camera"].transform, PinholeCamera.ovad()
+    assert (seen.translation.x, seen.translation.y, seen.translation.z) == camera.position_m
+    turn = Rotation.from_quat([seen.rotation.x, seen.rotation.y, seen.rotation.z, seen.rotation.w])
+    up = camera.pitch_rad
+    assert turn.apply([1.0, 0.0, 0.0]) == pytest.approx([math.cos(up), 0.0, math.sin(up)])
+    assert turn.apply([0.0, 1.0, 0.0]) == pytest.approx([0.0, 1.0, 0.0])
+    # 1 is TRANSIENT_LOCAL: otherwise a player sends the one message to those alone that listen already.
+    assert (bag_of_approach / "metadata.yaml").read_text().count("durability: 1") == 1
 
 
 def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach, tmp_path):

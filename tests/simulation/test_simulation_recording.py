@@ -110,6 +110,16 @@ def test_a_drive_enters_sight_when_told_and_never_turns(braking, speed, entry_y)
     assert path.heading == -np.sign(entry_y)
 
 
+@pytest.mark.parametrize("entry_s", [-6.0, 14.0])
+def test_a_vehicle_that_passes_before_or_after_the_recording_is_where_its_speed_puts_it(entry_s):
+    time = np.linspace(-2.0, 10.0, 1201)
+    path = drive(time, entry_s=entry_s, entry_y_m=5.0, lane_x_m=6.0, speed_mps=8.0, braking_mps2=1.0)
+    # It brakes from 8 to 6 m/s in the two seconds before: 14 m.
+    left_s = entry_s - time
+    away = np.where(left_s < 0.0, 6.0 * left_s, 14.0 + 8.0 * (left_s - 2.0))
+    assert path.front_y_m == pytest.approx(5.0 + away, abs=1e-3)
+
+
 @st.composite
 def scenes(draw):
     numbers = st.floats(0.0, 1.0)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 # Louder than a car, so that the first recording that a newcomer sees is not a marginal one.
 VAN_OVER_CAR_DB = 6.0
 
+NEEDS = ("matplotlib",)
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -59,7 +61,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.adapters.state_log import read_log
     from worldstate.operations.recordings.recording_report import announcement
-    from worldstate.operations.viewing.log_page import write_log_page
+    from worldstate.operations.viewing.log_page import page_data, write_log_page
     from worldstate.operations.viewing.state_figure import drawn_run
 
     out = output.output_folder(arguments.out, "timeline.png", "states.jsonl", "log.html", "summary.json")
@@ -70,7 +72,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         report = listening.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
     states = [state for _, state in read_log(out / "states.jsonl")]
     truth = read_true_tracks(folder)
-    write_log_page(states, out / "log.html", title=title, t0_s=source.t0_s, truth=truth)
+    write_log_page(out / "log.html", page_data(states, title=title, t0_s=source.t0_s, truth=truth))
     output.write_report(out / "summary.json", report.to_dict())
     told = announcement(states, truth, "a van")
     return output.CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}", told])

@@ -176,17 +176,22 @@ def commission(
     clips come from and which lists of windows were left out.
     """
     check_extra("sklearn")
-    streams, rng = [], np.random.default_rng(settings.seed)
-    for one in heard_streams(learned_streams(settings), array, folder, jobs):
+    streams, rng = list[HeardStream](), np.random.default_rng(settings.seed)
+    plan = learned_streams(settings)
+    # What is a user's own is read and checked before hours of streets are simulated.
+    domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
+    real = None if table is None else windows_of_array(table, settings, domain)
+    calm = quiet_streams(quiet, array, settings.onsets_per_hour) if quiet else []
+    for one in heard_streams(plan, array, folder, jobs):
         streams.append(one)
         on_step()
     open_field = open_field_windows(
         open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs, settings.moving_ego)
     )
-    rate_hz = streams[0].hops.about["sample_rate_hz"]
-    domain = domain_of(array, [rate_hz], [one.site for one in streams])
-    real = None if table is None else windows_of_array(table, settings, domain)
-    fit = partial(_windows_learned, real, open_field, domain)
+
+    def fit(some: Sequence[HeardStream]) -> EnsembleModel:
+        return window_model(*_table_and_beside(real, open_field, domain, some))
+
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
     model = train_model(
@@ -204,7 +209,11 @@ def commission(
         model = _with_ears(model, array, streams, recorded, 2 if settings.quick else CLIPS_EACH, rng, jobs)
     provenance = replace(model.provenance, fit_for_use=not settings.quick)
     made = replace(model, provenance=provenance, sequence=sequence)
-    return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made
+    if not calm:
+        return made
+    final, _ = parts_of(made)
+    said = [sequence.posterior(stream_evidence(final, one)) for one in calm]
+    return replace(made, sequence=replace(sequence, alarm=alarm_for(said, settings.onsets_per_hour)))
 
 
 def _with_ears(
@@ -230,11 +239,8 @@ def _with_ears(
     return replace(model, provenance=provenance, guard=guard, road_users=road_users)
 
 
-def with_quiet_alarm(
-    model: Model, array: MicrophoneArray, quiet: Sequence[Path], onsets_per_hour: float
-) -> Model:
-    """Return a model whose alarm is set on recordings without vehicles."""
-    windows, sequence = parts_of(model)
+def quiet_streams(quiet: Sequence[Path], array: MicrophoneArray, onsets_per_hour: float) -> list[HeardStream]:
+    """Hear recordings without vehicles; refuse fewer hours than an alarm can be set on."""
     heard = [hear_recording(path, array) for path in quiet]
     hours = sum(len(one.hops) for one in heard) * HOP_S / SECONDS_PER_HOUR
     # Where fewer onsets than these are to be expected, a threshold is set by chance alone.
@@ -243,8 +249,7 @@ def with_quiet_alarm(
             f"quiet: expected {LEAST_ONSETS / onsets_per_hour:.2f} hours for {onsets_per_hour:g} onsets an "
             f"hour, got {hours:.2f}: more sound, or more onsets allowed"
         )
-    said = [sequence.posterior(stream_evidence(windows, one)) for one in heard]
-    return replace(model, sequence=replace(sequence, alarm=alarm_for(said, onsets_per_hour)))
+    return heard
 
 
 def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
@@ -252,15 +257,6 @@ def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
     if model.sequence is None or not isinstance(model.signature, EnsembleModel):
         raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
     return model.signature, model.sequence
-
-
-def _windows_learned(
-    real: FeatureTable | None,
-    open_field: SimulatedWindows,
-    domain: ModelDomain,
-    streams: Sequence[HeardStream],
-) -> EnsembleModel:
-    return window_model(*_table_and_beside(real, open_field, domain, streams))
 
 
 def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:

@@ -28,7 +28,6 @@ import numpy as np
 from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.figure_style import CATEGORIES, figure_file, legend_beside
 from worldstate_lab.report.table import plain
@@ -124,7 +123,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    in_range("--jobs", arguments.jobs, 1, 256)
     if arguments.idmt is None and arguments.melaudis is None:
         raise InvalidArgumentError("expected --idmt, --melaudis or both: the folders of published corpora")
     if arguments.out is not None:

@@ -43,7 +43,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.camera.detections import DetectionFilter
-from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, choose_array
+from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_array
 from worldstate.adapters.files.array_match import microphone_order
 from worldstate.adapters.files.model_file import read_model
@@ -51,7 +51,6 @@ from worldstate.cli.common.output import CommandResult, output_folder, write_rep
 from worldstate.cli.common.progress import progress_bar, track
 from worldstate.cli.common.sensors import detector_maker, detector_name
 from worldstate.frontend.array.microphone_array import ovad_array
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.simulation.dataset.dataset import write_dataset
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES
@@ -178,7 +177,6 @@ def _is_foreign(take: Take) -> bool:
 
 def _check(arguments: argparse.Namespace) -> None:
 
-    in_range("--jobs", arguments.jobs, 1, 256)
     if arguments.stage_streams and not arguments.hazard_free:
         raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
     if arguments.dataset is not None and arguments.smoke:
@@ -242,21 +240,17 @@ def _check_model(model: Path, dataset: Path | None) -> None:
 
 
 def _simulated(arguments: argparse.Namespace) -> Path:
-    """Simulate the streets that are not there yet."""
+    """Simulate the streets that are not there yet, or are of other settings."""
     from worldstate.simulation.dataset.dataset import DatasetSettings
 
     root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
-    # A log of fewer recordings is that of a simulation that was interrupted.
-    kept = len(OvadDataset(root)) if (root / LOG_NAME).is_file() else 0
-    if kept == static + dynamic:
-        return root
     # A moving ego has no video: its camera moves, and every box with it.
     streets = DatasetSettings(static, seed=arguments.seed, duration_s=length_s, video=True)
     parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
     if dynamic:
         parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
-    with progress_bar("simulating streets", static + dynamic - kept) as bar:
+    with progress_bar("simulating streets", None) as bar:
         for part in parts:
             write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance(), go_on=True)
     return root

@@ -366,7 +366,6 @@ def _passes(
 ) -> dict[str, Passes]:
     """Run every seed of the method and of those that it is compared with."""
     in_range("--seeds", arguments.seeds, 1, 10_000)
-    in_range("--jobs", arguments.jobs, 1, 256)
     afar = arguments.protocol == "transfer"
     if afar and arguments.group != "dynamic":
         raise InvalidArgumentError("--protocol transfer: expected --group dynamic, static is learned from")

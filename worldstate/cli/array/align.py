@@ -17,8 +17,7 @@ Examples
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common import inputs, output, progress, sensors
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.cli.common import command, inputs, output, progress, sensors
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -40,11 +39,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.operations.calibration.cueing_calibration import find_inputs
 
     output.check_outputs(arguments, "out")
-    if arguments.out is not None and arguments.car is None:
-        raise InvalidArgumentError("--out: expected --car with it, whose camera is aligned")
+    command.check_beside(arguments, out="car")
     recordings = [found for path in arguments.input for found in find_inputs(path)]
-    if arguments.detections and len(recordings) > 1:
-        raise InvalidArgumentError("--detections: expected one recording with it, folders bring their own")
+    sensors.check_boxes(arguments, len(recordings))
     settings = replace(inputs.search_of(arguments), mask_dead=True)
     passes = [
         one

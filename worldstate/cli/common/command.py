@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
+from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError, WorldstateError
 from worldstate.ground.extras import check_extra
 from worldstate.ground.version import __version__
@@ -136,6 +137,20 @@ def add_choice(parser: argparse.ArgumentParser, option: str, help_text: str, *ch
     parser.add_argument(option, choices=choices, default=choices[0], help=told)
 
 
+def check_beside(arguments: argparse.Namespace, **other_of: str) -> None:
+    """Refuse options, by name, that were given without the other one that they belong to.
+
+    Examples
+    --------
+    >>> check_beside(argparse.Namespace(sample_rate=None, array=None), sample_rate="array")
+    """
+    given = vars(arguments)
+    for one, other in other_of.items():
+        if given[one] not in (None, []) and not given[other]:
+            option, beside = (f"--{name.replace('_', '-')}" for name in (one, other))
+            raise InvalidArgumentError(f"{option}: expected {beside} with it")
+
+
 def run_program(
     program: Program,
     words: Sequence[str],
@@ -187,6 +202,9 @@ def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandP
         if option in program.former_options and option not in parser._option_string_actions:
             raise InvalidArgumentError(f"{option}: expected {program.former_options[option]} in its place")
     arguments = parser.parse_args(given)
+    # They mean the same wherever they are.
+    in_range("--seed", getattr(arguments, "seed", 0), 0, 2**63)
+    in_range("--jobs", getattr(arguments, "jobs", 1), 1, 256)
     check_extra(*arguments.needs)
     result: CommandResult = arguments.run(arguments)
     print_result(result, as_json=arguments.json)

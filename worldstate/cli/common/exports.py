@@ -62,7 +62,8 @@ def add_output_options(parser: argparse.ArgumentParser, *, pages: bool = True) -
 
 def exported_files(arguments: argparse.Namespace) -> dict[str, Path]:
     """Return the files that --export writes, by option."""
-    return {f"export {name}": Path(target) for name, target in _asked(arguments) if name in _FILES}
+    files = [(name, target) for name, target in _asked(arguments) if name in _FILES]
+    return {f"export {name} ({n})": Path(target) for n, (name, target) in enumerate(files, start=1)}
 
 
 def needed_extras(arguments: argparse.Namespace) -> list[str]:

@@ -94,6 +94,11 @@ class GivenSensors:
     camera: "adapters.PinholeCamera | None"  # The one that is asked
     setup: "CameraSetup"  # Of that camera
 
+    def __post_init__(self) -> None:
+        boxes = self.arguments.detections or self.setup.detections
+        if getattr(self.arguments, "images", None) is not None and (not boxes or self.several()):
+            raise InvalidArgumentError("--images: expected --detections with it, of one camera")
+
     @property
     def model(self) -> Path | None:
         """The model file, None for the one that ships."""
@@ -167,6 +172,13 @@ def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
     name = next(iter(car.cameras), None) if arguments.camera is None else str(arguments.camera)
     setup = CameraSetup() if name is None else car.setups.get(name, CameraSetup())
     return GivenSensors(arguments, car, None if name is None else car.camera(name), setup)
+
+
+def check_boxes(arguments: argparse.Namespace, recordings: int) -> None:
+    """Refuse the boxes of one recording, by --detections or by the camera of --car, for several."""
+    if recordings > 1 and (arguments.detections or given_sensors(arguments).setup.detections):
+        problem = "expected one recording with boxes of --detections or --car, folders bring their own"
+        raise InvalidArgumentError(f"{problem}, got {recordings}")
 
 
 def recorded(

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate import ground, operations
-from worldstate.cli.common import inputs, output, progress
+from worldstate.cli.common import command, inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --out or --export mcap")
     add("--out", type=Path, metavar="PNG", help="draw the run over time")
-    add("--recording", type=Path, action="append", dest="input", metavar="WAV", help="below --out its sound")
+    add("--recording", type=Path, action="append", metavar="WAV", help="below --out its sound")
     add("--birds-eye", type=Path, metavar="PNG", help="draw the snapshot nearest to --time from above")
     add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the largest risk)")
     add("--animate", type=Path, metavar="GIF", help="draw every snapshot from above")
@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if not any(asked):
         raise InvalidArgumentError("plot: expected one of --out, --birds-eye and --animate")
     output.check_outputs(arguments, "animate", figures=("out", "birds_eye"))
+    command.check_beside(arguments, recording="out", time="birds_eye")
     if arguments.animate is not None:
         check_gif(arguments.animate)
     states, title = [state for _, state in read_log(arguments.log)], arguments.log.name
@@ -54,6 +55,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if arguments.time is not None:
         shown = min(states, key=lambda state: abs(state.stamp_ns - ground.nanoseconds(arguments.time)))
     if arguments.out is not None:
+        arguments.input = arguments.recording
         sound = _sound(arguments) if arguments.input else None
         operations.write_state_figure(states, arguments.out, title=title, sound=sound)
     if arguments.birds_eye is not None:

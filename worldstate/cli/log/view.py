@@ -34,21 +34,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.export.scene import CompressedImage, RawAudio
     from worldstate.adapters.state_log import read_media
-    from worldstate.operations.viewing.log_page import check_page, write_log_page
+    from worldstate.operations.viewing.log_page import check_page, page_data, write_log_page
 
     arguments.out = check_page(arguments.out or arguments.log.with_suffix(".html"))
     output.check_outputs(arguments, "out")
     with progress.progress_bar(f"reading {arguments.log.name}", None) as bar:
         states = _between(arguments.log, arguments.between or (-9e9, 9e9), bar.advance)
-        page = write_log_page(
-            states,
-            arguments.out,
-            title=arguments.log.name,
-            images=read_media(arguments.log, CompressedImage),
-            sound=read_media(arguments.log, RawAudio),
-        )
+        page = page_data(states, title=arguments.log.name, media=read_media(arguments.log))
+    write_log_page(arguments.out, page)
     report = {"states": len(page["states"]), "remarks": page["remarks"], "written": str(arguments.out)}
     return output.CommandResult(report)
 

@@ -22,8 +22,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate import adapters, operations
+from worldstate import adapters, ground, operations
 from worldstate.cli.common import output, progress, sensors
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, MakeDetector
@@ -50,8 +51,13 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.operations.detectors.miss_rate_measurement import find_videos, write_absence_figure
 
     output.check_outputs(arguments, "out", figures=("figure",))
+    if arguments.most is not None:
+        ground.in_range("--most", arguments.most, 1, np.inf)
     make = sensors.detector_maker(arguments.detector, tuple(arguments.labels))
-    scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
+    videos = find_videos(arguments.input, arguments.most)
+    if arguments.reference is not None and len(videos) > 1:
+        raise InvalidArgumentError(f"--reference: expected one video with it, got {len(videos)}")
+    scenes = [_scene(arguments, make, *one) for one in videos]
     with progress.progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
         rng, about = np.random.default_rng(arguments.seed), _provenance(arguments, len(scenes))
         rates = operations.measure_absence(scenes, make, rng, provenance=about, on_frame=bar.advance)

@@ -66,6 +66,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.adapters.datasets.feature_table import read_ids
 
     output.check_outputs(arguments, "out")
+    command.check_beside(arguments, sample_rate="array")
     table = _with_domain(arguments, adapters.read_features(arguments.table)).group(arguments.group)
     labelled = [_heard_windows(path, table) for path in arguments.labels]
     for one in labelled:

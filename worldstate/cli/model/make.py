@@ -81,6 +81,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.commissioning import commission, heard_stream, stream_exam
 
     output.check_outputs(arguments, "out", "report", figures=("figure",))
+    command.check_beside(arguments, exclude="labelled", source="labelled", figure="exam")
     settings = _settings(arguments)
     folder = arguments.streams or arguments.out.with_suffix(".streams")
     array = inputs.given_array(arguments) or frontend.ovad_array()

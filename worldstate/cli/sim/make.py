@@ -41,14 +41,20 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate import ground, simulation
+from worldstate import adapters, ground, simulation
 from worldstate.cli.common import command, inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import check_extra
 
 if TYPE_CHECKING:
     from worldstate.simulation.stream.settings import StreamSettings
 
 JUNCTION = "junction"  # the scene where none is named
+# Of recordings alone, with what each is where it is not given.
+OF_RECORDINGS = {
+    **{"static": None, "dynamic": 0, "video": False, "duration": None},
+    **{"scene": JUNCTION, "kind": next(iter(simulation.KINDS))},
+}
 FIGURE_NAME = "stream.png"
 PER_HOUR = 12.0  # of every kind of --sounds in a stream that is no vehicle's
 SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds
@@ -70,28 +76,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_array_options(parser, "OVAD's")
     add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
+    add("--duration", type=float, help="seconds each (default: 10)")
     told = "render up to here only, at three to six times as many samples a second (default: 16,000)"
     add("--bandwidth", type=float, metavar="HZ", help=told)
     add("--video", action="store_true", help="render the camera's video, too")
-    add("--video-width", type=int, default=1936, metavar="PX", help="of its images (default: 1936)")
+    add("--video-width", type=int, metavar="PX", help="of its images (default: 1936)")
     add = parser.add_argument_group("a continuous stream").add_argument
     add("--minutes", type=float, metavar="M", help="its length")
     # Any word is taken: the library refuses a moving ego with its reason.
     sites = simulation.SITES
     add(
         "--site",
-        default=sites[0],
         help=f"{', '.join(sites)}, or TA1, TB1, ... of the second renderer (default: {sites[0]})",
     )
-    add("--traffic", choices=[*TRAFFICS], default="calm", help="how much drives (default: calm)")
+    add("--traffic", choices=[*TRAFFICS], help="how much drives (default: calm)")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
+    command.check_beside(arguments, site="minutes", traffic="minutes", video_width="video")
     if arguments.minutes is not None:
         return _run_stream(arguments)
-
     settings = _settings(arguments)
     with progress.progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
         array = inputs.given_array(arguments)
@@ -112,8 +117,11 @@ def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.commissioning.stream_figure import write_stream_figure
     from worldstate.simulation.stream.writing import write_stream
 
-    if arguments.static or arguments.dynamic or arguments.video or arguments.scene != JUNCTION:
-        raise InvalidArgumentError("--minutes: expected without --static, --dynamic, --video and --scene")
+    given = [f"--{name}" for name, usual in OF_RECORDINGS.items() if getattr(arguments, name) != usual]
+    if given:
+        raise InvalidArgumentError(f"--minutes: expected without {', '.join(given)}, which are of recordings")
+    check_extra("matplotlib")
+    arguments.traffic = arguments.traffic or "calm"
     settings = _stream_settings(arguments)
     with progress.progress_bar("simulating", settings.duration_s) as bar:
         array, jobs = inputs.given_array(arguments), arguments.jobs
@@ -143,7 +151,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     if band is not None:
         rate_hz = rate_for(ground.in_range("--bandwidth", band, *BANDWIDTHS_HZ))
     return StreamSettings(
-        site=simulation.site(arguments.site),
+        site=simulation.site(arguments.site or simulation.SITES[0]),
         minutes=arguments.minutes,
         seed=arguments.seed,
         traffic=replace(
@@ -165,8 +173,8 @@ def _settings(arguments: argparse.Namespace) -> "simulation.DatasetSettings":
     return simulation.DatasetSettings(
         n_static=(0 if arguments.dynamic else 4) if static is None else static,
         n_dynamic=arguments.dynamic,
-        duration_s=arguments.duration,
-        video_width_px=arguments.video_width,
+        duration_s=10.0 if arguments.duration is None else arguments.duration,
+        video_width_px=arguments.video_width or adapters.PinholeCamera.ovad().width_px,
         bandwidth_hz=arguments.bandwidth,
         sounds=kinds,
         sounds_folder=folder,

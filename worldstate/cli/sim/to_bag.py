@@ -1,7 +1,8 @@
 """`worldstate sim to-bag`: a recording as a bag of ROS 2, as a vehicle would have recorded it.
 
-Write sound, array, detections and the speed of the ego, where it is known, as messages. It shows what a bag
-has to look like for `worldstate run BAG`, and which topics; the definitions are in the documentation.
+Write sound, array, detections, where both stand in base_link and the speed of the ego, where it is known, as
+messages. It shows what a bag has to look like for `worldstate run BAG`, and which topics; the definitions are
+in the documentation.
 
 Examples
 --------
@@ -38,8 +39,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     array, seen = choose_array(recording.path, inputs.given_array(arguments)), recording.read_detections()
     ego = odometry_of(recording)
     written = write_bag(
-        arguments.out, recording.audio_path, array, seen, ego,
-        start_ns=start_ns, storage=arguments.ros_storage,
+        arguments.out, recording.audio_path, array, seen, ego, start_ns=start_ns,
+        camera=None if seen is None else adapters.PinholeCamera.ovad(), storage=arguments.ros_storage,
     )  # fmt: skip
     sound_s = list(progress.track(written, f"writing {arguments.out.name}"))[-1]
     summary = {

@@ -45,6 +45,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     import numpy as np
 
     from worldstate.adapters.datasets.ovad import read_true_tracks
+    from worldstate.adapters.files.file_io import write_json, write_rows
     from worldstate.operations.labelling import label_files, pass_labels, street_figure
 
     output.check_outputs(arguments, "out", "windows", figures=("figure",))
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     tracks = pass_labels.box_tracks(detections, source.camera, source.settings.boxes)
     with progress.progress_bar("smoothing", len(tracks)) as bar:
         passes = pass_labels.label_passes(tracks, source.camera.position_m[0], on_pass=bar.advance)
-    label_files.write_open_label(arguments.out, source.audio_path.name, passes)
+    write_json(arguments.out, label_files.open_label(source.audio_path.name, passes))
     if arguments.figure is not None:
         truth = read_true_tracks(source.audio_path.parent)
         street_figure.write_pass_figure(passes, arguments.figure, source.audio_path.name, truth)
@@ -62,7 +63,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         summary["t0_std_s"] = float(np.median([one.t0.std_s for one in passes]))
     if file is not None:
         rows = _windows(arguments, source, tracks, passes, file)
-        label_files.write_window_labels(arguments.windows, rows)
+        write_rows(arguments.windows, label_files.COLUMNS, rows)
         summary |= {"windows": str(arguments.windows), "n_windows": len(rows)}
     lines = [
         f"{one.t0.time_s:9.2f} s +- {one.t0.std_s:.2f}  {one.arm:5}  {one.label}, {one.track.smoother}"

@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING
 
 from worldstate import adapters, ground
 from worldstate.cli.common import output, progress, sensors
-from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.operations.labelling.street_passes import WatchedRecording
@@ -74,8 +73,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 def _check(arguments: argparse.Namespace) -> None:
     ground.in_range("--days", arguments.days, 0.0, 1e5)
-    if arguments.detections and len(arguments.input) > 1:
-        raise InvalidArgumentError("--detections: expected one INPUT with it, they are of one recording")
+    sensors.check_boxes(arguments, len(arguments.input))
     # What is known may be written over: it is read before, and its passes are kept.
     apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})
     output.check_outputs(apart, "out", figures=("figure",))

@@ -8,13 +8,13 @@ import numpy as np
 
 from worldstate.adapters.datasets.feature_extraction import FRONT, window_ends_s
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.adapters.files.file_io import write_json, write_rows
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.version import __version__
 
 from .pass_labels import PassLabel
 
+# Of windows, as `model features --labels` and `model fit --labels` read them.
 COLUMNS = ("ID", "Class", "Environment", "Recording ID", "File", "End", "T0", "T0 std")
 # A window a second before T0 that is half a second off holds what the next class sounds like.
 SUREST_STD_S = 0.3
@@ -54,11 +54,6 @@ def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
             "frames": {key: frames[key] for key in sorted(frames, key=int)},
         }
     }
-
-
-def write_open_label(path: Path, recording: str, passes: Sequence[PassLabel]) -> None:
-    """Write the document, whole or not at all."""
-    write_json(path, open_label(recording, passes))
 
 
 def window_rows(
@@ -111,11 +106,6 @@ def file_below(sound: Path, labels: Path) -> str:
     except ValueError as error:
         problem = f"expected it in the folder of {sound.name} or above, where readers of the list find that"
         raise InputFileError(labels, problem) from error
-
-
-def write_window_labels(path: Path, rows: Sequence[Sequence[object]]) -> None:
-    """Write windows in the columns that `extract-features --labels` and `train --labels` read."""
-    write_rows(path, COLUMNS, rows)
 
 
 def _placed(state: FloatArray, spread: FloatArray, in_sight: bool) -> dict[str, Any]:

@@ -72,8 +72,12 @@ def _sources_in(block: Float32Array, front_end: FrontEnd) -> int:
     settings = front_end.settings
     band = band_bins(settings.srp_band_hz, front_end.sample_rate_hz, settings.nfft)
     chosen = np.unique(np.linspace(0, len(band) - 1, _BINS).round().astype(int))
+    # A dead microphone has no noise, beside which all that the others hear would be waves.
+    alive = block[:, np.ptp(block, axis=0) > 0.0]
+    if not alive.shape[1]:
+        return 0
     # Frames overlap by half; every second one is nearly independent of the last.
-    frames = StreamingStft(block.shape[1], settings.nfft, band).push(block)[::2][:, chosen]
+    frames = StreamingStft(alive.shape[1], settings.nfft, band).push(alive)[::2][:, chosen]
     if len(frames) < _FEWEST_FRAMES:
         return 0
     covariance = np.einsum("tkm,tkn->kmn", frames, frames.conj()) / len(frames)

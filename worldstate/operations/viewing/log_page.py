@@ -6,12 +6,14 @@ import json
 import math
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import NotRequired, TypeAlias, TypedDict
 
 import numpy as np
 import soundfile
+from numpy.typing import NDArray
 from scipy import signal
 
 from worldstate.abduction.road_users import Foreign
@@ -28,6 +30,8 @@ MOST_STATES = 3000
 # heard above 8 kHz.
 MOST_IMAGES, MOST_CHARACTERS = 300, 12_000_000
 MOST_SOUND_S, HIGHEST_RATE_HZ, _MOST_RATE_HZ = 180.0, 16_000, 1_000_000
+# Images and sound stand in a log near the snapshots of their time.
+_WRITTEN_WITHIN_NS = 1_000_000_000
 # A street has fewer; of a fault that gives birth to many the likeliest are enough to see it.
 _MOST_ENTITIES = 16
 
@@ -53,33 +57,38 @@ def check_page(path: Path) -> Path:
     return path
 
 
-def write_log_page(
+def write_log_page(path: Path, data: PageData) -> None:
+    """Write what `page_data` returns as one page of HTML, to exactly this file."""
+    template = (files("worldstate") / "data" / "log_view.html").read_text("utf-8")
+    # Within a script element only "<" can end it or begin a comment.
+    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    write_text(path, template.replace("@data@", text))
+
+
+def page_data(
     states: Iterable[WorldState],
-    path: Path,
     *,
     title: str = "",
     t0_s: float | None = None,
     truth: Sequence[TrueTrack] = (),
-    images: Iterable[tuple[int, CompressedImage]] = (),
-    sound: Iterable[tuple[int, RawAudio]] = (),
+    media: Iterable[tuple[int, CompressedImage | RawAudio]] = (),
 ) -> PageData:
-    """Write snapshots as one page of HTML; return what it draws.
+    """Return what the page draws of snapshots.
 
     Parameters
     ----------
     states : iterable of WorldState
         Of one run, at least one; of more than 6,000 every second, fourth, ... is kept.
-    path : Path
-        Exactly this file.
     title : str
         Heading of the page.
     t0_s : float, optional
         Line-of-sight entry.
     truth : sequence of TrueTrack
         True tracks of the vehicles of a simulated recording.
-    images, sound : iterable of (int, CompressedImage) or (int, RawAudio), optional
-        What `read_media` yields of the log: read after the snapshots, in order of their stamps, ns. The page
-        holds at most 300 images of 12 MB, thinned evenly, and 180 s of sound at no more than 16 kHz.
+    media : iterable of (int, CompressedImage or RawAudio), optional
+        What `read_media` yields of the log: read after the snapshots, images and sound each in order of their
+        stamps, ns. The page holds at most 300 images of 12 MB, thinned evenly, and 180 s of sound at no more
+        than 16 kHz.
 
     Raises
     ------
@@ -89,29 +98,12 @@ def write_log_page(
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
+    >>> page = page_data([WorldState(0, 0)])
     >>> with TemporaryDirectory() as folder:
-    ...     page = write_log_page([WorldState(0, 0)], Path(folder) / "log.html")
+    ...     write_log_page(Path(folder) / "log.html", page)
     >>> len(page["states"])
     1
     """
-    data = page_data(states, title=title, t0_s=t0_s, truth=truth, images=images, sound=sound)
-    template = (files("worldstate") / "data" / "log_view.html").read_text("utf-8")
-    # Within a script element only "<" can end it or begin a comment.
-    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    write_text(path, template.replace("@data@", text))
-    return data
-
-
-def page_data(
-    states: Iterable[WorldState],
-    *,
-    title: str = "",
-    t0_s: float | None = None,
-    truth: Sequence[TrueTrack] = (),
-    images: Iterable[tuple[int, CompressedImage]] = (),
-    sound: Iterable[tuple[int, RawAudio]] = (),
-) -> PageData:
-    """Return what the page draws of snapshots; parameters are those of `write_log_page`."""
     kept, every, count, calibrated = list[tuple[int, Row]](), 1, 0, 0
     for count, state in enumerate(states, start=1):
         calibrated += state.calibrated
@@ -126,65 +118,105 @@ def page_data(
         row["thresholds"] = {}
     remarks = _remarks(count, every, calibrated)
     data = PageData(title=title, remarks=remarks, t0_s=t0_s, truth=list(map(_track, truth)), states=rows)
-    stamps_ns = [stamp_ns for stamp_ns, _ in kept]
-    _add_images(data, stamps_ns, images)
-    _add_sound(data, stamps_ns[0], stamps_ns[-1], sound)
+    _add_media(data, [stamp_ns for stamp_ns, _ in kept], media)
     return data
 
 
-def _add_images(
-    data: PageData, stamps_ns: Sequence[int], images: Iterable[tuple[int, CompressedImage]]
+def _add_media(
+    data: PageData, stamps_ns: Sequence[int], media: Iterable[tuple[int, CompressedImage | RawAudio]]
 ) -> None:
-    """Add images from the last before the first snapshot on, and to each snapshot the number of its own."""
-    kept, every, count = list[tuple[int, str]](), 1, 0
-    for stamp_ns, image in images:
-        if stamp_ns > stamps_ns[-1]:
+    """Add images and sound, in one reading of the log."""
+    images, sound = _Images(stamps_ns[0], stamps_ns[-1]), _Sound(stamps_ns[0], stamps_ns[-1])
+    for stamp_ns, one in media:
+        if stamp_ns > stamps_ns[-1] + _WRITTEN_WITHIN_NS:
             break
-        if stamp_ns <= stamps_ns[0]:
-            kept, every, count = [], 1, 0
-        if count % every == 0:
-            kept.append((stamp_ns, f"data:image/{image.format};base64,{image.data}"))
-        count += 1
-        while len(kept) > MOST_IMAGES or sum(len(uri) for _, uri in kept) > MOST_CHARACTERS:
-            kept, every = kept[::2] if len(kept) > 1 else [], 2 * every
-    if len(kept) < count:
-        said = f"{len(kept)} of {count} images of the camera are shown, evenly spread over the time."
-        data["remarks"].append(f"{said} The option --between shows more of a part.")
-    if kept:
-        data["images"] = [{"t": round(seconds(stamp_ns), 3), "src": uri} for stamp_ns, uri in kept]
-        for stamp_ns, row in zip(stamps_ns, data["states"], strict=True):
-            row["image"] = bisect_right(kept, stamp_ns, key=lambda one: one[0]) - 1
+        if isinstance(one, CompressedImage):
+            images.take(stamp_ns, one)
+        else:
+            sound.take(stamp_ns, one)
+    images.add_to(data, stamps_ns)
+    sound.add_to(data)
 
 
-def _add_sound(data: PageData, first_ns: int, last_ns: int, sound: Iterable[tuple[int, RawAudio]]) -> None:
-    """Add the sound from the first snapshot on; where the log has none in between, it is silent."""
-    span_s, rate_hz, begun_ns, begun = min(seconds(last_ns - first_ns), MOST_SOUND_S), 0, 0, 0
-    samples = np.zeros(0, np.int16)
-    for stamp_ns, block in sound:
-        if seconds(stamp_ns - first_ns) > span_s:
-            break
-        got, rate = (block.format, block.number_of_channels, block.sample_rate), rate_hz or block.sample_rate
+@dataclass(slots=True)
+class _Images:
+    """Images from the last before the first snapshot on, thinned evenly to what a page holds."""
+
+    first_ns: int
+    last_ns: int
+    kept: list[tuple[int, str]] = field(default_factory=list)
+    every: int = 1
+    count: int = 0
+
+    def take(self, stamp_ns: int, image: CompressedImage) -> None:
+        if stamp_ns > self.last_ns:
+            return
+        if stamp_ns <= self.first_ns:
+            self.kept, self.every, self.count = [], 1, 0
+        if self.count % self.every == 0:
+            self.kept.append((stamp_ns, f"data:image/{image.format};base64,{image.data}"))
+        self.count += 1
+        while len(self.kept) > MOST_IMAGES or sum(len(uri) for _, uri in self.kept) > MOST_CHARACTERS:
+            self.kept, self.every = self.kept[::2] if len(self.kept) > 1 else [], 2 * self.every
+
+    def add_to(self, data: PageData, stamps_ns: Sequence[int]) -> None:
+        """Add the images, and to each snapshot the number of its own."""
+        kept = self.kept
+        if len(kept) < self.count:
+            said = f"{len(kept)} of {self.count} images of the camera are shown, evenly spread over the time."
+            data["remarks"].append(f"{said} The option --between shows more of a part.")
+        if kept:
+            data["images"] = [{"t": round(seconds(stamp_ns), 3), "src": uri} for stamp_ns, uri in kept]
+            for stamp_ns, row in zip(stamps_ns, data["states"], strict=True):
+                row["image"] = bisect_right(kept, stamp_ns, key=lambda one: one[0]) - 1
+
+
+@dataclass(slots=True)
+class _Sound:
+    """Sound from the first snapshot on; where the log has none in between, it is silent."""
+
+    first_ns: int
+    last_ns: int
+    rate_hz: int = 0
+    begun_ns: int = 0
+    samples: NDArray[np.int16] = field(default_factory=lambda: np.zeros(0, np.int16))
+
+    @property
+    def span_s(self) -> float:
+        """How much of it a page holds."""
+        return min(seconds(self.last_ns - self.first_ns), MOST_SOUND_S)
+
+    def take(self, stamp_ns: int, block: RawAudio) -> None:
+        if seconds(stamp_ns - self.first_ns) > self.span_s:
+            return
+        rate = self.rate_hz or block.sample_rate
+        got = block.format, block.number_of_channels, block.sample_rate
         if got != ("pcm-s16", 1, rate) or not 0 < rate <= _MOST_RATE_HZ:
             raise InvalidArgumentError(f"sound: expected pcm-s16 of one channel at one rate, got {got}")
-        if not rate_hz:
-            # The blocks after the first are placed by whole samples from it: rounding leaves no gap.
-            rate_hz, begun_ns, begun = rate, stamp_ns, round(seconds(stamp_ns - first_ns) * rate)
-            samples = np.zeros(round(span_s * rate), np.int16)
-        heard = base64.b64decode(block.data)
-        at = begun + round(seconds(stamp_ns - begun_ns) * rate_hz)
-        low, high = np.clip((at, at + len(heard) // 2), 0, len(samples))
-        samples[low:high] = np.frombuffer(heard, "<i2", len(heard) // 2)[low - at : high - at]
-    if not samples.any():
-        return
-    step = -(-rate_hz // HIGHEST_RATE_HZ)
-    if step > 1:
-        samples = np.clip(np.rint(signal.resample_poly(samples.astype(float), 1, step)), -32768, 32767)
-    file = io.BytesIO()
-    soundfile.write(file, samples.astype(np.int16), round(rate_hz / step), "PCM_16", format="WAV")
-    data["sound"] = "data:audio/wav;base64," + base64.b64encode(file.getvalue()).decode()
-    if seconds(last_ns - first_ns) > span_s:
-        said = f"The sound is that of the first {span_s:g} s. The option --between chooses another part."
-        data["remarks"].append(said)
+        if not self.rate_hz:
+            self.rate_hz, self.begun_ns = rate, stamp_ns
+            self.samples = np.zeros(round(self.span_s * rate), np.int16)
+        told = base64.b64decode(block.data)
+        heard = np.frombuffer(told, "<i2", len(told) // 2)
+        # The blocks after the first are placed by whole samples from it: rounding leaves no gap.
+        begun = round(seconds(self.begun_ns - self.first_ns) * rate)
+        at = begun + round(seconds(stamp_ns - self.begun_ns) * rate)
+        low, high = np.clip((at, at + len(heard)), 0, len(self.samples))
+        self.samples[low:high] = heard[low - at : high - at]
+
+    def add_to(self, data: PageData) -> None:
+        if not self.samples.any():
+            return
+        samples, step = self.samples, -(-self.rate_hz // HIGHEST_RATE_HZ)
+        if step > 1:
+            resampled = signal.resample_poly(samples.astype(float), 1, step)
+            samples = np.clip(np.rint(resampled), -32768, 32767).astype(np.int16)
+        file = io.BytesIO()
+        soundfile.write(file, samples, round(self.rate_hz / step), "PCM_16", format="WAV")
+        data["sound"] = "data:audio/wav;base64," + base64.b64encode(file.getvalue()).decode()
+        if seconds(self.last_ns - self.first_ns) > self.span_s:
+            said = f"The sound is that of the first {self.span_s:g} s."
+            data["remarks"].append(f"{said} The option --between chooses another part.")
 
 
 def _remarks(count: int, every: int, calibrated: int) -> list[str]:
