@@ -55,7 +55,9 @@ class Sector:
 
     @classmethod
     def between(cls, right_rad: float, left_rad: float) -> "Sector":
-        """Return the sector that runs from `right_rad` to the left until `left_rad`."""
+        """Return the sector that runs from `right_rad` to the left until `left_rad`, a full turn or less."""
+        if left_rad - right_rad >= 2.0 * math.pi:
+            return cls(0.0, math.pi)
         half = (left_rad - right_rad) % (2.0 * math.pi) / 2.0
         return cls(wrap_angle(right_rad + half), half)
 
