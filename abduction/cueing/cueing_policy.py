@@ -4,6 +4,7 @@ The threshold of a policy is set in `thresholds`, its map to risk in `risk_map`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -293,11 +294,14 @@ class CueingPolicies:
         InvalidArgumentError
             If the model was not calibrated for it; the message lists the budgets that it holds.
         """
-        for policy in self.policies:
-            if np.isclose(policy.alpha, alpha, rtol=1e-6) and np.isclose(policy.miss_rate, miss_rate):
-                return policy
-        held = ", ".join(sorted({f"{policy.alpha:g}" for policy in self.policies}))
-        raise InvalidArgumentError(f"alpha: expected a calibrated budget ({held}), got {alpha:g}")
+        held: Sequence[CueingPolicy] = self.policies
+        for name, wanted in (("alpha", alpha), ("miss_rate", miss_rate)):
+            found = [one for one in held if np.isclose(getattr(one, name), wanted, rtol=1e-6)]
+            if not found:
+                known = ", ".join(sorted({f"{getattr(one, name):g}" for one in held}))
+                raise InvalidArgumentError(f"{name}: expected a calibrated budget ({known}), got {wanted:g}")
+            held = found
+        return held[0]
 
 
 def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:

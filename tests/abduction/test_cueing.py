@@ -100,6 +100,8 @@ def test_policies_are_found_by_budget():
     assert policies.for_alpha(0.02, 1.0) is made[3]
     with pytest.raises(InvalidArgumentError, match=r"0\.01, 0\.02"):
         policies.for_alpha(0.03)
+    with pytest.raises(InvalidArgumentError, match=r"miss_rate: expected .* \(0, 1\), got 0\.5"):
+        policies.for_alpha(0.02, 0.5)
 
 
 @pytest.mark.parametrize(

@@ -179,5 +179,14 @@ def test_json_text_can_be_written_again_or_is_refused(key, value):
         json.dumps(decode_json(text, "car"), ensure_ascii=False).encode()
 
 
+@pytest.mark.parametrize("depth", [300, 700, 20_000])
+def test_lists_in_lists_are_refused_however_deep(depth):
+    deep = 1.0
+    for _ in range(depth):
+        deep = [deep]
+    with pytest.raises(InvalidArgumentError, match="weights: expected"):
+        decode(FloatArray, deep, "weights")
+
+
 def test_an_escaped_backslash_is_no_half_of_a_pair():
     assert decode_json(r'["C:\\ud800", "\ud83d\ude97"]', "car") == ["C:\\ud800", "\N{AUTOMOBILE}"]

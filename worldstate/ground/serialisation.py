@@ -176,6 +176,8 @@ def decode(hint: type[T], data: object, where: str) -> T:
         if error.schema:
             raise SchemaVersionError(place, error.problem) from error
         raise InvalidArgumentError(f"{place}: {error.problem}") from error
+    except RecursionError as error:
+        raise InvalidArgumentError(f"{where}: expected fewer lists within lists") from error
     return value
 
 
