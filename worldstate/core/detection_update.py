@@ -114,8 +114,9 @@ def _scan_look(scan: PositionScan) -> CountedLook:
         return CountedLook(scan.stamp_ns, scan.source)
     miss, half_rad = 1.0 - searched.detection_probability, searched.sector.half_width_rad
     answer = (Present if scan.positions else Absent)(miss, searched.clutter_rate)
-    ends_rad = (searched.sector.centre_rad - half_rad, searched.sector.centre_rad + half_rad)
-    return CountedLook(scan.stamp_ns, scan.source, answer, ends_rad)
+    centre_rad = searched.sector.centre_rad if half_rad < math.pi else 0.0  # A full turn has no end
+    right_rad, left_rad = (math.remainder(centre_rad + way * half_rad, math.tau) for way in (-1.0, 1.0))
+    return CountedLook(scan.stamp_ns, scan.source, answer, (right_rad, left_rad))
 
 
 def detection_update(
