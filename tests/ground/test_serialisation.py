@@ -54,8 +54,8 @@ class Everything:
     moving: bool
     answer: Literal["yes", "no"]
     looks: tuple[NotUsable | Bearing, ...]
-    pair: Annotated[tuple[str, int], Keys("source", "stamp_ns")]
-    stamps: tuple[Annotated[int | None, Keys("stamp_ns")], ...]
+    pair: Annotated[tuple[str, int], Keys(("source", "stamp_ns"))]
+    stamps: tuple[int | None, ...]
     vector: tuple[float, float] | None
     matrix: FloatArray
     ids: IntArray
