@@ -104,10 +104,10 @@ class SiteGeometry:
     @cached_property
     def _sight(self) -> Sector:
         """What all occluders leave free, by their own sides: those of the x axis turn with the ego."""
-        left = (one.edge_azimuth_rad for one in self.sides if one.outwards > 0.0)
-        right = (one.edge_azimuth_rad for one in self.sides if one.outwards < 0.0)
-        ends = max(right, default=-0.5 * math.pi), min(left, default=0.5 * math.pi)
-        return Sector.between(*ends)
+        ways = (-1.0, 1.0)
+        return Sector.in_sight(
+            *([k.edge_azimuth_rad for k in self.sides if k.outwards == way] for way in ways)
+        )
 
     @cached_property
     def expected(self) -> MotionBelief:
@@ -136,11 +136,12 @@ class SiteGeometry:
         look, answer = seen.look, seen.look.answer
         if look.sector_rad is None or isinstance(answer, Unqueried):
             return look
-        sight = self._sight
-        both = sight.overlap(self.view(look))
+        both = self._sight.overlap(self.view(look))
         # Rounding may take the overlap above the whole.
-        share = 0.0 if both is None else min(both.half_width_rad / sight.half_width_rad, 1.0)
-        found = any(one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings)
+        share = 0.0 if both is None else min(both.half_width_rad / self._sight.half_width_rad, 1.0)
+        found = any(
+            one.moving and self._sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings
+        )
         miss = share * answer.miss_rate + (1.0 - share)
         if not found:
             return replace(look, answer=Absent(miss, answer.clutter_rate))

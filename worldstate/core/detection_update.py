@@ -203,13 +203,9 @@ def _existence(tracks: Tracks, found: _Found, hits: FloatArray, scans: Sequence[
         missed = after_empty_look(r, 1.0 - detected)
         missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
         now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
-        ratio = ratio * _odds(now) / odds
+        now = np.minimum(np.maximum(now, _ROUNDING), 1.0 - _ROUNDING)
+        ratio = ratio * (now / (1.0 - now)) / odds
     return np.where(counts, ratio / (1.0 + ratio), before)
-
-
-def _odds(probabilities: FloatArray) -> FloatArray:
-    bounded = np.minimum(np.maximum(probabilities, _ROUNDING), 1.0 - _ROUNDING)
-    return np.asarray(bounded / (1.0 - bounded))
 
 
 def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
