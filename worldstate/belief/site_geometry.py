@@ -136,11 +136,12 @@ class SiteGeometry:
         look, answer = seen.look, seen.look.answer
         if look.sector_rad is None or isinstance(answer, Unqueried):
             return look
-        both = self._sight.overlap(self.view(look))
+        sight = self._sight
+        both = sight.overlap(self.view(look))
         # Rounding may take the overlap above the whole.
-        share = 0.0 if both is None else min(both.half_width_rad / self._sight.half_width_rad, 1.0)
+        share = 0.0 if both is None else min(both.half_width_rad / sight.half_width_rad, 1.0)
         found = any(
-            one.moving and self._sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings
+            one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings
         )
         miss = share * answer.miss_rate + (1.0 - share)
         if not found:

@@ -5,13 +5,15 @@ from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 from typing import ClassVar
 
-from worldstate.ground import InvalidArgumentError, in_range, named
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.checks import all_of, check_fields, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
 _LEAST_STD_RAD, _FASTEST_HZ = 1e-4, 100.0
 _AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (math.ulp(0.0), math.pi)
 _OCCLUDER = {
+    "id": str,
+    "direction": str,
     "edge_azimuth_rad": _AZIMUTHS_RAD,
     "hidden_azimuth_rad": _AZIMUTHS_RAD,
     "hidden_std_rad": _STDS_RAD,
@@ -156,8 +158,6 @@ class Occluder:
     crossing_m: float | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        named("id", self.id)
-        named("direction", self.direction)
         check_fields(self, **_OCCLUDER)
         if self.corner_m is not None:
             object.__setattr__(self, "corner_m", pair("corner_m", self.corner_m, _FARTHEST_M))
