@@ -140,9 +140,7 @@ class SiteGeometry:
         both = sight.overlap(self.view(look))
         # Rounding may take the overlap above the whole.
         share = 0.0 if both is None else min(both.half_width_rad / sight.half_width_rad, 1.0)
-        found = any(
-            one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings
-        )
+        found = any(one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings)
         miss = share * answer.miss_rate + (1.0 - share)
         if not found:
             return replace(look, answer=Absent(miss, answer.clutter_rate))
