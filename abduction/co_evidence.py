@@ -55,24 +55,23 @@ class Sector:
 
     @classmethod
     def between(cls, right_rad: float, left_rad: float) -> "Sector":
-        """Return the sector that runs from `right_rad` to the left until `left_rad`."""
+        """Return the sector that runs from `right_rad` to the left until `left_rad`, a full turn or less."""
+        if left_rad - right_rad >= 2.0 * math.pi:
+            return cls(0.0, math.pi)
         half = (left_rad - right_rad) % (2.0 * math.pi) / 2.0
         return cls(wrap_angle(right_rad + half), half)
 
     @classmethod
-    def in_sight(cls, edges_rad: Iterable[float]) -> "Sector":
+    def in_sight(cls, right_rad: Iterable[float], left_rad: Iterable[float]) -> "Sector":
         """Return the directions ahead that occluders with these edges leave free.
 
         Examples
         --------
-        >>> sector = Sector.in_sight([0.56, -0.56])
+        >>> sector = Sector.in_sight([-0.56], [0.56])
         >>> sector.touches(0.5), sector.touches(0.7)
         (True, False)
         """
-        edges = tuple(edges_rad)
-        left = min((edge for edge in edges if edge > 0), default=math.pi / 2)
-        right = max((edge for edge in edges if edge < 0), default=-math.pi / 2)
-        return cls.between(right, left)
+        return cls.between(max(right_rad, default=-math.pi / 2), min(left_rad, default=math.pi / 2))
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground import FloatArray, InvalidArgumentError, in_range
-from worldstate.ground.checks import all_of, check_shape, finite_array
+from worldstate.ground.checks import all_of, check_fields, check_shape, finite_array
 
 from .co_evidence import CoEvidence
 
@@ -60,7 +60,10 @@ class SideEvidence:
 
     def __post_init__(self) -> None:
         _check_each("log_ratios", self.log_ratios, self.directions)
-        _nats(log_ratios=self.log_ratios, visible=(self.visible,))
+        *ratios, visible = _nats(log_ratios=self.log_ratios, visible=(self.visible,))
+        object.__setattr__(self, "log_ratios", tuple(ratios))
+        object.__setattr__(self, "visible", visible)
+        check_fields(self, both=(0.0, 1.0), direct=(0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +112,7 @@ class SignatureEvidence:
             raise InvalidArgumentError(f"directions: expected different labels, got {labels!r}")
         _check_each("hidden", self.hidden, self.directions)
         *hidden, visible, none = _nats(hidden=self.hidden, visible=(self.visible,), none=(self.none,))
+        object.__setattr__(self, "directions", labels)
         # Whole numbers among them would make arrays that no likelihood can be added to.
         object.__setattr__(self, "hidden", tuple(hidden))
         object.__setattr__(self, "visible", visible)

@@ -38,6 +38,7 @@ SEEN_AS = {
 # Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
 # would take a wrong guess of the ear for a look at the right thing.
 _ASKED = 0.95
+_ROUNDING = 1e-6
 ClassShares: TypeAlias = tuple[tuple[str, float], ...]
 """Names of classes with their probabilities, sorted by name."""
 
@@ -57,6 +58,8 @@ def class_shares(name: str, value: object) -> ClassShares:
         label, share = one
         named(name, label)
         shares.append((label, in_range(name, share, 0.0, 1.0)))
+    if (total := sum(share for _, share in shares)) > 1.0 + _ROUNDING:
+        raise InvalidArgumentError(f"{name}: expected probabilities that sum to at most one, got {total:g}")
     return tuple(sorted(shares))
 
 
@@ -114,8 +117,8 @@ class RoadUserModel:
         """
         if self.shares is None:
             return self
-        moved = np.log(np.maximum(shares, np.finfo(float).tiny)) - np.log(self.shares)
-        return replace(self, biases=self.biases + moved, shares=shares)
+        now, before = (np.log(np.maximum(one, np.finfo(float).tiny)) for one in (shares, self.shares))
+        return replace(self, biases=self.biases + (now - before), shares=shares)
 
     def probabilities(self, measures: FloatArray) -> FloatArray:
         r"""Return the probability of every class, shape (n, classes).

@@ -247,7 +247,8 @@ def unoccluded_sector(context: Context) -> Sector:
     >>> bool(sector.touches(0.5)), bool(sector.touches(0.7))
     (True, False)
     """
-    return Sector.in_sight(occluder.edge_azimuth_rad for occluder in context.occluders)
+    edges_rad = [occluder.edge_azimuth_rad for occluder in context.occluders]
+    return Sector.in_sight([one for one in edges_rad if one < 0.0], [one for one in edges_rad if one > 0.0])
 
 
 def street_listener(

@@ -4,7 +4,8 @@ The threshold of a policy is set in `thresholds`, its map to risk in `risk_map`.
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -12,10 +13,10 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
+from worldstate.ground.values import SECONDS_PER_HOUR
 
 from .risk_map import PlattMap, RiskMap
 
-SECONDS_PER_HOUR = 3600.0
 # Odds of half a billion to one: beyond them a shift of the threshold means nothing.
 _EXTREME_LOGIT = 20.0
 # eta, the shift that one false alarm brings, and the bounds of the shift; downward it keeps quiet nights from
@@ -149,34 +150,6 @@ class AdaptiveThreshold:
 
 
 @dataclass(frozen=True, slots=True)
-class SustainedRule:
-    """State of the rule "in alarm while the statistic has held for k consecutive hops".
-
-    Examples
-    --------
-    >>> rule = SustainedRule(sustain_hops=2)
-    >>> rule.advance(True).alarm, rule.advance(True).advance(True).alarm
-    (False, True)
-    """
-
-    sustain_hops: int  # k >= 1; 1 alarms at any single window, as the published rule does with the argmax
-    run: int = 0  # Consecutive hops held so far, counted up to k
-
-    def __post_init__(self) -> None:
-        _check_sustain_hops(self.sustain_hops)
-
-    @property
-    def alarm(self) -> bool:
-        """Whether the last k hops all held."""
-        return self.run >= self.sustain_hops
-
-    def advance(self, held: bool) -> "SustainedRule":
-        """Return the state after one more hop."""
-        # `run' = min(run + 1, k)` if the hop held, else `run' = 0`.
-        return replace(self, run=min(self.run + 1, self.sustain_hops) if held else 0)
-
-
-@dataclass(frozen=True, slots=True)
 class CueingPolicy:
     """Numbers of one false-alarm budget, fixed on calibration data and applied unchanged.
 
@@ -245,10 +218,6 @@ class CueingPolicy:
         """
         return self.gamma if self.adaptive is None else self.adaptive.gamma(self.gamma, shift_nats)
 
-    def rule(self) -> SustainedRule:
-        """Return the sustained rule at its start."""
-        return SustainedRule(self.sustain_hops)
-
 
 @dataclass(frozen=True, slots=True)
 class CueingPolicies:
@@ -293,11 +262,14 @@ class CueingPolicies:
         InvalidArgumentError
             If the model was not calibrated for it; the message lists the budgets that it holds.
         """
-        for policy in self.policies:
-            if np.isclose(policy.alpha, alpha, rtol=1e-6) and np.isclose(policy.miss_rate, miss_rate):
-                return policy
-        held = ", ".join(sorted({f"{policy.alpha:g}" for policy in self.policies}))
-        raise InvalidArgumentError(f"alpha: expected a calibrated budget ({held}), got {alpha:g}")
+        held: Sequence[CueingPolicy] = self.policies
+        for name, wanted in (("alpha", alpha), ("miss_rate", miss_rate)):
+            found = [one for one in held if np.isclose(getattr(one, name), wanted, rtol=1e-6)]
+            if not found:
+                known = ", ".join(sorted({f"{getattr(one, name):g}" for one in held}))
+                raise InvalidArgumentError(f"{name}: expected a calibrated budget ({known}), got {wanted:g}")
+            held = found
+        return held[0]
 
 
 def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
@@ -322,7 +294,7 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
 
 
 def sustained_alarm(held: ArrayLike, sustain_hops: int) -> BoolArray:
-    """Return where the last k hops all held, shape (windows,): `SustainedRule` over a whole recording.
+    """Return where the last k hops all held, shape (windows,): the sustained rule over a whole recording.
 
     Shapes: held (windows,).
 

@@ -17,11 +17,8 @@ from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import IndexArray
 from worldstate.ground.values import RealT
 
-# As in the note's pseudocode; the tolerance is finer, for values are scaled to one first.
-_ITERATIONS = 100
-_SMALLEST_STEP = 1e-10
-_GRADIENT_TOLERANCE = 1e-6
-_RIDGE = 1e-12
+# Of the gradient, of values in units of the largest one.
+_GRADIENT_TOLERANCE = 1e-9
 
 
 def sigmoid(value: FloatArray, slope: ArrayLike, offset: ArrayLike) -> FloatArray:
@@ -54,30 +51,19 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
     target = np.where(label, (n_positive + 1) / (n_positive + 2), 1 / (n_negative + 2))
     # In units of the largest value, so that the tolerance means the same at every scale.
     unit = float(np.abs(decision).max()) or 1.0
-    slope, offset = _newton(decision / unit, target, np.log((n_negative + 1) / (n_positive + 1)))
+    design = np.stack([decision / unit, np.ones_like(decision)])
+
+    def loss(point: FloatArray) -> tuple[float, FloatArray]:
+        exponent = point @ design
+        off = np.logaddexp(0.0, exponent) - (1.0 - target) * exponent
+        return float(off.sum()), design @ (target - sigmoid(exponent, 1.0, 0.0))
+
+    # Imported where it is used: scipy.optimize takes longer than all else here.
+    from scipy.optimize import minimize
+
+    start, options = [0.0, np.log((n_negative + 1) / (n_positive + 1))], {"gtol": _GRADIENT_TOLERANCE}
+    slope, offset = minimize(loss, start, jac=True, method="BFGS", options=options).x.tolist()
     return slope / unit, offset
-
-
-def _newton(decision: FloatArray, target: FloatArray, offset: float) -> tuple[float, float]:
-    design, point = np.stack([decision, np.ones_like(decision)]), np.array([0.0, offset])
-
-    def loss(at: FloatArray) -> float:
-        exponent = at[0] * decision + at[1]
-        return float(np.sum(np.logaddexp(0.0, exponent) - (1.0 - target) * exponent))
-
-    for _ in range(_ITERATIONS):
-        probability = sigmoid(decision, point[0], point[1])
-        gradient = design @ (target - probability)
-        if np.abs(gradient).max() < _GRADIENT_TOLERANCE:
-            break
-        curvature = (design * (probability * (1.0 - probability))) @ design.T
-        step = -np.linalg.solve(curvature + _RIDGE * np.eye(2), gradient)
-        while loss(point + step) >= loss(point) + 1e-4 * float(gradient @ step):
-            step = step / 2.0
-            if np.abs(step).max() < _SMALLEST_STEP:
-                return float(point[0]), float(point[1])
-        point = point + step
-    return float(point[0]), float(point[1])
 
 
 # Where isotonic regression stops losing to two numbers: see `fit_risk_map`.

@@ -331,7 +331,7 @@ class HiddenState:
 
     Examples
     --------
-    >>> HiddenState("left", "motor_vehicle", ("car",), 0.5, 8.0, -3.0).labels
+    >>> HiddenState("left", "motor_vehicle", ("car",), 0.5, 8.0).labels
     ('car',)
     """
 
@@ -340,7 +340,6 @@ class HiddenState:
     labels: tuple[str, ...]  # What a camera would report of it
     azimuth_rad: float  # Most probable values, on the grid of the quadrature
     radial_speed_m_s: float
-    log_posterior: float  # Of the whole of it, among hidden states, nats
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +357,7 @@ class GroundedAnswer:
 
     Examples
     --------
-    >>> hidden = HiddenState("left", "motor_vehicle", ("car",), 0.5, 8.0, -3.0)
+    >>> hidden = HiddenState("left", "motor_vehicle", ("car",), 0.5, 8.0)
     >>> evidence = SignatureEvidence(("left", "right"), (1.2, -0.3), -0.5, 0.1)
     >>> GroundedAnswer(evidence, hidden, {"motor_vehicle": 1.0}).best.direction
     'left'
@@ -499,17 +498,13 @@ def _best(
     over_azimuth: FloatArray,
 ) -> HiddenState:
     """Return arg max of p(k, c, theta, v_r | y, hidden): its factors part, so each is taken by itself."""
-    sides = np.array(evidence.hidden) - np.logaddexp.reduce(evidence.hidden)
     entity, speed = divmod(int(over_speed.argmax()), over_speed.shape[1])
-    states = over_speed - np.logaddexp.reduce(over_speed, axis=None)
-    azimuths = over_azimuth - np.logaddexp.reduce(over_azimuth)
     return HiddenState(
-        direction=evidence.directions[int(sides.argmax())],
+        direction=evidence.directions[int(np.argmax(evidence.hidden))],
         entity_class=descriptors[entity].name,
         labels=descriptors[entity].labels,
         azimuth_rad=float(_AZIMUTHS_RAD[over_azimuth.argmax()]),
         radial_speed_m_s=float(_SPEEDS_M_S[speed]),
-        log_posterior=float(sides.max() + states.max() + azimuths.max()),
     )
 
 

@@ -43,11 +43,6 @@ def at_prior(posterior: FloatArray, share: FloatArray, prior: FloatArray) -> Flo
     return _normed(posterior * prior / share)
 
 
-def first_belief(posterior: FloatArray) -> SequenceBelief:
-    """Return the belief after the first posterior, at the context's prior, with nothing else said."""
-    return SequenceBelief(posterior, posterior)
-
-
 def next_belief(
     last: SequenceBelief,
     posterior: FloatArray | None,
@@ -62,7 +57,7 @@ def next_belief(
     --------
     >>> q = np.array([[0.3, 0.7]])
     >>> chain = np.array([[0.9, 0.1], [0.2, 0.8]])
-    >>> next_belief(first_belief(q), np.array([[0.6, 0.4]]), chain).belief
+    >>> next_belief(SequenceBelief(q, q), np.array([[0.6, 0.4]]), chain).belief
     array([[0.6, 0.4]])
     """
     predicted, carried = ((row[:, None] @ chain)[:, 0] for row in (last.belief, last.alone))

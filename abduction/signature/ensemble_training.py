@@ -303,10 +303,7 @@ def standardisation(inputs: FloatArray, weights: FloatArray | None = None) -> tu
     >>> standardisation(np.array([[1.0, 5.0], [3.0, 5.0]]))
     (array([2., 5.]), array([1., 1.]))
     """
-    if weights is None:
-        mean, deviation = inputs.mean(axis=0), inputs.std(axis=0)
-    else:
-        mean = np.average(inputs, axis=0, weights=weights)
-        deviation = np.sqrt(np.average((inputs - mean) ** 2, axis=0, weights=weights))
+    mean = np.average(inputs, axis=0, weights=weights)
+    deviation = np.sqrt(np.average((inputs - mean) ** 2, axis=0, weights=weights))
     # A column that never changes carries nothing; leave it as it is.
     return mean, np.where(deviation > 10 * np.finfo(float).eps, deviation, 1.0)

@@ -9,8 +9,6 @@ open. The first belongs to either side by a half, the second is as likely under 
 so that a direct sound moves no explanation against another: its side is that of its bearing.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -106,7 +104,10 @@ def explained(shares: FloatArray, classes: tuple[str, ...], prior: FloatArray) -
     array([[0.  , 0.75, 0.  , 0.25],
            [0.2 , 0.3 , 0.2 , 0.3 ]])
     """
-    return _Parts.of(shares, classes).explained(_Parts.of(prior[None], classes))
+    filled, (usual,) = (
+        four + 0.5 * both * _IS_SIDE for four, both, _ in (_six(shares, classes), _six(prior[None], classes))
+    )
+    return np.asarray(filled + _six(shares, classes)[2] * (usual / usual.sum()))
 
 
 def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> FloatArray:
@@ -125,7 +126,13 @@ def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatAr
     >>> side_ratios(window, WINDOW_CLASSES, np.full(6, 1 / 6)).round(2)
     array([[1.45, 1.45]])
     """
-    return _Parts.of(posteriors, classes).side_ratios(_Parts.of(prior[None], classes))
+    (four, both, direct), (known, known_both, known_direct) = (
+        _six(one, classes) for one in (posteriors, prior[None])
+    )
+    told = 1.0 - known_direct
+    sides = (four[:, [LEFT, RIGHT]] + both) / (known[:, [LEFT, RIGHT]] + known_both)
+    rest = four[:, [FRONT, NONE]] / known[:, [FRONT, NONE]] * told + direct
+    return np.asarray(np.log(sides * told + direct) - np.log(rest[:, :1] + rest[:, 1:]))
 
 
 def visible_ratios(posteriors: FloatArray, prior: FloatArray) -> FloatArray:
@@ -156,42 +163,17 @@ def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: Flo
     >>> sides.both, sides.direct, sides.log_ratios[0] > sides.log_ratios[1]
     (0.1, 0.1, True)
     """
-    seen, known = _Parts.of(posteriors, classes), _Parts.of(prior[None], classes)
-    ratios = explanation_ratios(seen.explained(known), known.explained(known)[0])[0]
-    left, right = seen.side_ratios(known)[0].tolist()
+    seen, known = (explained(one, classes, prior) for one in (posteriors, prior[None]))
+    left, right = side_ratios(posteriors, classes, prior)[0].tolist()
     visible = visible_ratios(posteriors, prior).item()
-    both, direct = seen.both.item(), seen.direct.item()
-    return evidence_of(ratios, SideEvidence(DIRECTIONS, (left, right), both, direct, visible))
+    _, both, direct = _six(posteriors, classes)
+    sides = SideEvidence(DIRECTIONS, (left, right), both.item(), direct.item(), visible)
+    return evidence_of(explanation_ratios(seen, known[0])[0], sides)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Parts:
-    """Posteriors or priors by class; zero where a model does not know one."""
-
-    four: FloatArray  # shape (n, 4): Of front, left, none, right
-    both: FloatArray  # shape (n, 1)
-    direct: FloatArray
-
-    @classmethod
-    def of(cls, shares: FloatArray, classes: tuple[str, ...]) -> "_Parts":
-        n_four, zero = len(CLASSES), np.zeros((len(shares), 1))
-        both, direct = (
-            shares[:, n_four + i : n_four + i + 1] if name in classes else zero
-            for i, name in ((0, BOTH), (int(BOTH in classes), DIRECT))
-        )
-        return cls(shares[:, :n_four], both, direct)
-
-    @property
-    def filled(self) -> FloatArray:
-        """The four, each side with half of what both have."""
-        return np.asarray(self.four + 0.5 * self.both * _IS_SIDE)
-
-    def explained(self, prior: "_Parts") -> FloatArray:
-        known = prior.filled
-        return np.asarray(self.filled + self.direct * (known / known.sum()))
-
-    def side_ratios(self, prior: "_Parts") -> FloatArray:
-        known = 1.0 - prior.direct
-        sides = (self.four[:, [LEFT, RIGHT]] + self.both) / (prior.four[:, [LEFT, RIGHT]] + prior.both)
-        rest = self.four[:, [FRONT, NONE]] / prior.four[:, [FRONT, NONE]] * known + self.direct
-        return np.asarray(np.log(sides * known + self.direct) - np.log(rest[:, :1] + rest[:, 1:]))
+def _six(shares: FloatArray, classes: tuple[str, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return shares of the four, of both and of direct; zero where a model does not know one."""
+    every = np.zeros((len(shares), len(WINDOW_CLASSES)))
+    every[:, [WINDOW_CLASSES.index(name) for name in classes]] = shares
+    four, both, direct = np.split(every, [len(CLASSES), len(CLASSES) + 1], axis=1)
+    return four, both, direct

@@ -19,7 +19,6 @@ from worldstate.abduction.cueing.cueing_policy import (
     AdaptiveBudget,
     AdaptiveThreshold,
     CueingPolicy,
-    SustainedRule,
     uncalibrated_policy,
 )
 from worldstate.abduction.evidence import SignatureEvidence
@@ -101,18 +100,19 @@ def test_while_the_street_is_not_believed_empty_nothing_is_learned():
 
 def drifting_street(budget, hours, drift_nats, seed):
     """False alarms in each hour of empty street whose log-odds drift upward, and the state."""
-    rng, rule, state, calibrated = np.random.default_rng(seed), SustainedRule(3), AdaptiveThreshold(), 0.93
+    rng, run, state, calibrated = np.random.default_rng(seed), 0, AdaptiveThreshold(), 0.93
     count = int(hours * 3600 / HOP_S)
     sound = lfilter([math.sqrt(1 - 0.9**2)], [1.0, -0.9], rng.normal(size=count)) * 1.0 - 1.0
     sound = sound + np.linspace(0.0, drift_nats, count)
     onsets, before = np.zeros(count, dtype=bool), False
     for i, score in enumerate((1.0 / (1.0 + np.exp(-sound))).tolist()):
         gamma = calibrated if budget is None else budget.gamma(calibrated, state.shift_nats)
-        rule = rule.advance(score >= gamma)
-        onsets[i], before = rule.alarm and not before, rule.alarm
+        run = run + 1 if score >= gamma else 0
+        alarm = run >= 3
+        onsets[i], before = alarm and not before, alarm
         if budget is not None:
-            none = 0.2 if rule.alarm else 0.8
-            state = state.advance(budget, visible=0.1, none=none, alarm=rule.alarm, elapsed_s=HOP_S)
+            none = 0.2 if alarm else 0.8
+            state = state.advance(budget, visible=0.1, none=none, alarm=alarm, elapsed_s=HOP_S)
     return onsets.reshape(hours, -1).sum(axis=1), state
 
 

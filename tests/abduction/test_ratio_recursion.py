@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.abduction.sequence.ratio_recursion import at_prior, balanced, first_belief, next_belief
+from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, balanced, next_belief
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -24,7 +24,7 @@ def test_with_a_posterior_of_the_same_chain_it_is_the_exact_filter_of_everything
         heard = heard @ chain * np.exp(emission) if belief else heard * np.exp(emission)
         heard = heard / heard.sum()
         if belief is None:
-            belief, exact = first_belief(heard[None]), heard
+            belief, exact = SequenceBelief(*[heard[None]] * 2), heard
             continue
         exact = exact @ chain * np.exp(emission + extra)
         exact = exact / exact.sum()
@@ -36,7 +36,7 @@ def test_with_a_posterior_of_the_same_chain_it_is_the_exact_filter_of_everything
 def test_alone_it_is_what_the_sequence_says_whatever_the_chain(seed: int) -> None:
     rng, chain, _ = _drawn(seed)
     said = rng.dirichlet(np.full(5, 0.3), (30, 2))
-    belief = first_belief(said[0])
+    belief = SequenceBelief(said[0], said[0])
     for one in said[1:]:
         belief = next_belief(belief, one, chain)
         np.testing.assert_allclose(belief.belief, one, rtol=1e-6, atol=1e-12)
@@ -48,7 +48,7 @@ def test_a_message_is_worth_its_nats_at_once_and_less_later(seed: int, nats: flo
     # Slow, as streets are: a message spoken now holds for seconds.
     slow = 0.95 * np.eye(2) + 0.05 * chain
     said = rng.dirichlet(np.ones(2) * 3.0, 25)[:, None]
-    belief, worth = first_belief(said[0]), []
+    belief, worth = SequenceBelief(said[0], said[0]), []
     for number, one in enumerate(said[1:]):
         belief = next_belief(belief, one, slow, np.array([[nats, 0.0]]) if number == 0 else 0.0)
         (p, _), (q, _) = belief.belief[0], one[0]
@@ -64,7 +64,7 @@ def test_without_sound_it_goes_back_to_what_the_context_expects(seed: int) -> No
     share = 0.9 * share + 0.02
     still = balanced(0.9 * chain + 0.02, share)
     np.testing.assert_allclose(share @ still, share, atol=1e-8)
-    belief = first_belief(np.eye(5)[:1] * 0.95 + 0.01)
+    belief = SequenceBelief(*[np.eye(5)[:1] * 0.95 + 0.01] * 2)
     for _ in range(1000):
         belief = next_belief(belief, None, still)
     np.testing.assert_allclose(belief.belief[0], share, atol=1e-4)

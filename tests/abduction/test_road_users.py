@@ -30,6 +30,13 @@ def test_probabilities_are_those_of_a_softmax_under_their_names(seed: int, measu
     assert dict(said) == pytest.approx(expected, abs=1e-12)
 
 
+def test_a_class_of_share_zero_may_be_there_again() -> None:
+    shares = np.array([0.5, 0.3, 0.2])
+    one = replace(model(), shares=shares)
+    again = one.with_shares(np.array([0.7, 0.0, 0.3])).with_shares(shares)
+    np.testing.assert_allclose(again.biases, one.biases, atol=1e-9)
+
+
 @given(st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3), st.floats(-5.0, 5.0), st.floats(0.05, 0.999))
 def test_no_smaller_set_reaches_the_mass_and_a_siren_takes_its_own(
     parts: list[float], log_odds: float, mass: float

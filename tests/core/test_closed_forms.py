@@ -12,7 +12,7 @@ from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvide
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.cueing.risk_map import PlattMap
-from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
+from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, next_belief
 from worldstate.abduction.sequence.sequence_chain import BEHIND, COMES, context_prior, states_of
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
@@ -175,7 +175,7 @@ def test_a_vehicle_comes_behind_another_as_often_as_prior_and_sound_have_one_in_
 
 def memory_of(groups: np.ndarray, **more) -> SequenceMemory:
     return SequenceMemory(
-        first_belief(states_of(groups, SHARE)), SHARE, 0.1, SequenceAlarm(0.0, 20.0), **more
+        SequenceBelief(*[states_of(groups, SHARE)] * 2), SHARE, 0.1, SequenceAlarm(0.0, 20.0), **more
     )
 
 

@@ -18,7 +18,7 @@ from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.belief.track import Tracks
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Look, Position, PositionScan, SearchedSector, Sector
-from worldstate.state import Event, Priors
+from worldstate.state import Event, Priors, Rates
 
 SEEDS = st.integers(0, 2**32 - 1)
 SILENT, UNASKED = NotUsable("not scripted"), Unqueried("no camera")
@@ -182,6 +182,31 @@ def test_a_scan_is_a_look_at_its_own_sector_and_a_message_at_none() -> None:
     ]
     assert world.state.valid_until_ns == 2 * 10**9 + 1
     assert [event.kind for event in world.state.events] == ["born"]
+
+
+def test_what_stands_behind_the_vehicle_has_azimuths_of_one_turn() -> None:
+    spread = ((0.1, 0.0), (0.0, 0.1))
+    for centre_rad, half_rad, y_m in ((math.pi, 0.5, 0.0), (math.pi, 0.5, 1e-9), (0.7, math.pi, -1e-9)):
+        scan = PositionScan("radar", 10**9, (Position((-10.0, y_m), spread),),
+                            SearchedSector(Sector(centre_rad, half_rad), 70.0, 0.9))  # fmt: skip
+        state = WorldFilter().update(scan).state
+        (one,), (view,) = state.entities, state.searched
+        azimuths = one.azimuth_rad, *(at for at, _ in (one.forecast or {}).values()), *view.sector_rad
+        assert all(-math.pi <= azimuth <= math.pi for azimuth in azimuths)
+        ends = Sector.between(*view.sector_rad)
+        assert ends.half_width_rad == pytest.approx(half_rad)
+        assert half_rad == math.pi or abs(ends.centre_rad) == pytest.approx(math.pi)
+
+
+def test_a_high_risk_without_sound_says_that_nothing_was_measured() -> None:
+    slow = Context(rates=Rates(emergence_hz=0.02, departure_hz=0.02))
+    heard = SignatureEvidence(("left", "right"), (8.0, 0.0), 0.0, 0.0)
+    sound = [Measurement(hop * 10**8, heard, UNASKED, SILENT, SILENT) for hop in range(1, 20)]
+    world = run(sound, WorldFilter(slow))[-1]
+    assert world.state.cues[0].advisory is not None
+    silent = world.predict(1.5).state.cues[0]
+    assert silent.advisory is None and silent.risk > 0.7
+    assert silent.not_advised == "nothing was measured for a second"
 
 
 @given(SEEDS, st.booleans())

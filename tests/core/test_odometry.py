@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -11,11 +12,18 @@ from hypothesis import strategies as st
 
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.adapters.files.odometry_file import read_odometry
+from worldstate.belief.association import reached_edge
+from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.kinematics.cartesian import EgoBelief, driven
+from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.track import born
 from worldstate.cli.main import main
+from worldstate.core.site_model import FilterModel, from_here, site_geometry_of
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.measurement import Position, PositionScan
+from worldstate.measurement import CameraLook, Look, Position, PositionScan
 from worldstate.measurement.odometry import EgoPose, Odometry
 from worldstate.state.context import corner_at, open_side
 
@@ -81,6 +89,38 @@ def test_an_edge_moves_as_the_ego_vehicle_does_and_is_less_sure_with_its_pose() 
     spread = math.sqrt(0.5**2 + 0.3**2) / math.hypot(5.0, 2.5)
     assert near[0].edge_std_rad == pytest.approx(math.hypot(spread, 0.02), rel=1e-3)
     assert near[0].hides and WorldFilter(CORNERS).state.context.occluders == CORNERS.occluders
+
+
+@pytest.mark.parametrize("yaw_rad", [0.9, -0.9])
+def test_a_turned_ego_vehicle_has_the_same_place_turned(yaw_rad: float) -> None:
+    """So far that both edges lie on one side of its x axis."""
+    model = FilterModel(CORNERS, uncalibrated_policy(), site_geometry_of(CORNERS, FilterSettings()))
+    ahead, turned = (
+        from_here(model, EgoBelief(np.array([0.0, 0.0, yaw]), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0)).site
+        for yaw in (0.0, yaw_rad)
+    )
+    azimuths, stds, way = np.linspace(-1.2, 1.2, 9), np.full(9, 0.05), np.tile([1.0, -1.0, 0.0], 3)
+    leaving = [site.past_edge(azimuths - by, stds, way) for site, by in ((ahead, 0.0), (turned, yaw_rad))]
+    assert leaving[1] == pytest.approx(leaving[0], abs=1e-9) and 0.1 < leaving[0].mean() < 0.5
+    coming = np.eye(9)[5]
+    for k in range(2):
+        here, there = (
+            hidden_motion(coming, 0.5, site.sides[k], site.sides[k].prior()) for site in (ahead, turned)
+        )
+        assert there.azimuth_rad + yaw_rad == pytest.approx(here.azimuth_rad, abs=1e-9)
+        near = []
+        for site, by in ((ahead, 0.0), (turned, yaw_rad)):
+            far = MotionBelief.around(
+                (math.copysign(1.1, 0.5 - k) - by, 0.0, 0.0, 3.0), (0.05, 0.1, 0.1, 0.6)
+            )
+            near.append(reached_edge(replace(born("left", 0, 0.9, 0, site), side=k, motion=far), site))
+        assert near[1] == pytest.approx(near[0], abs=1e-9) and near[0] < 0.5
+    for right_rad, left_rad in ((-0.6, 0.6), (0.2, 1.2), (-1.5, -0.2)):
+        miss = [
+            site.in_sight(CameraLook(Look("camera", 0, Absent(0.1), (right_rad - by, left_rad - by)))).answer
+            for site, by in ((ahead, 0.0), (turned, yaw_rad))
+        ]
+        assert miss[1].miss_rate == pytest.approx(miss[0].miss_rate, abs=1e-9)
 
 
 @pytest.mark.parametrize("context", [CORNERS, OPEN])

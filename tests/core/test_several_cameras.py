@@ -12,20 +12,23 @@ from hypothesis import strategies as st
 
 from worldstate import (
     Absent,
+    Bearing,
     Context,
     Measurement,
     NotUsable,
     Present,
     Sighting,
     SignatureEvidence,
+    Unqueried,
     WorldFilter,
 )
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement import Odometry, Position, PositionScan, SearchedSector, Sector
 from worldstate.measurement.measurement import CameraLook, Look
 from worldstate.state import blind_corner
+from worldstate.state.context import corner_at
 
 SILENT, EVEN = NotUsable("-"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 FRONT, LEFT, REAR = (-0.6, 0.6), (0.3, 1.5), (2.4, -2.4)
@@ -283,3 +286,106 @@ def numbers(state):
 
 def vars_of(priors):
     return priors.hidden, priors.visible, priors.none
+
+
+def test_a_look_all_round_searches_all_that_is_in_sight() -> None:
+    sound = Measurement(
+        10**9, EVEN, Absent(0.1, 0.01), SILENT, SILENT, sequence=reading(np.random.default_rng(1))
+    )
+    ahead, round_about = (
+        after(replace(sound, look=Look("camera", 10**9, Absent(0.1, 0.01), ends))).state
+        for ends in ((-1.5, 1.5), (-math.pi, math.pi))
+    )
+    assert round_about.searched[0].sector_rad == (-math.pi, math.pi)
+    assert numbers(round_about) == pytest.approx(numbers(ahead), abs=1e-12)
+    assert Sector.between(0.0, math.tau) == Sector.between(-math.pi, math.pi) == Sector(0.0, math.pi)
+
+
+@pytest.mark.parametrize("context, ends", [(Context(view_half_angle_rad=0.0), None), (Context(), (0.3, 0.3))])
+def test_a_look_at_nothing_says_nothing(context, ends) -> None:
+    look = Look("camera", 10**9, Absent(0.1, 0.01), ends)
+    state = (
+        WorldFilter(context).update(Measurement(10**9, EVEN, Unqueried("-"), SILENT, SILENT, look=look)).state
+    )
+    assert len(state.searched) == 1 and not state.entities
+
+
+def test_any_mirrored_world_of_cameras_radars_and_drives_has_the_mirrored_state() -> None:
+    for seed in (0, 2, 3):
+        rng = np.random.default_rng(seed)
+        world = reflection = WorldFilter(CORNERS)
+        for hop in range(30):
+            one = something(rng, 0.1 * hop + 0.1)
+            world, reflection = world.update(one), reflection.update(mirrored(one))
+            here, there = (published(one, sign) for one, sign in ((world.state, 1), (reflection.state, -1)))
+            assert there == pytest.approx(here, abs=2e-5), (seed, hop)
+
+
+CORNERS = Context(occluders=(corner_at("left", (8.0, 4.0), 12.0), corner_at("right", (8.0, -4.0), 12.0)))
+
+
+def something(rng, time_s):
+    """Return what a camera ahead and one to the left, a radar, a radio or odometry says of a busy street."""
+    stamp_ns, kind = round(time_s * 1e9), rng.random()
+    if kind < 0.1:
+        return Odometry("wheels", stamp_ns, float(rng.uniform(0.0, 2.0)), float(rng.normal(0.0, 0.3)))
+    if kind < 0.4:
+        places = [
+            (float(rng.uniform(3.0, 30.0)), float(rng.uniform(-25.0, 25.0))) for _ in range(rng.integers(3))
+        ]
+        exists = float(rng.uniform(0.5, 0.95))
+        found = tuple(Position(at, ((0.3, 0.1), (0.1, 0.4)), None, exists, (("car", 0.8),)) for at in places)
+        sector = SearchedSector(Sector(float(rng.uniform(-0.5, 0.5)), 0.8), 60.0, 0.9)
+        return (
+            PositionScan("radar", stamp_ns, found, sector)
+            if kind < 0.25
+            else PositionScan("v2x", stamp_ns, found)
+        )
+
+    def boxes(low, high):
+        return [Sighting(float(rng.uniform(low, high)), 0.03, str(rng.choice(["car", "truck"])), 0.9, 0.1)
+                for _ in range(rng.integers(3))]  # fmt: skip
+
+    looks = camera("front", time_s, FRONT, *boxes(-0.7, 0.7)), camera("left", time_s, LEFT, *boxes(0.3, 1.5))
+    left, right, visible, none = rng.normal(0.0, 2.0, 4).tolist()
+    said = SignatureEvidence(("left", "right"), (left, right), visible, none)
+    bearing = Bearing(float(rng.uniform(-1.5, 1.5)), 0.1)
+    return replace(measured(time_s, *looks), signature=said, bearing=bearing)
+
+
+def mirrored(one):
+    """The same world seen in a mirror."""
+    if isinstance(one, Odometry):
+        return replace(one, yaw_rate_rad_s=-one.yaw_rate_rad_s)
+    if isinstance(one, PositionScan):
+        places = tuple(replace(place, position_m=(place.position_m[0], -place.position_m[1]),
+                               covariance=((0.3, -0.1), (-0.1, 0.4))) for place in one.positions)  # fmt: skip
+        sector = one.searched and replace(one.searched.sector, centre_rad=-one.searched.sector.centre_rad)
+        return replace(one, positions=places, searched=one.searched and replace(one.searched, sector=sector))
+
+    def flipped(boxes):
+        return tuple(replace(box, azimuth_rad=-box.azimuth_rad) for box in boxes)
+
+    def turned(look):
+        right_rad, left_rad = look.sector_rad
+        return replace(look, sector_rad=(-left_rad, -right_rad))
+
+    return replace(
+        one,
+        signature=replace(one.signature, hidden=one.signature.hidden[::-1]),
+        bearing=replace(one.bearing, azimuth_rad=-one.bearing.azimuth_rad),
+        sightings=flipped(one.sightings),
+        look=turned(one.look),
+        further=tuple(CameraLook(turned(seen.look), flipped(seen.sightings)) for seen in one.further),
+    )
+
+
+def published(state, sign):
+    """Return what a state says of entities and sides, as one row, in a mirror if sign is -1."""
+    entities = sorted(
+        (one.existence_probability, one.hidden_probability, sign * one.azimuth_rad, one.azimuth_std_rad)
+        for one in state.entities
+    )
+    cues = sorted(state.cues, key=lambda cue: sign * cue.azimuth_rad)
+    sides = [(cue.risk, cue.advisory is not None, *vars_of(cue.hypotheses)) for cue in cues]
+    return [float(number) for row in (*entities, *sides) for number in row]

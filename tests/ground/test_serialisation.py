@@ -54,8 +54,8 @@ class Everything:
     moving: bool
     answer: Literal["yes", "no"]
     looks: tuple[NotUsable | Bearing, ...]
-    pair: Annotated[tuple[str, int], Keys("source", "stamp_ns")]
-    stamps: tuple[Annotated[int | None, Keys("stamp_ns")], ...]
+    pair: Annotated[tuple[str, int], Keys(("source", "stamp_ns"))]
+    stamps: tuple[int | None, ...]
     vector: tuple[float, float] | None
     matrix: FloatArray
     ids: IntArray
@@ -177,6 +177,15 @@ def test_json_text_can_be_written_again_or_is_refused(key, value):
                 decode_json(refused, "car")
     else:
         json.dumps(decode_json(text, "car"), ensure_ascii=False).encode()
+
+
+@pytest.mark.parametrize("depth", [300, 700, 20_000])
+def test_lists_in_lists_are_refused_however_deep(depth):
+    deep = 1.0
+    for _ in range(depth):
+        deep = [deep]
+    with pytest.raises(InvalidArgumentError, match="weights: expected"):
+        decode(FloatArray, deep, "weights")
 
 
 def test_an_escaped_backslash_is_no_half_of_a_pair():

@@ -38,7 +38,8 @@ from worldstate.measurement import (
     Sighting,
 )
 from worldstate.measurement.odometry import EgoPose
-from worldstate.state import WorldState
+from worldstate.state import Context, Occluder, Rates, WorldState, blind_corner
+from worldstate.state.context import corner_at
 
 RATE_HZ = 48_000
 CAR = Sighting(0.1, 0.02, "car", 0.9)
@@ -89,6 +90,7 @@ def test_a_hop_of_the_whole_chain_makes_at_most_forty_checks():
 CAMERA = Look("camera", 10**8, Absent(0.04), (-0.5, 0.5))
 RADAR = SearchedSector(Sector(0.0, 1.0), 50.0, 0.8)
 THERE = Position((10.0, 3.0), ((1.0, 0.0), (0.0, 1.0)), existence_probability=0.9, classes=(("car", 1.0),))
+CORNER = corner_at("left", (5.0, 3.0), 9.0)
 BUILT = [
     CAR,
     Bearing(0.3, 0.1),
@@ -103,6 +105,9 @@ BUILT = [
     PositionScan("radar", 10**8, (THERE,), RADAR),
     EgoPose((1.0, 2.0)),
     Odometry("wheels", 10**8, 5.0, pose=EgoPose((0.0, 0.0))),
+    CORNER,
+    Rates(),
+    Context(ego_speed_mps=5.0, degradation=0.1),
 ]
 WRONG = [
     *(None, object(), "text", 5, -1.0, 1e300, math.nan, math.inf, 10**400, 2**63, -(2**63), True),
@@ -129,6 +134,8 @@ def test_what_is_built_is_sound_or_its_field_is_named(whole):
             else:
                 if isinstance(built, Measurement | PositionScan | Odometry):
                     sound(built)
+                if isinstance(built, Occluder | Rates | Context):
+                    drives_past(built)
     assert refused > 10 * len(fields(whole))
 
 
@@ -164,6 +171,43 @@ def sound(built):
     world.state.to_json()
     copy = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict(), allow_nan=False)))
     assert copy.state == world.state
+
+
+def drives_past(built):
+    """Check that a filter of this place writes states that read, wherever the ego vehicle is."""
+    if isinstance(built, Occluder):
+        built = Context(occluders=(built, blind_corner("right", -1)))
+    world = WorldFilter(Context(rates=built) if isinstance(built, Rates) else built)
+    for hop, x_m in enumerate((-1e3, 0.0, 4.9, 8.95, 9.0, 9.05, 1e3)):
+        world = world.update(Odometry("wheels", (hop + 1) * 10**8, 5.0, pose=EgoPose((x_m, 0.0))))
+        assert WorldState.from_json(world.state.to_json()) == world.state
+
+
+def test_a_place_is_one_that_can_be_driven_past():
+    with pytest.raises(InvalidArgumentError, match="crossing_m: expected the lane beyond the corner"):
+        replace(CORNER, crossing_m=4.0)
+    with pytest.raises(InvalidArgumentError, match="degradation: expected a number in"):
+        Context(degradation=7.0)
+    single = Context(ego_speed_mps=np.float32(5.0), occluders=(replace(CORNER, pace_hz=np.float32(0.5)),))
+    assert single.occluders[0] == CORNER
+    assert WorldState.from_json(WorldState(0, 0, context=single).to_json()).context == single
+
+
+def test_classes_of_one_object_share_what_is_certain():
+    with pytest.raises(InvalidArgumentError, match=r"classes: .* sum to at most one, got 1\.8"):
+        replace(THERE, classes=(("car", 0.9), ("truck", 0.9)))
+    assert replace(THERE, classes=(("van", 0.6), ("car", 0.4))).classes == (("car", 0.4), ("van", 0.6))
+
+
+def test_directions_in_a_list_and_single_precision_are_taken_as_what_they_say():
+    sides = SideEvidence(("left", "right"), (np.float32(1.0), 0), np.float32(0.5), 0, np.float32(2.0))
+    told = SignatureEvidence(["left", "right"], [4.0, 0.0], 2.0, 0.0, sides)
+    plain = SideEvidence(("left", "right"), (1.0, 0.0), 0.5, 0.0, 2.0)
+    worlds = [WorldFilter().update(measured(1, signature=one)) for one in (told, replace(told, sides=plain))]
+    assert worlds[0].state == worlds[1].state
+    assert json.dumps(worlds[0].to_dict()) == json.dumps(worlds[1].to_dict())
+    with pytest.raises(InvalidArgumentError, match="direct: expected a finite number, got nan"):
+        replace(sides, direct=math.nan)
 
 
 def test_what_is_no_measurement_is_refused():

@@ -16,7 +16,7 @@ from smoothing_problem import (
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Approach, Bearing, Position
-from worldstate.smoothing import AngularHeight, FixedLagSmoother, Range, SmoothingSettings
+from worldstate.smoothing import AngularHeight, FixedLagSmoother, Range, SmoothedTrack, SmoothingSettings
 
 EXACT = SmoothingSettings(robust_k=1e4)
 
@@ -179,6 +179,15 @@ def test_first_sight_is_when_the_edge_was_passed(side):
         errors_s.append(first.time_s - 1e-9 * start - 1.8)
     assert np.abs(errors_s).max() < 0.2
     assert track.first_sight(side, 1.5 * side, 0.0) is None
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_one_that_overtakes_has_not_come_past_the_edge_of_the_other_side(side):
+    azimuths = [side * (math.pi - 0.2 * hop) for hop in range(15)]
+    passed = [MotionBelief.around((at, -2.0 * side, 0.0, 2.0), (0.03, 0.1, 0.1, 0.2)) for at in azimuths]
+    track = SmoothedTrack("car", np.arange(15) * HOP_NS, MotionBelief.stacked(passed))
+    assert track.first_sight(-side, -0.55 * side, 0.04) is None
+    assert track.first_sight(side, 0.55 * side, 0.04).time_s == pytest.approx(1.3, abs=0.01)
 
 
 def test_what_cannot_be_is_refused():

@@ -306,10 +306,9 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
     A vehicle believed seconds away from the edge is not the one that appears now.
     """
     side, near_rad = site.sides[track.side], EDGE_STD_RAD
-    outwards = math.copysign(1.0, side.edge_azimuth_rad)
 
     def near(azimuth_rad: float, std_rad: float) -> float:
-        far_rad = outwards * wrap_angle(azimuth_rad - side.edge_azimuth_rad)
+        far_rad = side.outwards * wrap_angle(azimuth_rad - side.edge_azimuth_rad)
         return normal_share((2.0 * near_rad - far_rad) / math.hypot(std_rad, near_rad))
 
     by_time = near(track.motion.azimuth_rad, track.motion.azimuth_std_rad)

@@ -97,7 +97,8 @@ def camera_scan(seen: CameraLook, view: Sector, weight: float) -> Scan:
     if not isinstance(answer, Unqueried):
         miss_rate, clutter_rate = min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or CLUTTER_RATE
     # Boxes that come without an answer were found without a stated miss rate.
-    found, log_new = 1.0 - (miss_rate or 0.0), math.log(UNHEARD / (2.0 * view.half_width_rad))
+    found, width_rad = 1.0 - (miss_rate or 0.0), 2.0 * max(view.half_width_rad, LEAST_STD)
+    log_new = math.log(UNHEARD / width_rad)
     boxes = sorted(seen.sightings, key=BY_ALL)
     rows = [(*_MEASURED(one), _FIRST_EXISTENCE, log_new, found) for one in boxes]
     detections = Detections.of(rows, tuple(((one.label, one.score),) for one in boxes))
@@ -184,7 +185,8 @@ def _near_pairs(boxes: Detections) -> list[tuple[int, int]]:
 
 def _joined(boxes: Detections, groups: Sequence[list[int]]) -> Detections:
     """Return one detection of every group of boxes."""
-    best = [max(group, key=lambda i: boxes.classes[i][0][1]) for group in groups]
+    # Of two scores alike the label decides: the order of azimuths would turn with a mirrored world.
+    best = [max(group, key=lambda i: boxes.classes[i][0][::-1]) for group in groups]
     azimuth, std, width, moving, existence, log_new, found = (one[best] for one in _COLUMNS(boxes))
     for at, group in enumerate(groups):
         if len(group) > 1:

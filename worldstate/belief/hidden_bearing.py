@@ -83,7 +83,8 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
 
     and stands half-way between edge and axis, give or take; what was heard of its approach rate is kept.
     """
-    (hidden_rad, hidden_std), in_view_rad = hidden_bearing(coming, side), 0.5 * side.edge_azimuth_rad
+    hidden_rad, hidden_std = hidden_bearing(coming, side)
+    in_view_rad = 0.5 * (side.edge_azimuth_rad - side.yaw_rad)
     azimuth_rad = share * hidden_rad + (1.0 - share) * in_view_rad
     # Mean and variance of the two together.
     apart = share * (1.0 - share) * (hidden_rad - in_view_rad) ** 2

@@ -98,8 +98,16 @@ class SiteGeometry:
 
     @cached_property
     def _edges(self) -> FloatArray:
-        edges = np.array([(one.edge_azimuth_rad, one.edge_std_rad) for one in self.sides])
+        edges = np.array([(one.edge_azimuth_rad, one.edge_std_rad, one.outwards) for one in self.sides])
         return edges.T[:, :, None]
+
+    @cached_property
+    def _sight(self) -> Sector:
+        """What all occluders leave free, by their own sides: those of the x axis turn with the ego."""
+        ways = (-1.0, 1.0)
+        return Sector.in_sight(
+            *([k.edge_azimuth_rad for k in self.sides if k.outwards == way] for way in ways)
+        )
 
     @cached_property
     def expected(self) -> MotionBelief:
@@ -108,9 +116,9 @@ class SiteGeometry:
 
     def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
         """Return the chances that azimuths lie past the edge on their way: 1 to the left, -1, 0 of none."""
-        edge_rad, edge_std = self._edges
+        edge_rad, edge_std, outwards = self._edges
         past = way * (azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
-        farthest = np.where(way * edge_rad > 0.0, past, -np.inf).max(axis=0)
+        farthest = np.where(way * outwards > 0.0, past, -np.inf).max(axis=0)
         return np.array([normal_share(one) for one in farthest.tolist()])
 
     def view(self, look: Look) -> Sector:
@@ -128,7 +136,7 @@ class SiteGeometry:
         look, answer = seen.look, seen.look.answer
         if look.sector_rad is None or isinstance(answer, Unqueried):
             return look
-        sight = Sector.in_sight(side.edge_azimuth_rad for side in self.sides)
+        sight = self._sight
         both = sight.overlap(self.view(look))
         # Rounding may take the overlap above the whole.
         share = 0.0 if both is None else min(both.half_width_rad / sight.half_width_rad, 1.0)

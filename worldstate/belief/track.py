@@ -42,7 +42,7 @@ NEVER_NS = np.iinfo(np.int64).min  # Of what was never seen
 
 
 NumbersT = TypeVar("NumbersT", float, FloatArray)  # Of one entity, or of each of many
-Label: TypeAlias = Annotated[tuple[str, float], Keys("label", "probability")]
+Label: TypeAlias = Annotated[tuple[str, float], Keys(("label", "probability"))]
 Objects: TypeAlias = NDArray[np.object_]
 
 
@@ -78,10 +78,6 @@ class Track:
     def of_side(self) -> int | None:
         """The side that its existence is read from: None, of any, where it is not known."""
         return None if self.side_shares and not self.detected else self.side
-
-    def may_be_on(self, side: int) -> bool:
-        """Tell whether it is, or may be, of a side."""
-        return self.side == side if self.of_side is not None else self.side_shares[side] > 0.0
 
     @property
     def detected(self) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground import InvalidArgumentError
-from worldstate.ground.serialisation import Keys, Via, written_as
+from worldstate.ground.serialisation import Keys, Via
 from worldstate.ground.typing import FloatArray
 
 from .side_belief import SideBelief
@@ -194,9 +194,9 @@ class WindowBelief:
     # Updating the belief of one window ago with the full likelihood makes ten interleaved filters of windows
     # that do not overlap, each of them exact.
 
-    now: AsLogs = field(metadata=written_as("log_explanations"))
+    now: AsLogs = field(metadata={"key": "log_explanations"})
     # Time stamps, ns, in order, and the posterior at each.
-    past: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
+    past: tuple[Annotated[tuple[int, AsLogs], Keys(("stamp_ns", "log_explanations"))], ...]
     heard: tuple[SourceEvidence, ...] = ()  # Most recent evidence of each source, sorted by its name
 
     @property

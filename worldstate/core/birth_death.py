@@ -290,8 +290,9 @@ def after_look(
     `emerged` is the chance that a detection was theirs, by the rows of those that were not seen before.
     """
     tracks = memory.tracks
-    # Of the side where it is: what was heard may have been believed on the other one.
-    handed_over = {int(tracks.side[i]): max(HANDOVER_RESIDUAL, 1.0 - chance) for i, chance in emerged.items()}
+    # Of the side where it is: what was heard may have been believed on the other one. Of two the likelier.
+    residuals = [(max(HANDOVER_RESIDUAL, 1.0 - chance), int(tracks.side[i])) for i, chance in emerged.items()]
+    handed_over = {side: residual for residual, side in sorted(residuals, reverse=True)}
     # First seen near an edge, it came past it unheard.
     unheard = set[int]()
     for i in range(known, len(tracks)):

@@ -160,14 +160,13 @@ class BudgetWatch:
 
     def after(self, hop: WatchedHop, onsets_per_hour: float) -> "BudgetWatch":
         """Return the watch one hop on."""
-        watch = self if hop.looked and self.watches(hop.stamp_ns) else self._interrupted(hop)
+        watch = self
+        if not (hop.looked and self.watches(hop.stamp_ns)):
+            since_ns = hop.stamp_ns if hop.looked else None
+            watch = replace(self, since_ns=since_ns, stamp_ns=hop.stamp_ns, pending_ns=(), bet=None)
         if watch.since_ns is not None:
             watch = watch._seen(hop)._judged(hop, onsets_per_hour)._betted(hop)
         return watch._noted(hop)
-
-    def _interrupted(self, hop: WatchedHop) -> "BudgetWatch":
-        since_ns = hop.stamp_ns if hop.looked else None
-        return replace(self, since_ns=since_ns, stamp_ns=hop.stamp_ns, pending_ns=(), bet=None)
 
     def _seen(self, hop: WatchedHop) -> "BudgetWatch":
         """Return the watch after the vehicles that have come into view since the last hop."""

@@ -154,13 +154,15 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
     """Return why a side of high risk has no advisory; None where its risk is below .7."""
     if sides.risks[side] <= _HIGH_RISK:
         return None
-    sequence = memory.sequence
+    sequence, silent = memory.sequence, "nothing was measured for a second"
     if memory.last.no_sequence == TOO_FEW:
         return "less than a second of sound: no alarm is raised yet"
     if sequence is None or sequence.alarm is None:
+        if all(_news_ends_ns(one) < memory.stamp_ns for one in memory.rules.values()):
+            return silent
         return f"the statistic has not stayed above its threshold for {model.policy.sustain_hops} hops"
     if not sequence.has_news(memory.stamp_ns):
-        return "nothing was measured for a second"
+        return silent
     log_odds = list(sequence.log_odds(model.context).values())
     learned, threshold = sequence.read_nats(model.context)[side], sequence.threshold_nats
     if log_odds[-1][side] < threshold <= log_odds[-1][side] + learned:

@@ -114,8 +114,9 @@ def _scan_look(scan: PositionScan) -> CountedLook:
         return CountedLook(scan.stamp_ns, scan.source)
     miss, half_rad = 1.0 - searched.detection_probability, searched.sector.half_width_rad
     answer = (Present if scan.positions else Absent)(miss, searched.clutter_rate)
-    ends_rad = (searched.sector.centre_rad - half_rad, searched.sector.centre_rad + half_rad)
-    return CountedLook(scan.stamp_ns, scan.source, answer, ends_rad)
+    centre_rad = searched.sector.centre_rad if half_rad < math.pi else 0.0  # A full turn has no end
+    right_rad, left_rad = (math.remainder(centre_rad + way * half_rad, math.tau) for way in (-1.0, 1.0))
+    return CountedLook(scan.stamp_ns, scan.source, answer, (right_rad, left_rad))
 
 
 def detection_update(
@@ -202,13 +203,9 @@ def _existence(tracks: Tracks, found: _Found, hits: FloatArray, scans: Sequence[
         missed = after_empty_look(r, 1.0 - detected)
         missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
         now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
-        ratio = ratio * _odds(now) / odds
+        now = np.minimum(np.maximum(now, _ROUNDING), 1.0 - _ROUNDING)
+        ratio = ratio * (now / (1.0 - now)) / odds
     return np.where(counts, ratio / (1.0 + ratio), before)
-
-
-def _odds(probabilities: FloatArray) -> FloatArray:
-    bounded = np.minimum(np.maximum(probabilities, _ROUNDING), 1.0 - _ROUNDING)
-    return np.asarray(bounded / (1.0 - bounded))
 
 
 def _searched(tracks: Tracks, scan: Scan) -> FloatArray:

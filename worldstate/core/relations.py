@@ -67,9 +67,9 @@ def _edges(track: Track, share: float, memory: Memory, context: Context) -> Iter
     """Yield the relations of one entity to its occluder and to the ego vehicle."""
     occluder, stamp_ns = context.occluders[track.side].id, memory.stamp_ns
     if not track.seen:
-        for k, one in enumerate(context.occluders):
-            hidden = share * side_weights(track, len(context.occluders))[k]
-            if track.may_be_on(k):
+        for k, weight in enumerate(side_weights(track, len(context.occluders))):
+            if weight > 0.0:
+                one, hidden = context.occluders[k], share * weight
                 comes = hidden * _comes(track, k, memory)
                 yield Relation(track.id, one.id, "occluded_by", hidden, stamp_ns)
                 yield Relation(track.id, one.id, "approaching_from", comes, stamp_ns)
@@ -118,7 +118,9 @@ def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterat
     farness = np.where(near, along + _BESIDE * beside, np.inf)[:-1]
     for b in np.flatnonzero(np.isfinite(farness).any(axis=0)).tolist():
         a = int(np.argmin(farness[:, b]))
-        lane = _within(float(across[a, b]), _HALF_LANE_M, math.sqrt(across_var[a, b]))
+        aside, std_m = float(across[a, b]), math.sqrt(across_var[a, b])
+        left, right = (normal_share((end_m - aside) / std_m) for end_m in (_HALF_LANE_M, -_HALF_LANE_M))
+        lane = left - right
         ahead = lane * normal_share(float(along[a, b]) / math.sqrt(along_var[a, b]))
         for kind, chance in (("same_lane", lane), ("in_front_of", ahead)):
             if chance >= _LEAST:
@@ -127,10 +129,6 @@ def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterat
         chance = _crosses(track, context.ego_speed_mps or 0.0)
         if chance >= _LEAST:
             yield Relation(track.id, EGO, "conflicts_with_ego_path", chance, stamp_ns)
-
-
-def _within(mean: float, half: float, std: float) -> float:
-    return normal_share((half - mean) / std) - normal_share((-half - mean) / std)
 
 
 def _crosses(track: Track, ego_speed_mps: float) -> float:

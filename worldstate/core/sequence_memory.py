@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from worldstate.abduction.co_evidence import MOSTLY_MISSED, Unqueried
-from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
+from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, next_belief
 from worldstate.abduction.sequence.sequence_chain import (
     BEHIND,
     COMES,
@@ -420,8 +420,10 @@ def informed(
     said = None
     if isinstance(reading, SequenceReading):
         if kept is None:
-            first = first_belief(states_of(reading.groups, reading.share))
-            kept = SequenceMemory(first, reading.share, reading.margin_s, reading.alarm)
+            first = states_of(reading.groups, reading.share)
+            kept = SequenceMemory(
+                SequenceBelief(first, first), reading.share, reading.margin_s, reading.alarm
+            )
         kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
         expected = kept.prior(context, kept.read_nats(context))
         said = states_of(at_prior(reading.groups, reading.share, expected), reading.share)

@@ -60,10 +60,9 @@ def forecasts(tracks: Tracks) -> list[Forecast]:
     azimuth_rad = theta + np.arctan2(b, a)
     azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
     # Full precision would take twice as long to write.
-    rows = np.stack([azimuth_rad, np.sqrt(variance)], axis=-1)
+    rows = np.stack([np.clip(azimuth_rad.round(6), -np.pi, np.pi), np.sqrt(variance).round(6)], axis=-1)
     return [
-        {_SOONER: (mean, std), _LATER: (then, then_std)}
-        for (mean, std), (then, then_std) in rows.round(6).tolist()
+        {_SOONER: (mean, std), _LATER: (then, then_std)} for (mean, std), (then, then_std) in rows.tolist()
     ]
 
 
@@ -101,7 +100,9 @@ def _entity(
     heard_only = hidden and track.place is None
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
     closing_hz = -mean[RADIAL_RATE] if track.approach_heard else None
-    azimuth_rad, std_rad, source = mean[AZIMUTH], std[AZIMUTH], _azimuth_source(track, track.motion, site)
+    # Rounded up, what stands right behind would be beyond a half turn.
+    azimuth_rad, std_rad = min(max(mean[AZIMUTH], -math.pi), math.pi), std[AZIMUTH]
+    source = _azimuth_source(track, track.motion, site)
     if heard_only:
         azimuth_rad, std_rad, source = hidden_azimuth(track.side, track, memory.sequence, site)
     return Entity(

@@ -80,18 +80,15 @@ class Check:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keys:
-    """An annotation: a fixed tuple is written as an object with these keys, a single value with one key.
+    """An annotation: a fixed tuple is written as an object with these keys.
 
     Examples
     --------
-    >>> decode(Annotated[tuple[str, float], Keys("label", "score")], {"label": "car", "score": 1}, "box")
+    >>> decode(Annotated[tuple[str, float], Keys(("label", "score"))], {"label": "car", "score": 1}, "box")
     ('car', 1.0)
     """
 
     names: tuple[str, ...]
-
-    def __init__(self, *names: str) -> None:
-        object.__setattr__(self, "names", names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,13 +112,9 @@ Count: TypeAlias = Annotated[int, Check("a count", lambda value: value >= 0, {"m
 
 # Metadata of a field: files of an earlier minor version do not hold it, and then its default stands.
 ADDED = {"added": True}
-# Metadata of a field: the keys of its dataclass stand among those of the one that holds it.
+# Metadata of a field: the keys of its dataclass stand among those of the one that holds it. A field with the
+# metadata "key" is written under that in place of its own name.
 FLAT = {"flat": True}
-
-
-def written_as(key: str) -> dict[str, str]:
-    """Return the metadata of a field that is written under another name than its own."""
-    return {"key": key}
 
 
 class _RefusedError(Exception):
@@ -176,6 +169,8 @@ def decode(hint: type[T], data: object, where: str) -> T:
         if error.schema:
             raise SchemaVersionError(place, error.problem) from error
         raise InvalidArgumentError(f"{place}: {error.problem}") from error
+    except RecursionError as error:
+        raise InvalidArgumentError(f"{where}: expected fewer lists within lists") from error
     return value
 
 
@@ -238,8 +233,7 @@ def _annotated(hint: Hint, notes: tuple[object, ...]) -> Plan:
         note, (write, read) = notes[0], _plan(notes[0].hint)
         return lambda value: write(note.write(value)), _then(read, note.read)
     if isinstance(notes[0], Keys):
-        names = notes[0].names
-        return _keyed(names, get_args(hint) if len(names) > 1 else (hint,))
+        return _keyed(notes[0].names, get_args(hint))
     write, read = _plan(hint)
     return write, _checked(read, notes[0]) if isinstance(notes[0], Check) else read
 
@@ -272,18 +266,15 @@ def _checked(read: Read, check: Check) -> Read:
 
 
 def _keyed(names: tuple[str, ...], hints: tuple[Hint, ...]) -> Plan:
-    """Return the plan of a fixed tuple, or a single value, that is written as an object."""
-    plans = [_plan(hint) for hint in hints]
-    single = len(names) == 1
+    """Return the plan of a fixed tuple that is written as an object."""
+    plans = dict(zip(names, map(_plan, hints), strict=True))
 
-    def write(value: Any) -> dict[str, Any]:
-        parts = (value,) if single else value
-        return {name: plan[0](part) for name, part, plan in zip(names, parts, plans, strict=True)}
+    def write(parts: Any) -> dict[str, Any]:
+        return {name: plan[0](part) for (name, plan), part in zip(plans.items(), parts, strict=True)}
 
-    def read(data: object) -> Any:
+    def read(data: object) -> tuple[Any, ...]:
         entries = _object(data)
-        parts = tuple(_entry(entries, name, plan[1]) for name, plan in zip(names, plans, strict=True))
-        return parts[0] if single else parts
+        return tuple(_entry(entries, name, plan[1]) for name, plan in plans.items())
 
     return write, read
 

@@ -10,10 +10,9 @@ the bearing. No loss is robust, and no height is shared by the boxes of a pass.
 """
 
 import math
-from bisect import bisect_left, insort
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, pairwise
 from typing import Any
 
 import numpy as np
@@ -54,33 +53,25 @@ class FactorGraph:
         self._clear()
 
     def _clear(self) -> None:
-        self._factors: list[Factor] = []
+        self.factors: list[Factor] = []
+        self.times: dict[int, float] = {}  # Until a lag after which variables are kept
         self._values: dict[int, FloatArray] = {}
-        self._times: dict[int, float] = {}
-
-    def add(self, factor: Factor) -> None:
-        """Add a factor at the next update."""
-        self._factors.append(factor)
 
     def add_variable(self, key: int, value: FloatArray, time_s: float) -> None:
         """Add a variable at the next update."""
-        self._values[key], self._times[key] = value, time_s
-
-    def keep(self, key: int, time_s: float) -> None:
-        """Keep a variable for another lag."""
-        self._times[key] = time_s
+        self._values[key], self.times[key] = value, time_s
 
     def update(self) -> None:
         """Take in what has been added."""
         import gtsam
 
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for factor in self._factors:
+        for factor in self.factors:
             graph.push_back(factor)
         for key, value in self._values.items():
             values.insert(key, value)
         self._updates += 1
-        self._smoother.update(graph, values, self._times)
+        self._smoother.update(graph, values, self.times)
         # One estimate costs as much as all, a quarter of an update: in between, what variables began with is
         # near enough to begin the next ones with.
         self._near = {} if self._updates % self._every == 0 else self._near | self._values
@@ -130,11 +121,16 @@ _BLOCK_NS = 1_000_000_000
 
 @dataclass(slots=True)
 class _Entity:
-    """The states of an entity within the lag, in order."""
+    """The states of an entity within the lag."""
 
-    stamps_ns: list[int] = field(default_factory=list)
-    keys: dict[int, int] = field(default_factory=dict)  # By stamp
+    # By stamp, in order: a late one has no state of its own.
+    keys: dict[int, int] = field(default_factory=dict)
     height_key: int | None = None  # Once its height is a variable
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of its last state."""
+        return next(reversed(self.keys))
 
 
 class FixedLagSmoother:
@@ -209,7 +205,7 @@ class FixedLagSmoother:
         self._start(stamp_ns)
         one = self._entities[entity] = _Entity()
         key = self._add_state(one, stamp_ns, belief.mean)
-        self._graph.add(f.prior_factor(key, belief.mean, belief.covariance))
+        self._graph.factors.append(f.prior_factor(key, belief.mean, belief.covariance))
 
     def update(self, stamp_ns: int, observations: Mapping[str, Sequence[obs.Observation]]) -> None:
         """Take in what was observed at one instant, of any number of entities.
@@ -258,9 +254,9 @@ class FixedLagSmoother:
         one = self._entities.get(entity)
         if one is None:
             raise InvalidArgumentError(f"entity: expected one of {self.entities}, got {entity!r:.40}")
-        mean, covariance = self._graph.refined([one.keys[stamp] for stamp in one.stamps_ns])
+        mean, covariance = self._graph.refined([*one.keys.values()])
         belief = MotionBelief(mean, 0.5 * (covariance + covariance.mT))
-        return obs.SmoothedTrack(entity, np.array(one.stamps_ns, np.int64), belief)
+        return obs.SmoothedTrack(entity, np.array([*one.keys], np.int64), belief)
 
     def _start(self, stamp_ns: int) -> None:
         if self._origin_ns is None:
@@ -279,7 +275,6 @@ class FixedLagSmoother:
         # Of an entity and a stamp: keys may not come again within the lag, and stamps are too long for one.
         key = next(self._numbers)
         one.keys[stamp_ns] = key
-        insort(one.stamps_ns, stamp_ns)
         self._graph.add_variable(key, state, self._time_s(stamp_ns))
         return key
 
@@ -287,11 +282,11 @@ class FixedLagSmoother:
         one = self._entities.get(entity)
         if one is None:
             one = self._first(entity, stamp_ns, every)
-        elif stamp_ns > one.stamps_ns[-1]:
+        elif stamp_ns > one.last_ns:
             self._go_on(one, stamp_ns)
         node = self._node(one, stamp_ns)
         for said in every:
-            self._graph.add(self._factor(one, node, said))
+            self._graph.factors.append(self._factor(one, node, said))
 
     def _first(self, entity: str, stamp_ns: int, every: Sequence[obs.Observation]) -> _Entity:
         """Begin an entity where it is first observed, with a prior that is wide in all else."""
@@ -308,26 +303,25 @@ class FixedLagSmoother:
         prior = np.array([state[0], 0.0, 0.0, math.log(_START_M)])
         key = self._add_state(one, stamp_ns, state)
         spread = np.diag(np.square([*_START_STD]))
-        self._graph.add(f.prior_factor(key, prior, spread))
+        self._graph.factors.append(f.prior_factor(key, prior, spread))
         return one
 
     def _go_on(self, one: _Entity, stamp_ns: int) -> None:
         """Add the next state of an entity, reached at constant velocity."""
-        last_ns = one.stamps_ns[-1]
+        last_ns = one.last_ns
         key, step_s = one.keys[last_ns], seconds(stamp_ns - last_ns)
         before = f.Node(key, self._graph.value(key))
         state = obs.moved(before.state, step_s)
         after = f.Node(self._add_state(one, stamp_ns, state), state)
-        self._graph.add(f.motion_factor(before, after, step_s, f.motion_noise(self.settings, step_s)))
+        self._graph.factors.append(
+            f.motion_factor(before, after, step_s, f.motion_noise(self.settings, step_s))
+        )
 
     def _node(self, one: _Entity, stamp_ns: int) -> f.Node:
         """Return the state nearest to a stamp."""
         # A state in between would need the motion between its neighbours taken out of the graph. Over half a
         # hop white acceleration moves no vehicle by more than a centimetre.
-        nearest = one.stamps_ns[min(bisect_left(one.stamps_ns, stamp_ns), len(one.stamps_ns) - 1)]
-        before = one.stamps_ns[max(bisect_left(one.stamps_ns, stamp_ns) - 1, 0)]
-        if abs(stamp_ns - before) < abs(nearest - stamp_ns):
-            nearest = before
+        nearest = min(one.keys, key=lambda ns: (abs(ns - stamp_ns), -ns))
         key = one.keys[nearest]
         return f.Node(key, self._graph.value(key), seconds(stamp_ns - nearest))
 
@@ -349,22 +343,23 @@ class FixedLagSmoother:
         if one.height_key is None:
             one.height_key, start = next(self._numbers), np.array([math.log(said.true_height_m)])
             self._graph.add_variable(one.height_key, start, self._time_s(self._now_ns))
-            self._graph.add(f.prior_factor(one.height_key, start, np.array([[said.true_relative_std**2]])))
+            self._graph.factors.append(
+                f.prior_factor(one.height_key, start, np.array([[said.true_relative_std**2]]))
+            )
         return one.height_key
 
     def _keep_heights(self) -> None:
         # A height that outlives the states of its entity is refused by gtsam when its turn comes.
         for one in self._entities.values():
             if one.height_key is not None:
-                self._graph.keep(one.height_key, self._time_s(one.stamps_ns[-1]))
+                self._graph.times[one.height_key] = self._time_s(one.last_ns)  # For another lag
 
     def _forget(self) -> None:
         """Forget states that gtsam has marginalised."""
         oldest_s = self._oldest_s
         for name, one in list(self._entities.items()):
-            while one.stamps_ns and self._time_s(one.stamps_ns[0]) < oldest_s:
-                del one.keys[one.stamps_ns.pop(0)]
-            if not one.stamps_ns:
+            one.keys = {ns: key for ns, key in one.keys.items() if self._time_s(ns) >= oldest_s}
+            if not one.keys:
                 del self._entities[name]
 
 
@@ -395,18 +390,13 @@ def rts_track(
     stamps_ns = sorted(observed)
     mean, slope = obs.cartesian(start.mean)
     kalman.x, kalman.P, kalman.H = mean, slope @ start.covariance @ slope.T, np.eye(2, 4)
-    means, covariances, flows, noises = [], [], [], []
-    for before_ns, stamp_ns in zip([stamps_ns[0], *stamps_ns], stamps_ns, strict=False):
-        flow, unit = constant_velocity(seconds(stamp_ns - before_ns))
-        kalman.predict(F=flow, Q=_ACCELERATION_PSD * unit)
-        place = _placed(observed[stamp_ns])
-        if place is not None:
-            kalman.update(place[0], R=place[1])
-        means.append(kalman.x.copy())
-        covariances.append(kalman.P.copy())
-        flows.append(flow)
-        noises.append(_ACCELERATION_PSD * unit)
-    means, covariances, _, _ = kalman.rts_smoother(np.array(means), np.array(covariances), flows, noises)
+    steps = pairwise([stamps_ns[0], *stamps_ns])
+    flows, units = zip(*(constant_velocity(seconds(after - before)) for before, after in steps), strict=True)
+    noises = [_ACCELERATION_PSD * unit for unit in units]
+    places = [_placed(observed[stamp_ns]) or (None, np.eye(2)) for stamp_ns in stamps_ns]
+    measured, spreads = zip(*places, strict=True)
+    means, covariances, _, _ = kalman.batch_filter(measured, Fs=flows, Qs=noises, Rs=spreads)
+    means, covariances, _, _ = kalman.rts_smoother(means, covariances, flows, noises)
     motion = polar_motion(CartesianBelief(means, covariances), 0.0)
     return obs.SmoothedTrack(entity, np.array(stamps_ns, np.int64), motion, "RTS smoother")
 

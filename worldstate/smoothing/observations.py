@@ -252,7 +252,9 @@ class SmoothedTrack:
         (0.5, 0.1)
         """
         beyond = side * wrap_angle(self.motion.mean[:, AZIMUTH] - edge_rad)
-        crossed = np.flatnonzero((beyond[:-1] > 0.0) & (beyond[1:] <= 0.0))
+        # From behind the ego vehicle azimuths beyond the edge go on at the other end of the turn.
+        ahead = beyond[:-1] - beyond[1:] < math.pi
+        crossed = np.flatnonzero((beyond[:-1] > 0.0) & (beyond[1:] <= 0.0) & ahead)
         if not crossed.size:
             return None
         before, after = int(crossed[-1]), int(crossed[-1]) + 1

@@ -6,9 +6,23 @@ from operator import attrgetter
 from typing import ClassVar
 
 from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.checks import all_of, check_fields, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
-_LEAST_STD_RAD, _FASTEST_HZ, _FASTEST_EGO_MPS = 1e-4, 100.0, 100.0
+_LEAST_STD_RAD, _FASTEST_HZ = 1e-4, 100.0
+_AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (math.ulp(0.0), math.pi)
+_OCCLUDER = {
+    "id": str,
+    "direction": str,
+    "edge_azimuth_rad": _AZIMUTHS_RAD,
+    "hidden_azimuth_rad": _AZIMUTHS_RAD,
+    "hidden_std_rad": _STDS_RAD,
+    "edge_std_rad": _STDS_RAD,
+    "pace_hz": (math.ulp(0.0), _FASTEST_HZ),
+    "assumed": bool,
+    "hides": bool,
+}
+_FARTHEST_M, _MOST_SIDES = 1e6, 64
 _PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: a vehicle that comes past it is in view
 
 
@@ -53,8 +67,7 @@ class Rates:
     visible_departure_hz: float = 0.3  # In view for 3 s
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            in_range(one.name, getattr(self, one.name), 0.0, 1e3)
+        check_fields(self, **{one.name: (0.0, 1e3) for one in fields(self)})
 
     @property
     def values_hz(self) -> tuple[float, ...]:
@@ -145,11 +158,15 @@ class Occluder:
     crossing_m: float | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        in_range("edge_azimuth_rad", self.edge_azimuth_rad, -math.pi, math.pi)
-        in_range("hidden_azimuth_rad", self.hidden_azimuth_rad, -math.pi, math.pi)
-        in_range("hidden_std_rad", self.hidden_std_rad, 0.0, math.pi, open_low=True)
-        in_range("edge_std_rad", self.edge_std_rad, 0.0, math.pi, open_low=True)
-        in_range("pace_hz", self.pace_hz, 0.0, _FASTEST_HZ, open_low=True)
+        check_fields(self, **_OCCLUDER)
+        if self.corner_m is not None:
+            object.__setattr__(self, "corner_m", pair("corner_m", self.corner_m, _FARTHEST_M))
+        if self.crossing_m is not None:
+            check_fields(self, crossing_m=(0.0, 2.0 * _FARTHEST_M))
+            # Else an ego vehicle that drives up to the corner would cross the lane before it has passed it.
+            if self.corner_m is not None and self.crossing_m <= max(self.corner_m[0], 0.0):
+                expected = f"the lane beyond the corner, {self.corner_m[0]} m ahead"
+                raise InvalidArgumentError(f"crossing_m: expected {expected}, got {self.crossing_m}")
 
 
 def blind_corner(direction: str, side: int) -> Occluder:
@@ -345,12 +362,15 @@ class Context:
     view_half_angle_rad: float = 0.6  # Of OVAD's camera
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "occluders", all_of("occluders", self.occluders, Occluder, _MOST_SIDES))
         for names in (self.directions, tuple(occluder.id for occluder in self.occluders)):
             if not names or len(set(names)) != len(names):
                 raise InvalidArgumentError(f"occluders: expected different ids and directions, got {names}")
-        in_range("view_half_angle_rad", self.view_half_angle_rad, 0.0, math.pi)
-        if self.ego_speed_mps is not None:
-            in_range("ego_speed_mps", self.ego_speed_mps, -_FASTEST_EGO_MPS, _FASTEST_EGO_MPS)
+        check_fields(self, rates=Rates, priors=Priors | None, site=str | None)
+        check_fields(self, view_half_angle_rad=(0.0, math.pi))
+        for name, span in (("ego_speed_mps", (-100.0, 100.0)), ("degradation", (0.0, 1.0))):
+            if getattr(self, name) is not None:
+                check_fields(self, **{name: span})
 
     @property
     def directions(self) -> tuple[str, ...]:
