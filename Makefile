@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Where the surroundings forbid caches of bytecode, every command that a test starts compiles the library anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo check test slow mutations lint schema figures docs locked audit matrix dist clean
+.PHONY: demo check test long slow mutations lint schema figures docs locked audit matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -38,6 +38,10 @@ check: $(VENV)/.test
 # The library's tests and the laboratory's.
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+# Whole commands, pages that are run as they stand, streets that are simulated: CI runs these as well.
+long: $(VENV)/.test
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m long
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --hypothesis-profile=anew

@@ -29,6 +29,8 @@ def pytest_collection_modifyitems(items):
         group = _shared(item)
         if group is not None and item.get_closest_marker("xdist_group") is None:
             item.add_marker(pytest.mark.xdist_group(group))
+        if group == "smoke":
+            item.add_marker(pytest.mark.long)
 
 
 def _shared(item):

@@ -22,6 +22,7 @@ def plain(outcome):
     return outcome.name, {name: column.tobytes() for name, column in outcome.columns.items()}
 
 
+@pytest.mark.long
 def test_any_number_of_processes_gives_the_same_and_reports_the_broken_recording(tmp_path):
     paths = write_sounds(tmp_path / "sounds", 6)
     paths[2].write_bytes(b"no sound")
@@ -40,6 +41,7 @@ def test_any_number_of_processes_gives_the_same_and_reports_the_broken_recording
     assert str(paths[4]) in failed[1].problem
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_of_the_program_is_no_broken_recording(jobs):
     with pytest.raises(TypeError, match="has no len"):
@@ -83,6 +85,7 @@ def start(folder, pause_s):
 ASKED = [pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGTERM)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGKILL, *ASKED])
 def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same(number, tmp_path):
     write_sounds(tmp_path / "sounds", 8, seconds=1)

@@ -31,6 +31,7 @@ def test_the_files_of_a_hop_are_those_that_it_executes(capsys):
     assert "worldstate/adapters/source.py" not in report["files"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_keys_and_consistency(capsys):
     assert main(["bench", "--rounds", "1", "--json"]) == 0

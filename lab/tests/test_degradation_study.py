@@ -130,6 +130,7 @@ def rates(video):
     )
 
 
+@pytest.mark.long
 def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
     detector, scale = MotionDetector(), np.array([WHOLE.width_px / WIDTH, WHOLE.height_px / HEIGHT] * 2)
     kept = detections_in(looks["mog2"], CLEAN)
@@ -186,6 +187,7 @@ def test_the_scale_of_d_is_that_of_the_same_images(video):
     assert mine.sharpness == pytest.approx(theirs.sharpness, rel=0.05)
 
 
+@pytest.mark.long
 def test_counts_are_those_of_measure_absence(approach, video):
     """On clean frames, where nothing is drawn at random."""
     whole, (first, last) = read_detections(approach.detections_path), (60, 100)
@@ -206,6 +208,7 @@ def test_counts_are_those_of_measure_absence(approach, video):
     assert np.array(counted.looks)[:, 0].sum() > 10
 
 
+@pytest.mark.long
 def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, looks, rates):
     source, seed = open_source(approach.folder), (0, 1)
     behind = cameras(MOTION, {"mog2": rates}, looks)
@@ -248,6 +251,7 @@ def assert_the_sound_says_the_same(source, off):
     assert off.presence == pytest.approx(np.array(presence))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(approach, video, rates, tmp_path):
     folder = tmp_path / "recording"
@@ -316,6 +320,7 @@ def test_advisories_of_a_state_stand_beside_those_of_the_clean_camera():
     )
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
     found = staged_advisories(approach.folder, None, 0)
@@ -330,6 +335,7 @@ def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
     assert found.advised[found.condition == "roof 1"].sum() < sum(chain)
 
 
+@pytest.mark.long
 def test_rain_on_the_roof_is_white_and_its_own_at_every_microphone(approach):
     source = open_source(approach.folder)
     with open_sound(source.sound) as audio:

@@ -161,6 +161,7 @@ def most_probable(row):
     return max(("front", "left", "none", "right"), key=lambda label: float(row[f"p_{label}"]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", ["cv", "lojo"])
 def test_every_figure_can_be_recomputed_from_the_predictions(csv_path, tmp_path, capsys, protocol):
     out = tmp_path / "p.csv"
@@ -188,6 +189,7 @@ def test_every_figure_can_be_recomputed_from_the_predictions(csv_path, tmp_path,
     assert figures["auroc_macro"] == pytest.approx(np.mean(by_junction))
 
 
+@pytest.mark.long
 def test_the_same_command_prints_the_same(csv_path, capsys):
     outputs = []
     for _ in range(2):
@@ -196,6 +198,7 @@ def test_the_same_command_prints_the_same(csv_path, capsys):
     assert outputs[0] == outputs[1]
 
 
+@pytest.mark.long
 def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_path, capsys):
     ids = tmp_path / "ids.csv"
     ids.write_text("ID\n" + "\n".join(f"none_{n}" for n in (1, 3, 5, 7)) + "\nleft_0\nright_6\n")
@@ -213,11 +216,13 @@ def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_
     assert set(figures) >= KEYS
 
 
+@pytest.mark.long
 def test_what_ships_is_what_train_makes_if_nothing_else_is_asked_for(csv_path, tmp_path):
     assert command("fit", csv_path, "--out", tmp_path / "m") == 0
     assert type(read_model(tmp_path / "m").signature) is type(read_model(None).signature)
 
 
+@pytest.mark.long
 def test_simulated_windows_are_learned_too_and_the_card_says_so(tmp_path):
     table = made_up_table(recordings=30)
     real, more = (write_csv(tmp_path / name, table) for name in ("real.csv", "more.csv"))

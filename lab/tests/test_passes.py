@@ -113,6 +113,7 @@ def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
     return measured
 
 
+@pytest.mark.long
 def test_a_vehicle_is_warned_of_keeps_its_identity_and_raises_nothing_once_it_is_seen() -> None:
     made_up = stream([("left", "left", 12.0), ("right", "right", 26.0), ("from_ahead", "left", 40.0)])
     follow = followed(WorldFilter(Context()), heard(made_up))
@@ -126,6 +127,7 @@ def test_a_vehicle_is_warned_of_keeps_its_identity_and_raises_nothing_once_it_is
     assert told["hidden_nees"] is not None and 0.05 < float(told["hidden_nees"]) < 1.5
 
 
+@pytest.mark.long
 def test_two_that_come_at_once_are_two_and_a_car_ahead_is_neither() -> None:
     made_up = stream([("both", "left", 15.0), ("both", "right", 15.8), ("from_ahead", "left", 9.5)])
     follow = followed(WorldFilter(Context()), heard(made_up))
@@ -184,6 +186,7 @@ def test_a_lower_risk_names_more_sides_of_two_and_more_wrong_ones() -> None:
     assert curve["risk 0.7"] == {"other_side_too": 0.0, "both_sides_found": 0.0, "both_near_found": 0.0}
 
 
+@pytest.mark.long
 def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
     made_up = stream([*PAIR, ("queue", "left", 30.0), ("follows", "left", 33.0), *SINGLES[1:]])
     follow = followed(WorldFilter(Context()), heard(made_up))

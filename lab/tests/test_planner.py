@@ -68,6 +68,7 @@ def stream(name: str = "SB2", entries_s: tuple[float, ...] = ENTRIES_S, known: b
 EVERY = (stream(), stream("SA1"), stream(entries_s=()))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ego", [EgoVehicle(), FROM_STANDING])
 def test_who_knows_brakes_for_vehicles_alone_and_who_knows_nothing_hits_them(ego: EgoVehicle) -> None:
     corners = draw_corners(EVERY, 40, ego, np.random.default_rng(1))

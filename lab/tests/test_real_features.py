@@ -37,6 +37,7 @@ def test_the_table_is_what_was_counted():
     assert len(table.only(read_ids(FOLDER / LISTS[0]))) == 125
 
 
+@pytest.mark.long
 def test_static_cross_validation_reaches_what_was_published():
     figures = evaluated("static", "cv", seeds=2)
     assert 0.91 <= figures["accuracy"] <= 0.93

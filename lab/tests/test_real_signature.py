@@ -29,6 +29,7 @@ def compared(group, protocol, others=(), seeds=1, reference="curated"):
     return comparison(table, passes, row, 0.02, draws=60)
 
 
+@pytest.mark.long
 def test_a_standing_ego_at_a_junction_never_seen():
     figures = compared("static", "lojo", ("loudest_direction",))
     assert figures["auroc_macro"] >= 0.97
@@ -42,6 +43,7 @@ def test_a_standing_ego_at_a_junction_never_seen():
         assert figures["gains"]["loudest_direction"][key]["low"] > 0
 
 
+@pytest.mark.long
 def test_a_moving_ego_at_a_junction_never_seen():
     # Three of five junctions here, so that each classifier learns from two.
     figures = compared("dynamic", "lojo")
@@ -120,6 +122,7 @@ def test_the_command_prints_every_row_and_writes_what_it_scored(tmp_path, capsys
     assert "transfer" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_no_row_of_the_data_ships_and_the_official_test_recordings_hold():
     table = read_features(TABLE).group("static")
     ids = read_ids(TABLE.parent / "timeHorizonStaticTestset.csv")

@@ -250,6 +250,7 @@ def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
     np.testing.assert_allclose(later, 1.5, atol=1e-3)
 
 
+@pytest.mark.long
 def test_the_command_holds_given_windows_against_a_table(tmp_path, capsys):
     """Windows that were made before, at some of the junctions, without simulating."""
     rng = np.random.default_rng(9)

@@ -292,6 +292,7 @@ def degradation(detectors):
     return DegradationStudy(sweeps, ("a", "b"), ("c", "d"), {}, (), DegradationSettings())
 
 
+@pytest.mark.long
 def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation, tmp_path):
     document = evaluation_document(replace(evaluation, degradation=degradation(("first", "<b>second"))))
     names = [block.name for block in document.blocks]

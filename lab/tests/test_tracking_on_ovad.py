@@ -14,7 +14,7 @@ from worldstate.adapters.datasets.ovad import Recording
 from worldstate.cli.main import main
 
 # With OVAD_ROOT nobody asks for the smoke evaluation, so that its group is not found by itself.
-pytestmark = pytest.mark.xdist_group("smoke")
+pytestmark = [pytest.mark.xdist_group("smoke"), pytest.mark.long]
 
 ROOT = os.environ.get("OVAD_ROOT")
 LINE_OF_SIGHT = (

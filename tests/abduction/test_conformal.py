@@ -69,6 +69,7 @@ def test_fewer_recordings_than_needed_give_no_finite_threshold(alpha, confidence
         assert conformal_threshold(scores[1:, None], alpha, 1, confidence) == math.inf
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_achieved_rate_is_beta_binomial_as_theory_says():
     """n calibration and m test scores, exchangeable: exceedances of the k-th largest are beta-binomial."""
@@ -86,6 +87,7 @@ def test_the_achieved_rate_is_beta_binomial_as_theory_says():
     assert stats.chisquare(observed, theory * trials / theory.sum()).pvalue > 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("alpha", "confidence"), [(0.02, None), (0.05, None), (0.05, 0.9)])
 def test_the_achieved_rate_stays_within_the_budgets_binomial_interval(alpha, confidence):
     """Fresh recordings of a known autocorrelated law, 100 seeds.
@@ -122,6 +124,7 @@ def test_the_correlation_time_of_the_alarm_is_that_of_the_law(alpha):
     assert correlation_time_hops(alarm) == pytest.approx(ALARM_TIME_HOPS[alpha], rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_confidence_holds_over_calibrations_and_the_plain_rule_does_not():
     rng, alpha = np.random.default_rng(8), 0.05

@@ -46,6 +46,7 @@ def interpreted(frame, grounding=None):
     return AcousticAdapter(roof_array_56(), 48_000.0, Flat(), grounding=grounding).interpret(frame)
 
 
+@pytest.mark.long
 def test_off_by_default(frame, approach):
     assert interpreted(frame).signature is SCORES
     assert open_source(approach.folder).settings.grounding is None
@@ -113,6 +114,7 @@ def test_the_whole_chain_runs_grounded(approach):
     assert [s.none for s in grounded] == [s.none for s in plain]
 
 
+@pytest.mark.long
 def test_run_has_the_switch(approach, tmp_path):
     # The windows are weighed otherwise; the sequence, which the risk goes by, reads them as they are.
     ratios = []

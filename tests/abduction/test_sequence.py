@@ -76,6 +76,7 @@ def test_a_model_reads_the_first_inputs_and_no_others() -> None:
         SequenceModel(trees, share, inputs=INPUTS[1:])
 
 
+@pytest.mark.long
 @given(SEEDS, st.integers(1, 900))
 def test_what_is_usual_in_a_street_is_a_quantile_of_the_last_minute(seed: int, hops: int) -> None:
     heard = evidence_of(np.random.default_rng(seed), hops)

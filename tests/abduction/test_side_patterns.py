@@ -172,6 +172,7 @@ def test_in_the_company_of_the_other_arm_nobody_knows_whose_sound_it_is():
     assert listener.hearing.known == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("adapts", [True, False])
 def test_a_hand_over_is_a_lesson(adapts, approach):
     settings = ListenSettings(site_adaptation=adapts)

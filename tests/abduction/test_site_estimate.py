@@ -150,6 +150,7 @@ def pooled_rates(group, seen, seed=0):
     return on[hazards].mean(), on[~hazards].mean(), off[hazards].mean(), off[~hazards].mean()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @real
 @pytest.mark.parametrize("seen", [False, True])
@@ -159,6 +160,7 @@ def test_a_stream_of_mostly_empty_street_costs_a_standing_ego_no_hits(seen):
     assert false <= false_off + 0.02
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @real
 def test_at_a_new_junction_it_takes_the_false_alarms_from_a_moving_ego():

@@ -78,6 +78,7 @@ def at_full_rate(heard: Heard) -> list[Step]:
     return heard.steps(heard.pipe(FULL_HZ))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", RATES)
 def test_the_same_sound_is_heard_alike_at_any_rate(heard: Heard, at_full_rate: list[Step], rate: int) -> None:
     if heard.array is not RING and rate not in (16_000, 44_100):
@@ -112,6 +113,7 @@ def as_live(heard: Heard, rate: int, folder: Path) -> SoundInput:
     return LiveSound(Playback(open_sound(as_file(heard, rate, folder)), speed=3.0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [16_000, 44_100])
 @pytest.mark.parametrize("form", [as_file, as_bag, as_live])
 def test_files_bags_and_microphones_give_the_states_of_a_pipe(
@@ -127,6 +129,7 @@ def test_files_bags_and_microphones_give_the_states_of_a_pipe(
         assert one.frame.bearing_rad == other.frame.bearing_rad
 
 
+@pytest.mark.long
 def test_a_run_of_any_rate_ends_in_states(heard: Heard, tmp_path: Path) -> None:
     if heard.array is RING:
         pytest.skip("the model that ships is of the roof")
@@ -168,6 +171,7 @@ def test_a_band_that_was_not_recorded_is_refused() -> None:
         FrontEnd(RING, 8_000, chosen)
 
 
+@pytest.mark.long
 def test_quiet_recordings_of_any_rate_set_an_alarm_alike(heard: Heard, tmp_path: Path) -> None:
     hops = []
     for rate in (FULL_HZ, 16_000):
@@ -182,6 +186,7 @@ def frames_of(heard: Heard, sound: Float32Array, rate: int) -> list[AcousticFram
     return FrontEnd(heard.array, rate, ListenSettings().front_end(heard.array, rate)).process(sound)
 
 
+@pytest.mark.long
 def test_faults_are_those_of_the_recorded_samples(heard: Heard) -> None:
     # Resampled, a clipped sound has no highest value, and repeated samples do not repeat.
     rate = 44_100

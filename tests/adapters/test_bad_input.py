@@ -295,6 +295,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.long
 @given(rows=st.lists(JSON, max_size=3))
 @settings(max_examples=150, deadline=None)
 def test_any_json_as_detections(tmp_path_factory: pytest.TempPathFactory, rows: list[Any]) -> None:

@@ -160,6 +160,7 @@ def in_child(work: Callable[[], int], report: Path) -> None:
     assert status == 0, report.read_text() if report.exists() else f"ended by signal {os.WTERMSIG(status)}"
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("times", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
@@ -300,6 +301,7 @@ def refused_by(said: str, read: Callable[[Path], object], folder: Path) -> None:
     in_child(refused, folder / "report")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BOMBS)
 def test_a_small_file_that_grows_is_refused(name, tmp_path):
     write, read = BOMBS[name]
@@ -307,6 +309,7 @@ def test_a_small_file_that_grows_is_refused(name, tmp_path):
     refused_by(name, read, tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", CHUNK_BOMBS)
 def test_a_chunk_that_grows_is_refused_by_the_readers_of_logs_and_of_bags(kind, tmp_path):
     codec, frame, claimed = CHUNK_BOMBS[kind]

@@ -60,6 +60,7 @@ def test_suppression_keeps_no_two_that_overlap_and_drops_none_without_a_reason(r
         assert overlaps(array[i : i + 1], array[better]).max() > most
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("background", ["mog2", "knn"])
 def test_motion_finds_the_car_and_little_else(background):
     detector, truth = MotionDetector(background), reference(40)
@@ -93,6 +94,7 @@ def test_motion_sees_nothing_in_an_empty_street():
     assert sum(len(detector.detect(frame)) for frame in street(15, car=False)) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("background", ["mog2", "knn"])
 def test_light_is_no_object_however_much_of_the_image_it_changes(background, monkeypatch):
     """The glow of lamps wanders over the street: motion without outlines would call it a car."""

@@ -117,6 +117,7 @@ def health():
     )
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=25)
 @given(st.sampled_from(["blur", "darkness", "noise"]), st.floats(0.0, 1.0), st.integers(0, 3))
 def test_d_is_read_from_another_image_of_the_same_camera(health, family, d, seed):
@@ -263,6 +264,7 @@ def scene(tmp_path_factory):
     return LabelledVideo(video, reference(26, 16.0), camera)
 
 
+@pytest.mark.long
 def test_beta_rises_from_a_tenth_to_nine_tenths(scene, monkeypatch):
     monkeypatch.setattr(miss_rate_measurement, "REPEATS", 1.0)
     settings_ = AbsenceSettings(families=("noise",))
@@ -276,6 +278,7 @@ def test_beta_rises_from_a_tenth_to_nine_tenths(scene, monkeypatch):
     assert np.array(rates.families["noise"].sectors).min() > 0
 
 
+@pytest.mark.long
 def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_clutter(scene, monkeypatch):
     class Blind:
         def detect(self, frame):
@@ -300,6 +303,7 @@ def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_cl
         assert np.array(family.clutter) == pytest.approx(clutter * np.array(family.sectors))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_command_writes_table_and_figure(tmp_path, capsys):
     out, figure = tmp_path / "beta.json", tmp_path / "beta.png"

@@ -302,6 +302,7 @@ def windows(seed: int = 0) -> FeatureTable:
     return FeatureTable(rng.random((60, 60)) + 0.1, labels, keys, sites, keys, (None,) * 60)
 
 
+@pytest.mark.long
 def test_a_table_and_the_model_trained_on_it_say_what_they_were_made_with(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -68,6 +68,7 @@ def test_an_exporter_gets_every_state(own_parts, log, tmp_path):
     ]
 
 
+@pytest.mark.long
 def test_a_sensor_of_ones_own_places_who_is_only_heard(own_parts, approach, tmp_path):
     """It announces itself on the left, 20 m away, from 2 s on; what sounds comes from the right."""
     messages = [
@@ -87,6 +88,7 @@ def test_a_sensor_of_ones_own_places_who_is_only_heard(own_parts, approach, tmp_
     assert min(told) >= 2_000_000_000, "a message counts when its time has come"
 
 
+@pytest.mark.long
 def test_a_detector_of_ones_own_looks_at_the_video(own_parts, approach, tmp_path):
     folder = tmp_path / "SB1" / "right" / "3_02_0000"
     folder.mkdir(parents=True)

@@ -52,6 +52,7 @@ def in_one(model: Model) -> list[str]:
     return pushed(listener, 0, len(SOUND)) + [state.to_json() for state in listener.push(None)]
 
 
+@pytest.mark.long
 @settings(max_examples=8)
 @given(cut=st.integers(0, len(SOUND)))
 def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Model, in_one: list[str]) -> None:
@@ -65,6 +66,7 @@ def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Mode
         assert states + rest == in_one
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [1, 37, 480, 48_000])
 def test_states_are_those_of_run_for_blocks_of_any_size(
     size: int, tmp_path: Path, model: Model, capsys: pytest.CaptureFixture[str]
@@ -83,6 +85,7 @@ def test_states_are_those_of_run_for_blocks_of_any_size(
     assert [one.to_json() for block in blocks for one in listener.push(block)] == out.read_text().splitlines()
 
 
+@pytest.mark.long
 def test_the_demo_s_recording_is_pushed_as_run_hears_it(approach, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "states.jsonl"
     assert main(["run", str(approach.audio_path), "--out", str(out)]) == 0

@@ -76,6 +76,7 @@ def driven(folder: Path) -> list[str]:
     return [step.state.to_json() for step in steps(folder, settings=DRIVEN)]
 
 
+@pytest.mark.long
 @settings(max_examples=20)
 @given(cuts=st.lists(st.integers(0, 3 * RATE_HZ), max_size=20))
 def test_states_are_the_same_to_the_bit_for_blocks_of_any_length(
@@ -200,6 +201,7 @@ def test_lost_sound_is_no_evidence_and_leaves_nothing_behind(folder: Path, tmp_p
     np.testing.assert_allclose(recent[0], recent[1], atol=1e-9)
 
 
+@pytest.mark.long
 def test_the_seconds_before_a_short_loss_join_on_and_those_before_a_long_one_are_forgotten(
     folder: Path, tmp_path: Path
 ) -> None:

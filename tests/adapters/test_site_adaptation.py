@@ -85,6 +85,7 @@ def test_the_forgetting_time_is_handed_on(approach):
         ListenSettings(forgetting_s=0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cut", [0, 1, 45])
 def test_a_checkpoint_of_the_chain_continues_bit_for_bit(heard, cut, tmp_path):
     source, frames = heard
@@ -163,6 +164,7 @@ def decided(model, gamma, stream):
     return np.array([[statistic(one, answer, prior) >= gamma for one in pair] for pair in pairs])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model, monkeypatch):
     monkeypatch.setattr(site_estimate, "HOP_S", 1.0)  # Windows that do not overlap
@@ -182,6 +184,7 @@ def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model, monkeypatch):
     assert on[~hazard].mean() <= off[~hazard].mean() + 0.01
 
 
+@pytest.mark.long
 def test_run_has_the_switch(approach, capsys):
     peaks = []
     for option in ([], ["--site-memory", "0"], ["--site-memory", "5"]):

@@ -183,6 +183,7 @@ def test_console_command_is_installed():
     assert done.stdout.startswith("worldstate ")
 
 
+@pytest.mark.long
 def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
     states = tmp_path / "states.jsonl"
     outputs = ["--out", str(states), "--figure", str(tmp_path / "t.png"), "--json"]
@@ -200,6 +201,7 @@ def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
     assert (tmp_path / "t.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.long
 def test_own_array_and_sound_give_the_same_as_the_folder(approach, tmp_path, capsys):
     by_folder, by_parts = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
     assert main(["run", str(approach.folder), "--out", str(by_folder)]) == 0

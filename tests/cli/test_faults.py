@@ -239,6 +239,7 @@ READERS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", READERS)
 def test_a_damaged_file_is_read_or_refused_in_one_line(name, whole, tmp_path, capsys):
     rng = np.random.default_rng(len(name))
@@ -280,6 +281,7 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
     return done.stderr
 
 
+@pytest.mark.long
 def test_a_full_disk_leaves_no_recording(tmp_path):
     done = on_small_disk(["sim", "make", "--out", str(tmp_path), "--static", "1", "--duration", "0.5"])
     assert "expected to write" in one_line(done)
@@ -368,6 +370,7 @@ def test_a_signal_waits_for_files_that_belong_together(number, code):
     assert (done.returncode, done.stdout) == (code, "written\n"), done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "code"), CODES)
 def test_an_interrupted_simulation_lists_what_it_leaves(number, code, tmp_path):
     words = ["sim", "make", "--out", str(tmp_path), "--static", "400", "--duration", "0.5", "--jobs", "2"]
@@ -379,6 +382,7 @@ def test_an_interrupted_simulation_lists_what_it_leaves(number, code, tmp_path):
     assert not list(tmp_path.rglob(".*"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "code"), CODES)
 def test_an_interrupted_run_leaves_nothing(number, code, tmp_path):
     sound = tmp_path / "long.wav"

@@ -9,6 +9,7 @@ import soundfile
 from worldstate.cli.main import main
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("follows", [False, True])
 def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path):
     sound, rate = soundfile.read(approach.audio_path, dtype="float32")

@@ -44,6 +44,7 @@ def foreign_share(guard: DomainGuard, measures: np.ndarray) -> float:
     return float(np.mean([isinstance(guard.judge(one), Foreign) for one in measures[:, : len(MEASURES)]]))
 
 
+@pytest.mark.long
 def test_a_new_foreign_sound_is_called_foreign_more_often_where_it_was_not_heard(tmp_path: Path) -> None:
     rows = [(pump(tmp_path / f"{n}.wav", n), "pump", f"r{n}", "") for n in range(8)]
     learned = read_recorded(tmp_path, table(tmp_path, rows))

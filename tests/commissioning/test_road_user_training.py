@@ -67,6 +67,7 @@ def test_vehicles_of_the_simulator_are_heard_before_they_are_seen_and_bicycles_h
     assert rows.weights.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["light", "tram"])
 def test_kinds_do_not_hang_on_a_recorder_that_rises_or_falls(kind: str) -> None:
     """Fresh clips through a filter of 6 dB from 80 to 2,700 Hz, by the model that ships."""

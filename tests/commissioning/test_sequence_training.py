@@ -42,6 +42,7 @@ def _stream(rng: np.random.Generator, hops: int = 1200) -> LabelledStream:
     )
 
 
+@pytest.mark.long
 def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten() -> None:
     rng = np.random.default_rng(5)
     model = train_sequence([_stream(rng) for _ in range(2)], rng, rounds=8)

@@ -102,6 +102,7 @@ def marked(page: Path) -> object:
     return pytest.param(page, id=page.stem, marks=[pytest.mark.slow] * (page.stem in SLOW))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", [*map(marked, PAGES)])
 def test_a_page_runs_and_prints_what_stands_on_it(page, desk, tmp_path, monkeypatch):
     shutil.copytree(desk, tmp_path / "desk", copy_function=os.link)

@@ -86,6 +86,7 @@ def test_a_missing_package_is_named_with_its_extra_before_any_work(package):
 HEAVY = {"scipy.stats", "scipy.signal", "sklearn", "filterpy", "gtsam", "matplotlib", "cv2", "networkx"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "statement",
     [

@@ -29,6 +29,7 @@ def test_there_are_seven_and_the_index_lists_them():
     assert [script.stem for script in SCRIPTS if f"({script.stem}.md)" not in index] == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "script",
     [pytest.param(one, id=one.stem, marks=[pytest.mark.slow] * (one.stem in SLOW)) for one in SCRIPTS],

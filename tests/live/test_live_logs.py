@@ -79,6 +79,7 @@ def check_killed(street, folder, seed, hops=(15, 60)):
         assert 0.0 <= written_s - read_checkpoint(folder / NAMES[3]).world.stamp_ns / 1e9 <= 61.0
 
 
+@pytest.mark.long
 def test_a_killed_run_leaves_what_it_wrote(street, tmp_path):
     for seed in (1, 2):
         check_killed(street, tmp_path / str(seed), seed)
@@ -91,6 +92,7 @@ def test_a_run_killed_at_twenty_moments_leaves_what_it_wrote(street, tmp_path):
         check_killed(street, tmp_path / str(seed), seed, (15, 60) if seed % 4 else (650, 1300))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES[:3])
 def test_a_full_disk_ends_the_run_and_says_what_was_kept(street, tmp_path, name):
     # A file may not grow above this, which the kernel says as it says that a disk is full.

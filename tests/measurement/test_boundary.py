@@ -287,6 +287,7 @@ def test_how_well_was_heard_is_written_and_may_be_missing():
         Heard(1.5)
 
 
+@pytest.mark.long
 def test_a_filter_that_is_certain_leaves_a_checkpoint_that_reads():
     world, rng = WorldFilter(), np.random.default_rng(4)
     for hop in range(1, 200):

@@ -108,6 +108,7 @@ def test_a_street_with_misses_of_the_camera_is_read_without_them(street, tmp_pat
     assert read_street(tmp_path / "street.json") == street[-1]
 
 
+@pytest.mark.long
 def test_the_command_learns_goes_on_and_run_takes_it(approach, tmp_path, capsys):
     out, figure = tmp_path / "street.json", tmp_path / "street.png"
     told = ["street", "learn", str(approach.folder), "--out", str(out)]

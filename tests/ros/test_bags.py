@@ -202,6 +202,7 @@ def test_the_bag_of_a_recording_says_where_array_and_camera_stand(bag_of_approac
     assert (bag_of_approach / "metadata.yaml").read_text().count("durability: 1") == 1
 
 
+@pytest.mark.long
 def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach, tmp_path):
     out, again = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
     assert main(["run", str(approach.folder), "--out", str(out)]) == 0
@@ -708,6 +709,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, capsys):
     assert "worldstate[ros]" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_program_of_the_page_runs(bag_of_approach, tmp_path, monkeypatch):
     page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "ros.md"
     (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)

@@ -28,6 +28,7 @@ def levels_db(sound: np.ndarray) -> np.ndarray:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["light", "heavy", "tram"])
 def test_a_pass_swells_and_an_engine_that_idles_stays(kind: str) -> None:
     drawn = [

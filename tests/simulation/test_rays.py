@@ -29,6 +29,7 @@ def walled_yard(scattered: float = 0.0) -> Houses:
     return Houses(ends, np.full(4, HEIGHT_M), np.full((4, 8), KEPT), np.full(4, scattered))
 
 
+@pytest.mark.long
 def test_mirrored_rays_leave_what_image_sources_do() -> None:
     """Energy of all echoes, and where they come from, of pyroomacoustics' images in the same yard."""
     pra = pytest.importorskip("pyroomacoustics")
@@ -76,6 +77,7 @@ def test_rough_walls_send_sound_where_mirrors_do_not() -> None:
     assert 10.0 * np.log10(shares[1].sum() / shares[0].sum()) == pytest.approx(0.0, abs=2.5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["TA7", "TB7", "TB8"])
 def test_a_drawn_street_hides_and_opens(name: str) -> None:
     """Sound of an arm falls with distance, and comes in by the mouth; what is open adds up to one."""

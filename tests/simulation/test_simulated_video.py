@@ -175,6 +175,7 @@ def test_a_mirrored_car_in_the_middle_mirrors_the_change():
     assert np.abs(seen[0] - seen[1][:, ::-1]).max(axis=2).mean() < 0.2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SITES)
 @pytest.mark.parametrize("approach", ["left", "right"])
 def test_nothing_moves_before_line_of_sight_and_then_it_does(name, approach):
@@ -258,6 +259,7 @@ def missed(frames, recording, camera, family, d, seed=0):
     return misses / looks
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["blur", "darkness", "noise"])
 def test_a_motion_detector_finds_the_vehicle_and_loses_it_in_each_family(family, passing):
     """Levels are those of the camera's own size, and blur is in pixels: the picture must be that large."""
@@ -267,6 +269,7 @@ def test_a_motion_detector_finds_the_vehicle_and_loses_it_in_each_family(family,
     assert rates[1] >= 0.9
 
 
+@pytest.mark.long
 def test_a_motion_detector_finds_the_vehicle_in_clean_frames(passing):
     recording, frames = passing
     assert missed(frames, recording, PinholeCamera.ovad(), "blur", 0.0) <= 0.1

@@ -148,6 +148,7 @@ def heard(scene: SimulationSettings, sound) -> np.ndarray:
     return out[0].astype(float)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SHOWN)
 def test_nothing_clicks_while_paths_come_and_go(name):
     """A 500-Hz tone stays one (Doppler aside): a click would spread beyond 2 kHz."""
@@ -158,6 +159,7 @@ def test_nothing_clicks_while_paths_come_and_go(name):
     assert 10 * np.log10(spectrum[frequency > 2000].sum() / spectrum.sum()) < -60.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SHOWN)
 def test_energy_is_continuous_through_the_whole_recording_and_line_of_sight_entry(name):
     """Noise in windows of 50 ms: no step beyond what 50 ms of movement and chance make, and no gap."""
@@ -215,6 +217,7 @@ def band_db(x: np.ndarray) -> float:
     return float(10 * np.log10(power[(frequency > 500) & (frequency < 2000)].sum()))
 
 
+@pytest.mark.long
 @settings(max_examples=8, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.data())
 def test_no_scene_gives_silence_nan_or_a_click(data):

@@ -74,6 +74,7 @@ def test_paths_come_and_go_without_clicks(name, approach):
     assert beyond_db < -60.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SITES)
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_energy_is_continuous_across_line_of_sight_entry(name, side):
@@ -213,6 +214,7 @@ def test_line_of_sight_is_the_straight_line_past_the_corner():
     assert at_corner == pytest.approx(plan.corner_left_m, abs=0.01)
 
 
+@pytest.mark.long
 def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp_path):
     """Two of a standing ego, one of a moving one; OVAD has no camera results of the latter."""
     wanted = DatasetSettings(n_static=2, n_dynamic=1, seed=5, duration_s=0.5, kind="bicycle")

@@ -39,6 +39,7 @@ def passes(
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("offset_s", "yaw_deg"), [(0.0, 0.0), (0.234, 3.3), (-0.45, -8.1), (0.81, 0.0), (-0.05, 12.0)]
 )

@@ -61,6 +61,7 @@ def test_what_would_fold_into_the_band_is_gone(frequency_hz: float) -> None:
     assert np.abs(decimator.push(line(frequency_hz, 0.5, RATE))).max() < 2e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("low_hz", "high_hz"), [(20.5, 24.0), (25.0, 390.0), (390.0, 399.0)])
 @pytest.mark.parametrize("snr_db", [-6.0, 10.0, 35.0])
 def test_variance_meets_the_decimated_bound(snr_db: float, low_hz: float, high_hz: float) -> None:

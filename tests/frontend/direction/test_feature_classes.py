@@ -94,6 +94,7 @@ def test_the_restatement_is_the_formula_pair_by_pair() -> None:
     np.testing.assert_allclose(plain_feature(window, positions), expected, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_same_class_on_a_simulated_recording_and_in_noise(approach) -> None:
     sound, rate = soundfile.read(approach.audio_path, dtype="float32")
     assert rate == RATE

@@ -405,6 +405,7 @@ def auroc(positive: list[np.ndarray], negative: list[np.ndarray]) -> np.ndarray:
     return np.array([roc_auc_score(labels, column) for column in scores.T])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_plane_wave_under_ego_noise_is_found_again_and_elsewhere_no_harm_is_done() -> None:
     rng = np.random.default_rng(20)

@@ -52,6 +52,7 @@ def opened(recording: Path, ego_noise: bool) -> Source:
     return open_source(recording, array=ARRAY, settings=settings)
 
 
+@pytest.mark.long
 def test_a_source_under_ego_noise_is_pointed_at_once_the_noise_is_known(recording: Path) -> None:
     bearings = {}
     for ego in (False, True):

@@ -108,6 +108,7 @@ def test_a_level_line_cannot_tell_and_trusts_its_caller() -> None:
     assert share_of(*judge.powers(np.ones((len(BINS_HZ), 9, 9), np.complex64))) == 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("array", [WHOLE, THIN], ids=["56", "14"])
 def test_a_street_that_is_learned_changes_nothing(array: MicrophoneArray) -> None:
     """The gate stays open throughout, a source from the horizon included: bit for bit what it was."""
@@ -147,6 +148,7 @@ def in_band(sound: np.ndarray) -> np.ndarray:
     return np.asarray(np.fft.irfft(np.fft.rfft(sound, axis=0) * band[:, None], len(sound), axis=0))
 
 
+@pytest.mark.long
 def test_a_source_where_the_noise_was_loudest_is_still_found() -> None:
     """Within five degrees of the azimuth where beams at the horizon hear the own noise, 11 dB below it."""
     scores: dict[tuple[str, bool], list[np.ndarray]] = {}

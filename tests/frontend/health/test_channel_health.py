@@ -113,6 +113,7 @@ FAULTS: list[tuple[Callable[[np.ndarray, np.random.Generator], None], dict[str, 
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("spoil", "expected", "masked"), FAULTS, ids=[f[0].__name__ for f in FAULTS])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_every_fault_is_named_and_nothing_else(
@@ -149,6 +150,7 @@ def test_all_at_once() -> None:
     assert named(last) == {"dead": [0, 50], "swapped": [7, 40], "inverted": [12], "noisy": [33]}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_a_clean_street_raises_no_alarm(seed: int) -> None:
     array = (HALF, ROOF)[seed % 2]
@@ -156,6 +158,7 @@ def test_a_clean_street_raises_no_alarm(seed: int) -> None:
     assert all(health.is_healthy for health in healths(array, sound))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("approach", "seed"), [("left", 5), ("none", 6)])
 def test_simulated_junctions_raise_no_alarm_and_show_a_swap(approach: str, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -46,6 +46,7 @@ def doctor(path: Path, *options: str) -> int:
     return main(["array", "check", str(path), "--array", str(path.with_name("mics.xml")), *options])
 
 
+@pytest.mark.long
 def test_a_healthy_recording(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
     assert doctor(write(street)) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -88,6 +89,7 @@ def test_it_says_what_to_do(street: np.ndarray, write: Callable, capsys: pytest.
     assert lines[-1].startswith("not healthy: swapped 4, 41;")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", Fault)
 def test_a_microphone_with_any_fault_is_drawn(fault: Fault, tmp_path: Path) -> None:
     health = RecordingHealth((ChannelVerdict(3, fault, 1.0, 1.0, 1.0),), (), 0, 1, 0.5)

@@ -111,6 +111,7 @@ def test_a_healthy_array_is_silent(n_channels: int) -> None:
     assert heard(ARRAYS[n_channels], street(n_channels)) == ({}, [])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n_channels", ARRAYS)
 @pytest.mark.parametrize("spoil", [gain, gusts, offset, drift, exchange])
 def test_each_fault_is_named_and_nothing_else(spoil: Spoil, n_channels: int) -> None:
