@@ -108,6 +108,14 @@ def test_an_alarm_counts_from_the_horizon_of_the_risk_on_or_from_less() -> None:
     assert (late.lead_s, late.onsets) == (0.0, 0)
 
 
+def test_an_approach_of_a_drive_counts_however_soon_the_vehicle_comes_out() -> None:
+    # Drives last 18 s, and their vehicles come out after six to eight.
+    soon: list[Vehicle] = [("left", "car", "left", 6.2)]
+    drive, standing = (heard(soon, 18.0, site=name) for name in ("DA1", "SB1"))
+    assert examine([examined(drive, [(4.0, 6.0, 0)])])["detected"] == 1.0
+    assert examine([examined(standing, [(4.0, 6.0, 0)])])["approaches"] == 0
+
+
 def test_figures_are_those_counted_by_hand() -> None:
     spans = [
         (8.2, 9.5, 0),  # the first: detected, some two seconds before

@@ -153,10 +153,12 @@ def alarm_outcomes(
     heard: HeardStream, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
 ) -> list[ApproachOutcome]:
     """Return the outcome of every approach that lies whole within the hops, shapes (n,) and (n, 2)."""
+    # Of a drive the hops are all there is: its vehicles come out before a horizon of eight seconds has passed.
+    before_s = 0.0 if heard.ego_moves else HORIZON_S
     return [
         hop_outcome(one, time_s, raised, longest_s)
         for one in approaches(heard)
-        if one.entries_s[0] - HORIZON_S >= time_s[0] and max(one.entries_s) + AFTER_S <= time_s[-1]
+        if one.entries_s[0] - before_s >= time_s[0] and max(one.entries_s) + AFTER_S <= time_s[-1]
     ]
 
 
