@@ -163,9 +163,9 @@ class VisionQuery:
         'Absent'
         """
         before, taken_ns = self.detections, stamp_ns + nanoseconds(self.camera.stamp_offset_s)
+        _check_size(self.camera, DetectionLog((frame,), np.array([taken_ns]), before.source))
         if len(before) and taken_ns < before.stamps_ns[-1] + LEAST_APART_NS:
             return
-        _check_size(self.camera, DetectionLog((frame,), np.array([taken_ns]), before.source))
         self._asked = True
         frames = (*before.frames, frame)[-REMEMBERED:]
         stamps_ns = np.append(before.stamps_ns, taken_ns)[-REMEMBERED:]
