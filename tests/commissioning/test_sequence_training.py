@@ -6,6 +6,7 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 
 from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
 from worldstate.commissioning.sequence_training import (
+    Growth,
     LabelledStream,
     StreamTruth,
     calibrated_margin_s,
@@ -45,7 +46,7 @@ def _stream(rng: np.random.Generator, hops: int = 1200) -> LabelledStream:
 @pytest.mark.long
 def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten() -> None:
     rng = np.random.default_rng(5)
-    model = train_sequence([_stream(rng) for _ in range(2)], rng, rounds=8)
+    model = train_sequence([_stream(rng) for _ in range(2)], rng, Growth(8, 16))
     fresh = _stream(rng)
     margin_s = calibrated_margin_s(model, [_stream(rng), _stream(rng)])
     said = model.posterior(fresh.evidence)

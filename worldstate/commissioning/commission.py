@@ -41,7 +41,14 @@ from .heard_stream import (
 )
 from .recorded_clips import RecordedClips
 from .road_user_training import CHOSEN_FOR_ROAD_USERS, fit_road_users, road_user_rows, with_close
-from .sequence_training import LabelledStream, calibrated_margin_s, stream_truth, train_sequence
+from .sequence_training import (
+    MOVING,
+    STANDING,
+    LabelledStream,
+    calibrated_margin_s,
+    stream_truth,
+    train_sequence,
+)
 from .simulated_windows import (
     N_OPEN,
     learned_beside,
@@ -119,6 +126,7 @@ def learn_sequence(
     """
     labelled: dict[int, LabelledStream] = {}
     folds, weights = _folds(streams), _weights(streams)
+    growth = MOVING if streams[0].ego_moves else STANDING
     for outside in folds:
         windows = fit_windows([one for i, one in enumerate(streams) if i not in outside])
         for i in outside:
@@ -127,14 +135,14 @@ def learn_sequence(
         on_step()
     margins, quiet = [], dict[str, list[SequencePosterior]]()
     for outside in folds:
-        model = train_sequence([labelled[i] for i in range(len(streams)) if i not in outside], rng)
+        model = train_sequence([labelled[i] for i in range(len(streams)) if i not in outside], rng, growth)
         margins.append(calibrated_margin_s(model, [labelled[i] for i in outside]))
         for i in outside:
             if streams[i].hazard_free:
                 quiet.setdefault(streams[i].site, []).append(model.posterior(labelled[i].evidence))
         on_step()
     alarm, margin_s = alarm_elsewhere(list(quiet.values()), onsets_per_hour), float(np.mean(margins))
-    final = train_sequence(list(labelled.values()), rng)
+    final = train_sequence(list(labelled.values()), rng, growth)
     on_step()
     return replace(final, margin_s=margin_s, alarm=alarm)
 

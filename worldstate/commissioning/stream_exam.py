@@ -153,7 +153,7 @@ def alarm_outcomes(
     heard: HeardStream, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
 ) -> list[ApproachOutcome]:
     """Return the outcome of every approach that lies whole within the hops, shapes (n,) and (n, 2)."""
-    # Of a drive the hops are all there is: its vehicles come out before a horizon of eight seconds has passed.
+    # The hops of a drive are all there is: its vehicles come out before the horizon of 8 s has passed.
     before_s = 0.0 if heard.ego_moves else HORIZON_S
     return [
         hop_outcome(one, time_s, raised, longest_s)
