@@ -27,6 +27,7 @@ from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.metrics.track_measures import bearing_curve
 from worldstate_lab.streets.simulated_windows import simulated_window_pair
+from worldstate_lab.trials import pass_cache
 from worldstate_lab.trials.classification import (
     Classifiers,
     classified,
@@ -275,6 +276,20 @@ def test_another_model_hears_nothing_but_its_own_chain(tmp_path):
     assert len(list((cache / "plain").glob("*.npz"))) == 2
     assert np.array_equal(heard.hops.features, other.hops.features)
     assert not np.array_equal(heard.hops.shipped, other.hops.shipped)
+
+
+def test_another_model_of_a_moving_ego_hears_its_drives_anew(tmp_path, monkeypatch):
+    noise = 0.01 * np.random.default_rng(0).standard_normal((60_000, 56))
+    soundfile.write(tmp_path / "quiet.wav", noise, 48_000, subtype="FLOAT")
+    write_array_xml(tmp_path / "array.xml", ovad_array())
+    take, cache = Take(tmp_path / "quiet.wav", "quiet", "quiet", moving=True), tmp_path / "cache"
+    Hearing(cache)(take)
+    before = read_model(moving_ego=True)
+    another = replace(before, provenance=replace(before.provenance, dataset="another"))
+    shipped = {False: read_model(), True: another}
+    monkeypatch.setattr(pass_cache, "read_model", lambda path, *, moving_ego=False: shipped[moving_ego])
+    Hearing(cache)(take)
+    assert len(list((cache / "plain").glob("*.npz"))) == 2
 
 
 @pytest.mark.parametrize(

@@ -218,7 +218,8 @@ class Hearing:
     def __call__(self, take: Take) -> Trial:
         """Listen to one recording, or read back what an earlier run heard of the same content."""
         mark = fingerprint(take.path, self.folder / "fingerprints")
-        model = read_model(self.model)
+        # What ships for a moving ego is another model, and its chains hear with that.
+        model = read_model(self.model, moving_ego=take.moving)
         array = named_array(take.path)
         about = [VERSION, take.name, take.label, take.t0_s, take.site, mark]
         about.append("" if array is None else content_hash(array))
