@@ -26,7 +26,7 @@ from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters import acoustic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.model_file import read_model
-from worldstate.commissioning.sequence_training import LEAVES, ROUNDS
+from worldstate.commissioning.sequence_training import STANDING
 from worldstate.frontend import hop_spectra, stream
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import roof_array_56
@@ -179,7 +179,7 @@ def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
 def _sequence(rng: np.random.Generator) -> SequenceModel:
     """Grow trees leaf by leaf as boosting does: the deepest decides what a walk takes."""
     # A round is a tree for each group.
-    trees, nodes = ROUNDS * len(GROUPS), 2 * LEAVES - 1
+    trees, nodes = STANDING.rounds * len(GROUPS), 2 * STANDING.leaves - 1
     yes, no = np.tile(np.arange(nodes), (2, trees, 1))
     for tree in range(trees):
         leaves = [0]
@@ -198,7 +198,11 @@ def _peer_trees(rng: np.random.Generator) -> Any:
     from sklearn.ensemble import HistGradientBoostingClassifier
 
     machine = HistGradientBoostingClassifier(
-        max_iter=ROUNDS, max_leaf_nodes=LEAVES, min_samples_leaf=2, early_stopping=False, random_state=0
+        max_iter=STANDING.rounds,
+        max_leaf_nodes=STANDING.leaves,
+        min_samples_leaf=2,
+        early_stopping=False,
+        random_state=0,
     )
     return machine.fit(rng.normal(size=(_ROWS, len(INPUTS))), np.arange(_ROWS) % len(GROUPS))
 
