@@ -41,7 +41,7 @@ test: $(VENV)/.test
 
 # Whole commands, pages that are run as they stand, streets that are simulated: CI runs these as well.
 long: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m long
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "long and not slow"
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --hypothesis-profile=anew

@@ -48,6 +48,7 @@ def test_an_error_of_the_program_is_no_broken_recording(jobs):
         list(attempted(len, [[0], 1, [2]], jobs))
 
 
+@pytest.mark.long
 def test_a_process_that_is_lost_is_an_error_not_an_endless_wait():
     with pytest.raises(WorldstateError, match="a process ended before its work was done"):
         list(attempted(end_at_one, [0, 1, 2], 2))

@@ -110,6 +110,7 @@ def test_it_agrees_on_the_boxes_of_a_recording(approach):
     assert agree((frame.boxes_px, frame.scores) for frame in frames) >= 1
 
 
+@pytest.mark.long
 @few
 @given(st.integers(15, 60), st.integers(1, 25))
 def test_a_tracker_coasts_after_it_has_seen_a_vehicle(first, hidden):

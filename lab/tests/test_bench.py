@@ -23,6 +23,7 @@ BATCHES = {"numpy_batch_1", "numpy_batch_20"}
 WHOLE = "front_end", "everything", "evidence", "feature_chain", "sound_to_state"
 
 
+@pytest.mark.long
 def test_the_files_of_a_hop_are_those_that_it_executes(capsys):
     assert main(["bench", "--files", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)

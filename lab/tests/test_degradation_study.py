@@ -143,6 +143,7 @@ def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
     assert kept.stamps_ns[:3].tolist() == [0, 100_000_000, 200_000_000]
 
 
+@pytest.mark.long
 def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
     first = SimpleNamespace(frames=lambda: islice(video.frames(), 90), frame_rate_hz=10.0, path="first")
     found, d = watched(first, MotionDetector(), rates)
@@ -278,6 +279,7 @@ def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(appr
     assert np.median([b for t, b in betas.items() if t > 5_500_000_000]) > 0.9
 
 
+@pytest.mark.long
 def test_a_degraded_camera_misses_what_its_table_says_and_never_less():
     box = DetectionFrame(np.array([[900.0, 500.0, 1000.0, 600.0]]), np.array([0.9]), ("car",))
     log, table = DetectionLog.at_rate([box] * 2000, 10.0), default_miss_rates()

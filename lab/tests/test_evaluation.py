@@ -191,6 +191,7 @@ def test_a_protocol_says_what_it_lacks(protocol):
     assert "found 0" in (protocol.lacks([replace(one, moving=not protocol.moving) for one in enough]) or "")
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_answers_and_another_deals_other_folds(streets):
     few = [*streets[:2], *streets[10:12]]
     one, again = (
@@ -257,6 +258,7 @@ def test_simulated_training_windows_are_kept_and_are_of_other_recordings(tmp_pat
     assert "other recordings" in said
 
 
+@pytest.mark.long
 def test_another_model_hears_nothing_but_its_own_chain(tmp_path):
     """What the front-end measured is read back; only the chain of the other model is run."""
     sound = tmp_path / "quiet.wav"

@@ -108,6 +108,7 @@ class Spy(PublishedClassifier):
         return super().predict_proba(X)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", ["cv", "lojo"])
 def test_nothing_is_predicted_by_what_it_was_trained_on(protocol):
     table = made_up_table(recordings=60)
@@ -243,6 +244,7 @@ def test_a_site_with_one_recording_is_refused(csv_path, tmp_path, capsys):
     )
 
 
+@pytest.mark.long
 def test_figures_for_people_show_every_junction(csv_path, capsys):
     assert command("windows", csv_path, "--method", "baseline", "--seeds", 1) == 0
     printed = capsys.readouterr().out

@@ -49,6 +49,7 @@ def test_static_cross_validation_reaches_what_was_published():
     assert figures["auroc_pooled_absent"] > figures["auroc_pooled"]
 
 
+@pytest.mark.long
 def test_an_unseen_junction_is_harder():
     figures = evaluated("static", "lojo", seeds=1)
     assert figures["accuracy"] == pytest.approx(0.807, abs=0.015)

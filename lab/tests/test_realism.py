@@ -165,6 +165,7 @@ def test_a_set_without_hazards_is_refused():
         measure_realism(windows(rng), {"seed 1": calm.select(calm.hazard_free)}, rng)
 
 
+@pytest.mark.long
 @needs_released_windows
 def test_the_released_windows_have_the_known_figures():
     """Figures of the released windows that were computed by another program (review of the simulation)."""

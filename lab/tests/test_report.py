@@ -193,6 +193,7 @@ def evaluation(tmp_path_factory):
     )
 
 
+@pytest.mark.long
 def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(evaluation, tmp_path):
     document = evaluation_document(evaluation, configuration=(("--seed", "7"),))
     blocks = {block.name: block for block in document.blocks}
@@ -237,6 +238,7 @@ def test_every_table_says_what_it_stands_on_and_every_mean_its_worst_junction(ev
     assert fewer.low <= fewer.value <= fewer.high
 
 
+@pytest.mark.long
 def test_a_model_that_was_not_made_for_the_sound_has_rows_without_numbers(evaluation, tmp_path):
     why = "<b>: not the array of the model"
     refused = {"static": {"shipped model": why, "shipped scores .02": why}}

@@ -288,6 +288,7 @@ def detector(trials, rate, rng):
     ]
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth_in_most_experiments():
     rng = np.random.default_rng(7)
     trials = [made_up(f"r{i}", "left", hops=50, site=f"S{i % 2}") for i in range(40)] + [

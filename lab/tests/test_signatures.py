@@ -150,6 +150,7 @@ def test_clips_repeated_within_their_recordings_do_not_narrow_the_interval():
     assert low < area(once) < high
 
 
+@pytest.mark.long
 def test_simulated_road_users_are_as_loud_as_their_kind(clips):
     heard = corpus(clips, CITY_STREET)
     # Above the wind, in which a bicycle drowns.
@@ -164,6 +165,7 @@ def test_a_simulated_recording_is_a_function_of_its_generator(clips):
     np.testing.assert_array_equal(samples, clips[TOWN_ROAD][0][1])
 
 
+@pytest.mark.long
 def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_path, capsys):
     idmt, melaudis = folders
     broken = next((idmt / "audio").glob("*_CL_SE_*"))

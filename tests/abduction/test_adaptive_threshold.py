@@ -181,6 +181,7 @@ def adaptive_world():
 BURST = [*[-4.0] * 30, *[2.6] * 4, *[-4.0] * 30]
 
 
+@pytest.mark.long
 def test_in_the_filter_false_alarms_raise_the_threshold_and_a_checkpoint_keeps_it():
     fixed, _ = listen(WorldFilter(), BURST * 8)
     adapted, world = listen(adaptive_world(), BURST * 8)

@@ -105,6 +105,7 @@ def test_the_engine_line_tells_the_speed():
     assert slow.best.radial_speed_m_s < fast.best.radial_speed_m_s
 
 
+@pytest.mark.long
 def test_the_whole_chain_runs_grounded(approach):
     source = open_source(approach.folder, settings=ListenSettings(grounding=Grounding()))
     grounded = [m.signature for _, m in measure_steps(source)]

@@ -310,6 +310,7 @@ def test_any_json_as_detections(tmp_path_factory: pytest.TempPathFactory, rows: 
 # --- models ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("version", ["2.0.0", "0.9.0"])
 def test_a_model_of_another_major_version(tmp_path: Path, version: str) -> None:
     save_model(tmp_path / "model.json", read_model())

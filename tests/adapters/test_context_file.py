@@ -101,6 +101,7 @@ def test_what_cannot_be_is_refused_by_name(tmp_path: Path, keys: dict[str, objec
         WorldFilter(read_context(written(tmp_path, **keys)))
 
 
+@pytest.mark.long
 def test_run_takes_the_place(approach, tmp_path: Path) -> None:
     out, file = tmp_path / "s.jsonl", written(tmp_path, arms=[LEFT, RIGHT], site="Elm Street")
     given_array = ["--array", str(approach.array_path)]

@@ -94,6 +94,7 @@ def array_file(path: Path, positions: np.ndarray) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("case", "form"), list(zip(WRONG, 7 * FORMS, strict=False)))
 @pytest.mark.parametrize("beside", ["model", "data set"])
 def test_a_wrong_array_is_never_taken(
@@ -221,6 +222,7 @@ def plane_wave(azimuth_deg: float) -> np.ndarray:
     return 0.05 * np.fft.irfft(spectrum[:, None] * turns, n, axis=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("azimuth_deg", [-50.0, -20.0, 0.0, 20.0, 50.0])
 def test_ovads_layout_is_read_with_ovads_array(azimuth_deg: float, tmp_path: Path) -> None:
     folder = tmp_path / "SA1" / "left" / "1_00_0002"
@@ -248,6 +250,7 @@ def test_another_order_is_said_and_gives_the_same_bearings(
     assert "in another order" in caplog.text
 
 
+@pytest.mark.long
 def test_a_recordings_own_array_gives_the_bearings_of_the_same_one_passed(
     tmp_path: Path, approach: Approach
 ) -> None:
@@ -266,6 +269,7 @@ def test_a_recordings_own_array_gives_the_bearings_of_the_same_one_passed(
         np.testing.assert_allclose(track, tracks[0], atol=0.1)
 
 
+@pytest.mark.long
 def test_a_data_set_is_read_with_its_own_array(tmp_path: Path, approach: Approach) -> None:
     own = open_source(approach.folder).array.positions_m
     assert np.array_equal(own, open_source(approach.folder, array=approach.array_path).array.positions_m)
@@ -350,6 +354,7 @@ def test_evaluating_a_table_of_another_array_is_refused(
     assert study(["windows", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 0
 
 
+@pytest.mark.long
 def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
     alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -58,6 +58,7 @@ def log(tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_an_exporter_gets_every_state(own_parts, log, tmp_path):
     assert main(["log", "replay", str(log), "--export", f"table={tmp_path / 'risk.csv'}"]) == 0
     with (tmp_path / "risk.csv").open() as file:

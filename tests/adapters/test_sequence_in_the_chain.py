@@ -177,6 +177,7 @@ def lossy(folder: Path, tmp_path: Path, seconds: float) -> tuple[list[Step], lis
     return heard[0], heard[1]
 
 
+@pytest.mark.long
 def test_lost_sound_is_no_evidence_and_leaves_nothing_behind(folder: Path, tmp_path: Path) -> None:
     hurt, whole = lossy(folder, tmp_path, 1.0)
     measured = {round(step.state.stamp_ns / 1e9, 1): step.measurement for step in hurt}
@@ -212,6 +213,7 @@ def test_the_seconds_before_a_short_loss_join_on_and_those_before_a_long_one_are
         assert reasons[len(reasons) - 1 - reasons[::-1].index("lost samples") + 1] == first
 
 
+@pytest.mark.long
 def test_a_checkpoint_within_a_loss_goes_on_as_the_whole(folder: Path, tmp_path: Path) -> None:
     hurt, _ = lossy(folder, tmp_path, 1.0)
     cut = hurt[25]

@@ -115,6 +115,7 @@ def test_a_coarse_bearing_asks_the_whole_side() -> None:
     assert isinstance(asked.ask(stamp_ns, NotUsable("flat")), Present)
 
 
+@pytest.mark.long
 @given(azimuth=AZIMUTHS, degradation=st.floats(0.0, 1.0))
 @settings(max_examples=60, deadline=None)
 def test_the_miss_rate_is_the_expectation_over_the_sector(azimuth: float, degradation: float) -> None:

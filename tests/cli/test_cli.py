@@ -76,6 +76,7 @@ print(code, heavy, front, "worldstate.adapters.files.model_file" in sys.modules)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -220,6 +221,7 @@ def test_the_help_names_every_exit_code(capsys):
         assert re.search(rf"^\|.*\b{code}\b.*\|", page, flags=re.MULTILINE)
 
 
+@pytest.mark.long
 def test_bearings_and_check_say_how_far_they_are(approach, tmp_path, monkeypatch):
     from worldstate.cli.common import progress
 

@@ -288,6 +288,7 @@ def test_a_full_disk_leaves_no_recording(tmp_path):
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
+@pytest.mark.long
 def test_a_full_disk_leaves_no_figure(tmp_path):
     soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0.0, 0.05, (48_000, 4)), 48_000)
     write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)]))

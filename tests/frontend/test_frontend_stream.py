@@ -52,6 +52,7 @@ def assert_same(ours: list[AcousticFrame], theirs: list[AcousticFrame], rtol: fl
         assert a.tone == b.tone  # bit for bit: hops are cut before anything is computed
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=15)
 @given(cuts=st.lists(st.integers(0, 20_000), max_size=12), rate=st.sampled_from([8_000, 15_999.7]))
 def test_block_size_does_not_matter(cuts: list[int], rate: float) -> None:
@@ -88,6 +89,7 @@ def test_nothing_before_the_first_full_second() -> None:
     assert len(front_end.process(sound[-1:])) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [16_000, 48_000])
 @pytest.mark.parametrize("azimuth_deg", [-50.0, 0.0, 25.0])
 @pytest.mark.parametrize("layout", ["square", "line", "roof"])
@@ -384,6 +386,7 @@ def test_what_lasts_for_ten_seconds_is_the_sound_of_the_place() -> None:
     assert set(shares[:101]) == {1.0} and set(shares[101:200]) == {0.0} and set(shares[203:]) == {1.0}
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=10)
 @given(st.integers(17_600, 30_000), st.integers(3200, 9600), st.booleans())
 def test_what_noise_covers_is_left_out_of_the_window(first: int, length: int, same: bool) -> None:

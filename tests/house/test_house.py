@@ -72,6 +72,7 @@ OPTIONAL = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("package", OPTIONAL)
 def test_a_missing_package_is_named_with_its_extra_before_any_work(package):
     call, extra = OPTIONAL[package]

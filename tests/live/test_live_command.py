@@ -97,6 +97,7 @@ def test_the_view_shows_bearing_risk_and_losses(street):
     assert [line.split()[0] for line in shown.splitlines() if "risk" in line] == ["left", "right"]
 
 
+@pytest.mark.long
 def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
     out = tmp_path / "states.jsonl"
     words = command(street, "--duration", 60, "--out", out, "--json")

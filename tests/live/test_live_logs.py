@@ -188,6 +188,7 @@ def test_a_full_mcap_goes_on_in_a_new_file(street, tmp_path, monkeypatch):
         assert after[-1] == 8_000_000_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
 def test_an_mcap_that_was_cut_short_reads_up_to_there(street, tmp_path, share):
     assert main(words(street, tmp_path, "--speed", 50, "--duration", 4)) == 0

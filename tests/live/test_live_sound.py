@@ -202,6 +202,7 @@ def test_a_longer_run_plays_it_again_and_a_shorter_one_ends_before(source):
     assert short[-1].step.state.stamp_ns == 1_300_000_000
 
 
+@pytest.mark.long
 def test_whoever_is_too_slow_loses_sound_and_keeps_the_time(source):
     sound = Playback(open_sound(source.sound), speed=100.0, duration_s=30.0)
     slow = replace(source, sound=LiveSound(sound))

@@ -94,6 +94,7 @@ def rows_of(path: Path) -> np.ndarray:
     return np.array(table[1:], dtype=np.float64)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "name"), list(enumerate(OWN)))
 def test_no_command_refuses_a_right_array(number: int, name: str, tmp_path: Path) -> None:
     file = write_array(tmp_path / f"mics.{FORMS[number % 4]}", OWN[name])

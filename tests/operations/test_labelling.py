@@ -63,6 +63,7 @@ def test_a_hidden_place_is_not_stated_wider_than_drivers_vary(labelled):
         assert 0.6 < stated_m < 2.3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("missing", "told"), [("gtsam", "RTS smoother"), ("gtsam filterpy", "[smoothing]")])
 def test_without_gtsam_the_rts_smoother_makes_the_labels(missing, told):
     program = """

@@ -366,6 +366,7 @@ angles, metres = st.floats(-math.pi, math.pi), st.floats(-5.0, 5.0)
 poses = st.tuples(st.tuples(metres, metres, metres), st.tuples(angles, angles, angles))
 
 
+@pytest.mark.long
 @settings(max_examples=20)
 @given(st.lists(poses, min_size=1, max_size=4))
 def test_a_board_stands_where_the_static_transforms_put_it(chain):
@@ -605,6 +606,7 @@ def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
     assert "`worldstate log replay` reads" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3", "signed_16", "pcm-s16"])
 def test_a_damaged_bag_is_refused_by_name(tmp_path, storage):
     samples = sound_of(RATE_HZ)

@@ -61,6 +61,7 @@ def test_what_a_recorder_hears_is_finite_and_within_full_scale(seed: int, kind: 
     assert np.abs(heard).max() == pytest.approx(0.5, rel=1e-3)
 
 
+@pytest.mark.long
 def test_a_vehicle_of_another_kind_is_another_sound() -> None:
     """A tram has most at 250 Hz, a car's tyres at 1 kHz: the octaves say so, whatever the recorder."""
     kinds = {name: replace(KINDS[name], ridden_mps=(8.0, 10.0)) for name in ("light", "tram")}

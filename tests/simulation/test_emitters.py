@@ -48,6 +48,7 @@ def envelope(x, fs=FS, rate=100):
     return np.sqrt((x[: len(x) // block * block].reshape(-1, block).astype(float) ** 2).mean(axis=1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SYNTHESES)
 def test_every_sound_has_the_level_of_the_table(sounds, name):
     heard = sosfilt(a_weighting_filter(FS), sounds[name].astype(float))

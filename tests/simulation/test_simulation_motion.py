@@ -168,6 +168,7 @@ def test_energy_is_continuous_through_the_whole_recording_and_line_of_sight_entr
     assert np.abs(np.diff(10 * np.log10(power))).max() < 5.0
 
 
+@pytest.mark.long
 def test_truth_tells_ways_sight_and_time_of_every_vehicle():
     others = (
         VehicleSettings("right", 4.0, 9.0, kind="heavy"),

@@ -111,6 +111,7 @@ def constant(speed: float, name: str) -> Trajectory:
     return drive(TIME_S, entry_s=7.0, entry_y_m=5.0, lane_x_m=6.0, speed_mps=speed, kind=vehicle_kind(name))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(KINDS))
 def test_a_vehicle_emits_the_power_of_its_kind(name):
     """Levels at 1 m over hard ground, all sources together: the law's sound power less 8 dB."""

@@ -154,6 +154,7 @@ def scenes(draw):
     )
 
 
+@pytest.mark.long
 @settings(max_examples=8, deadline=None)
 @given(scenes(), st.integers(0, 2**32 - 1))
 def test_no_setting_gives_silence_or_nan(scene, seed):
@@ -172,6 +173,7 @@ def quickly(scene: SimulationSettings) -> SimulationSettings:
     return replace(scene, sample_rate_hz=8_000.0, site=replace(scene.site, side_order=0, facade_order=0))
 
 
+@pytest.mark.long
 @settings(max_examples=6, deadline=None)
 @given(st.sampled_from(SITES), st.sampled_from(["left", "right"]), st.integers(0, 1000))
 def test_detections_begin_at_line_of_sight_and_truth_agrees(name, approach, seed):

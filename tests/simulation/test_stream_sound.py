@@ -101,6 +101,7 @@ def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() 
     assert levels[50] == pytest.approx(10 * np.log10((around**2).mean() / 4e-10), abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("later_s", [1.5, 4.0])
 def test_what_a_second_vehicle_adds_is_the_difference_of_scenes_with_it_and_without(later_s: float) -> None:
     """10 log10(1 + p2 / (p1 + background)) in the band, half a second each, of vehicles rendered apart."""

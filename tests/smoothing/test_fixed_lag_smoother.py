@@ -109,6 +109,7 @@ def test_an_entity_that_is_silent_beyond_the_lag_begins_anew():
     assert smoother.track("car").stamps_ns.tolist() == [101 * HOP_NS]
 
 
+@pytest.mark.long
 def test_entities_with_heights_come_and_go():
     # At the 581st step a height that had outlived its states was refused by gtsam.
     assert slots_of_a_street(620, np.random.default_rng(0)) > 0

@@ -109,6 +109,7 @@ def smooth_noise(rng):
     return lambda t: 0.05 * np.interp(t, grid, values / np.abs(values).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("speed", [0.0, 12.0])
 def test_random_wander_is_never_usable(speed):
     for seed in range(6):
@@ -124,6 +125,7 @@ def test_an_engine_that_runs_down_at_the_kerb_is_not_a_pass_by():
         assert isinstance(radial_speed(track_fundamental(x, RATE)), NotUsable)
 
 
+@pytest.mark.long
 def test_claimed_variance_covers_the_error():
     squares = []
     for seed in range(12):

@@ -28,6 +28,7 @@ def test_noiseless_real_tone_is_exact(frequency, phase, amplitude, n):
     assert np.exp(1j * tone.phase_rad) == pytest.approx(np.exp(1j * phase), abs=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("snr_db", [0.0, 10.0, 25.0])
 def test_variance_meets_the_bound(snr_db):
     """Within 1.5 dB of eq. (9) of Rife and Boorstyn, never below it beyond three standard errors."""

@@ -43,6 +43,7 @@ def hear(array: MicrophoneArray, sound: FloatArray) -> list[AcousticFrame]:
     return FrontEnd(array, RATE, chosen).process(sound)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("microphones", SPREAD)
 @pytest.mark.parametrize("kind", ["white", "diffuse"])
 def test_a_bearing_of_noise_is_not_called_sharp(kind: str, microphones: int) -> None:

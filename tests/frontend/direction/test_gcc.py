@@ -52,6 +52,7 @@ def test_peak_is_the_maximum_of_the_dirichlet_kernel_sum():
     assert got.delay_s[0] == pytest.approx(best.x, abs=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("snr", [1.0, 10.0, 100.0])
 def test_variance_meets_the_bound(snr):
     rng = np.random.default_rng(int(snr))

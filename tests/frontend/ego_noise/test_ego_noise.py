@@ -431,6 +431,7 @@ def test_a_plane_wave_under_ego_noise_is_found_again_and_elsewhere_no_harm_is_do
     assert 0.7 < plain[1].min() < 0.999
 
 
+@pytest.mark.long
 def test_the_bearing_stays_where_it_was_without_ego_noise() -> None:
     rng = np.random.default_rng(21)
     errors: dict[str, list[float]] = {"plain": [], "learned": []}

@@ -171,6 +171,7 @@ def test_simulated_junctions_raise_no_alarm_and_show_a_swap(approach: str, seed:
     assert named(healths(ROOF, swapped, recording.sample_rate_hz)[-1]) == {"swapped": [3, 40]}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("levels", [2, 5, 30])
 def test_coarse_quantisation_is_no_clipping(levels: int) -> None:
     sound = np.round(street(HALF, 8) * levels).astype(np.float32)
@@ -191,6 +192,7 @@ def test_silence_is_dead_after_a_second() -> None:
     assert last.n_dropouts == 0
 
 
+@pytest.mark.long
 def test_a_channel_that_dies_is_left_out_at_once_and_comes_back() -> None:
     sound = street(HALF, 9, seconds=9.0)
     sound[: 2 * RATE, 4] = 0.0
@@ -268,6 +270,7 @@ def test_leaving_out_noise_keeps_the_bearing() -> None:
     assert np.mean([f.prominence for f in watched[11:]]) > np.mean([f.prominence for f in unwatched[11:]])
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=5)
 @given(dead=st.sets(st.integers(0, 27), max_size=20), seed=st.integers(0, 99))
 def test_leaving_out_is_listening_with_the_rest(dead: set[int], seed: int) -> None:
