@@ -15,18 +15,35 @@ from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
-from worldstate.simulation.scene.settings import MICROPHONES, SOUNDS, SoundKind
+from worldstate.simulation.scene.settings import SoundKind
 
 from . import syntheses
 from .signals import gate
 
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]
 
-# Each kind that comes from a place or a vehicle is drawn by the function of its name.
 SYNTHESES: dict[str, Synthesis] = {
-    name: getattr(syntheses, name.replace("-", "_"))
-    for name, kind in SOUNDS.items()
-    if kind.origin != MICROPHONES
+    "voice": syntheses.voice,
+    "children": syntheses.children,
+    "steps": syntheses.steps,
+    "bell": syntheses.bell,
+    "saw": syntheses.saw,
+    "drill": syntheses.drill,
+    "music": syntheses.music,
+    "tune": syntheses.tune,
+    "drums": syntheses.drums,
+    "dog": syntheses.dog,
+    "birds": syntheses.birds,
+    "shots": syntheses.shots,
+    "tone": syntheses.tone,
+    "siren": syntheses.siren,
+    "wail": syntheses.wail,
+    "sweeps": syntheses.sweeps,
+    "turns": syntheses.turns,
+    "horn": syntheses.horn,
+    "horns": syntheses.horns,
+    "beeper": syntheses.beeper,
+    "bicycle-bell": syntheses.bicycle_bell,
 }
 # Everything is drawn at a whole multiple of the rate asked, of at least this, and then band-limited: partials
 # above a low Nyquist frequency are left out, not folded, and the level is that of the whole sound.

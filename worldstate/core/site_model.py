@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from operator import attrgetter
 
 import numpy as np
 
@@ -24,11 +23,6 @@ from .memory import Memory
 _NONE = 1e-12  # Of a coming group where no vehicle can come: shares of none at all are not defined
 
 
-# Of an occluder, in the order of `SideGeometry`.
-_OF_SIDE = "direction edge_azimuth_rad hidden_azimuth_rad hidden_std_rad edge_std_rad pace_hz hides"
-_SIDE = attrgetter(*_OF_SIDE.split())
-
-
 @dataclass(frozen=True, slots=True)
 class FilterModel:
     """Context, policy and site geometry, constant while the filter runs."""
@@ -43,8 +37,19 @@ def site_geometry_of(
 ) -> SiteGeometry:
     """Return the site geometry of a context, as the ego vehicle has it."""
     yaw_rad = 0.0 if ego is None else float(ego.pose[2])
-    # Only the edge of a corner in the map turns the other way.
-    sides = (SideGeometry(*(*_SIDE(one), yaw_rad if one.corner_m else 0.0)) for one in context.occluders)
+    sides = (
+        SideGeometry(
+            one.direction,
+            one.edge_azimuth_rad,
+            one.hidden_azimuth_rad,
+            one.hidden_std_rad,
+            one.edge_std_rad,
+            one.pace_hz,
+            one.hides,
+            0.0 if one.corner_m is None else yaw_rad,
+        )
+        for one in context.occluders
+    )
     twist = (context.ego_speed_mps or 0.0, 0.0) if ego is None else (ego.speed_mps, ego.yaw_rate_rad_s)
     return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, *twist)
 
