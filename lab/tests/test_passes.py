@@ -159,6 +159,25 @@ def stated(made_up: HeardStream, chance: float, *, masked: bool = False) -> Pass
     return PassedStream(made_up, stream_truth(made_up), follow)
 
 
+def test_one_that_comes_is_ranked_above_one_that_drives_off_and_a_sure_chance_is_counted() -> None:
+    made_up = stream([("left", "left", 15.0), ("leaves", "right", 40.0)])
+    made_up.vehicles.hazard[1], made_up.vehicles.entry_s[1] = False, np.nan
+    made_up.rows.in_view[made_up.rows.vehicle == 1] = False
+    told = stated(made_up, 0.1)
+    time_s, risk = told.followed.time_s, told.followed.risk
+    sure = (time_s > 13.5) & (time_s < 14.9)
+    for coming, leaving, area in ((0.6, 0.2, 1.0), (0.2, 0.6, 0.0)):
+        risk[sure, 0], risk[np.abs(time_s - 32.0) < 1.0, 1] = coming, leaving
+        figures = pass_figures([told])
+        assert (figures["leaving"], figures["coming_leaving_auroc"]) == (1, area)
+    assert (figures["certain_right"], figures["certain_said"]) == (None, 0.0)
+    told.followed.within[sure, 0] = 0.9
+    told.followed.within[np.searchsorted(time_s, 45.0), 1] = 0.9
+    figures = pass_figures([told])
+    assert figures["certain_right"] == pytest.approx(sure.sum() / (sure.sum() + 1))
+    assert figures["certain_said"] == 1.0
+
+
 def test_second_vehicles_are_judged_at_the_odds_of_the_street() -> None:
     """One of three firsts has a second one from the other side: stated as a third, it costs nothing."""
     group = "other, 1.5 to 4 s"

@@ -25,6 +25,7 @@ from scipy.signal import lfilter, sosfilt
 from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S, held
 from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.commissioning.sequence_training import QUIET_KINDS
 from worldstate.commissioning.stream_exam import (
     alarm_outcomes,
     approach_table,
@@ -43,6 +44,7 @@ from worldstate.operations.metrics.approach_table import (
     ApproachTable,
     Figures,
     StreamApproach,
+    auroc,
     mean_of,
 )
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
@@ -171,6 +173,7 @@ def pass_figures(streams: Sequence[PassedStream]) -> Figures:
         **_entities(streams, table),
         **{name: false[name] for name in ("hazard_free_hours", "onsets_per_hour", "hazard_free_share")},
         **_ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams),
+        **_leaving(streams) | _certain(streams),
         **_meter(streams, false["onsets_per_hour"]),
     }
 
@@ -286,6 +289,42 @@ def _forecast(streams: Sequence[PassedStream]) -> Figures:
         **time_figures(stated, coming_s),
         "times_stated": mean_of(np.isfinite(stated[coming_s <= LONGEST_S][:, 1])),
     }
+
+
+# A vehicle that leaves is compared in as long a time about its loudest as one that comes has before its T0,
+# where nothing comes near that time.
+_COMPARED_S, _ALONE_S, CERTAIN = 3.0, 10.0, 0.8
+
+
+def _leaving(streams: Sequence[PassedStream]) -> Figures:
+    """Return how well the risk ranks loud vehicles that come above those that drive off behind the corner."""
+    coming, leaving = [], []
+    for stream in streams:
+        time_s, most = stream.followed.time_s, stream.followed.risk.max(axis=1)
+        vehicles, rows = stream.heard.vehicles, stream.heard.rows
+        come = approaches(stream.heard)
+        entries_s = np.array([entry_s for one in come for entry_s in one.entries_s])
+        for entry_s in (entry_s for one in come if not one.quiet for entry_s in one.entries_s):
+            coming.append(most[shortly_before(time_s, entry_s, _COMPARED_S)].max(initial=0.0))
+        loud = ~np.isin(vehicles.kind, QUIET_KINDS)
+        for number in vehicles.vehicle[loud & (vehicles.flow == "leaves")].tolist():
+            mine = (rows.vehicle == number) & ~rows.in_view
+            at_s = rows.time_s[mine][rows.loudness_db[mine].argmax()]
+            if not (np.abs(entries_s - at_s) < _ALONE_S).any():
+                leaving.append(most[np.abs(time_s - at_s) <= 0.5 * _COMPARED_S].max(initial=0.0))
+    positive = np.arange(len(coming) + len(leaving)) < len(coming)
+    return {"leaving": len(leaving), "coming_leaving_auroc": auroc([*coming, *leaving], positive)}
+
+
+def _certain(streams: Sequence[PassedStream]) -> Figures:
+    """Return how often a chance above `CERTAIN` to come within two seconds is right, and how often said."""
+    at, right, said = HORIZONS_S.index(2.0), [], []
+    for one in streams:
+        certain = np.nan_to_num(one.followed.within[:, :, at]) > CERTAIN
+        right.append((one.truth.coming_s <= HORIZONS_S[at])[certain])
+        said.append((one.heard, certain))
+    reached = approach_table(said, HORIZON_S).loud().detections()["detected"]
+    return {"certain_right": mean_of(np.concatenate(right)), "certain_said": reached}
 
 
 def _bearing(streams: Sequence[PassedStream]) -> Figures:
