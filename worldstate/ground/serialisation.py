@@ -284,7 +284,8 @@ def _record(cls: Any) -> Plan:
     layout: Layout = getattr(cls, "LAYOUT", Layout())
     hints = get_type_hints(cls, include_extras=True)
     order = layout.order.split()
-    members = sorted(fields(cls), key=lambda f: order.index(f.name) if f.name in order else len(order))
+    given = [member for member in fields(cls) if member.init]
+    members = sorted(given, key=lambda f: order.index(f.name) if f.name in order else len(order))
     plans = {member.name: _plan(hints[member.name]) for member in members}
     flat = {member.name: plans.pop(member.name) for member in members if member.metadata.get("flat")}
     added = {member.name for member in members if member.metadata.get("added")}
