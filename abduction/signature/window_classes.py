@@ -175,5 +175,5 @@ def _six(shares: FloatArray, classes: tuple[str, ...]) -> tuple[FloatArray, Floa
     """Return shares of the four, of both and of direct; zero where a model does not know one."""
     every = np.zeros((len(shares), len(WINDOW_CLASSES)))
     every[:, [WINDOW_CLASSES.index(name) for name in classes]] = shares
-    four, both, direct = np.split(every, [len(CLASSES), len(CLASSES) + 1], axis=1)
-    return four, both, direct
+    n = len(CLASSES)
+    return every[:, :n], every[:, n : n + 1], every[:, n + 1 :]
