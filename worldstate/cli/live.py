@@ -35,6 +35,7 @@ Examples
 
 import argparse
 import math
+import socket
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -243,7 +244,12 @@ def _trust(arguments: argparse.Namespace) -> "Trust":
     if key is not None and len(key) < SHORTEST_KEY:
         problem = f"expected a secret of at least {SHORTEST_KEY} bytes, got {len(key)}"
         raise ground.InputFileError(arguments.key, problem)
-    return Trust(tuple(arguments.allow), key)
+    try:
+        allow = tuple(map(socket.gethostbyname, arguments.allow))
+    except (OSError, UnicodeError) as error:
+        got = ", ".join(arguments.allow)
+        raise InvalidArgumentError(f"--allow: expected hosts, got {got} ({error})") from error
+    return Trust(allow, key)
 
 
 def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
@@ -264,17 +270,19 @@ def _listen(
     steps: "Iterator[LiveStep]",
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
+    from worldstate.adapters.files.file_io import line_writer
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
-    from worldstate.adapters.state_log import growing_lines
-    from worldstate.operations.recordings.recording_report import WarningMeter
+    from worldstate.adapters.state_log import states_writer
+    from worldstate.operations.recordings.recording_report import WarningMeter, calibration_words
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice = _loss_notices()
+    lines = partial(line_writer, growing=True, most_bytes=exports.most_bytes(arguments))
     start_s = ground.seconds(source.start_ns)
     longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
         _kept(arguments) as keep,
-        growing_lines(arguments.out, exports.most_bytes(arguments)) as write,
+        states_writer(arguments.out, lines) as write,
         exports.exported_hops(arguments, source, given.car.crossing_m, live=True) as export,
         _view(arguments) as show,
         command.stopped_by_signals(sound.close),
@@ -299,6 +307,7 @@ def _listen(
         "latency_largest_s": latency.quantile_s(1.0),
         **cost.read(),
         "peak_risk": warnings.peak_risk,
+        "calibration": calibration_words(warnings.uncalibrated, warnings.states),
         "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
     }
 
