@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from worldstate.adapters.files.file_io import GrowingFile, LineWriter, line_writer, whole_file
+from worldstate.adapters.files.file_io import FileOpener, GrowingFile, line_writer
 from worldstate.ground import FloatArray, InvalidArgumentError, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.state import Entity, WorldState
@@ -183,14 +183,14 @@ def is_localised(state: WorldState) -> bool:
 
 @contextmanager
 def autoware_lines(
-    path: Path, crossing_m: float, writer: LineWriter = line_writer, *, comes: bool = False
+    path: Path, crossing_m: float, opener: FileOpener, *, comes: bool
 ) -> Iterator[Callable[[WorldState], None]]:
     """Lend a function that writes the messages of states, one a line.
 
     The first state must have a pose, unless one `comes` by a running odometry.
     """
     started = comes
-    with writer(path) as write:
+    with line_writer(path, opener) as write:
 
         def write_state(state: WorldState) -> None:
             nonlocal started
@@ -269,8 +269,6 @@ def _covariance(of_xy: FloatArray) -> list[float]:
 # Of osi3.MovingObject.VehicleClassification, by Autoware's numbers; a person has another type.
 _VEHICLES = {1: "TYPE_CAR", 2: "TYPE_HEAVY_TRUCK", 3: "TYPE_BUS", 5: "TYPE_MOTORBIKE", 6: "TYPE_BICYCLE"}
 _PERSON = 7
-# A second of states with an entity or two: whole chunks of a trace that was not ended are read.
-_CHUNK_BYTES = 1 << 12
 # Of the height of the middle, assumed: a van is .5 m higher than a car, and roads have a camber.
 _Z_STD_M = 0.3
 
@@ -310,7 +308,7 @@ def _set(part: Any, **values: float) -> None:
 
 
 @contextmanager
-def osi_trace(path: Path, crossing_m: float, *, live: bool = False) -> Iterator[Callable[[WorldState], None]]:
+def osi_trace(path: Path, crossing_m: float, opener: FileOpener) -> Iterator[Callable[[WorldState], None]]:
     """Lend a function that writes states to a trace: of one channel, or multi-channel where it ends in .mcap.
 
     The name of the latter is extended to OSI's convention at the end: the number of states is a part of it.
@@ -318,7 +316,7 @@ def osi_trace(path: Path, crossing_m: float, *, live: bool = False) -> Iterator[
     check_extra("osi3")
     many, states = path.suffix.lower() == ".mcap", count()
     opened = _osi_mcap if many else _osi_lengths
-    with GrowingFile(path) if live else whole_file(path) as file, opened(file) as write:
+    with opener(path) as file, opened(file) as write:
         yield lambda state: write(osi_sensor_data(state, crossing_m), next(states))
     if many:
         path.rename(path.with_name(_osi_name(path.name, next(states))))
@@ -339,7 +337,7 @@ def _osi_lengths(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], 
 def _osi_mcap(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], None]]:
     """Lend a function that writes a message to OSI's multi-channel trace."""
     osi, protobuf = _osi_versions()
-    writer = optional("mcap.writer").Writer(file, chunk_size=_CHUNK_BYTES)
+    writer = optional("mcap.writer").Writer(file, chunk_size=1 << 12)  # a second of states
     writer.start()
     bounds = {f"{bound}_osi_version": osi for bound in ("min", "max")}
     bounds |= {f"{bound}_protobuf_version": protobuf for bound in ("min", "max")}
@@ -418,7 +416,7 @@ class _Numbers:
 
 
 @contextmanager
-def mot_lines(path: Path, writer: LineWriter = line_writer) -> Iterator[Callable[[WorldState], None]]:
+def mot_lines(path: Path, opener: FileOpener) -> Iterator[Callable[[WorldState], None]]:
     """Lend a function that writes states as text of MOTChallenge 2015, tracks in space.
 
     A line is ``frame, id, -1, -1, -1, -1, conf, x, y, z``: number of the state from 1, that of the entity,
@@ -426,7 +424,7 @@ def mot_lines(path: Path, writer: LineWriter = line_writer) -> Iterator[Callable
     a moving entity of which no distance is stated has no line.
     """
     numbers, frames = _Numbers(), count(1)
-    with writer(path) as write:
+    with line_writer(path, opener) as write:
 
         def write_state(state: WorldState) -> None:
             frame, known = next(frames), numbers.of(state)

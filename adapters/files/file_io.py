@@ -92,18 +92,16 @@ def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence
         writer.writerows(rows)
 
 
-LineWriter: TypeAlias = Callable[[Path], AbstractContextManager[Callable[[str], None]]]
+FileOpener: TypeAlias = Callable[[Path], "AbstractContextManager[BinaryIO | GrowingFile]"]
 
 
 @contextmanager
-def line_writer(
-    path: Path, *, growing: bool = False, most_bytes: int | None = None
-) -> Iterator[Callable[[str], None]]:
-    """Lend a function that writes lines of UTF-8 to a file, which takes its name at the end.
-
-    Where it is `growing` it is a `GrowingFile`, of so many bytes at most.
-    """
-    with GrowingFile(path, most_bytes) if growing else whole_file(path) as file:
+def line_writer(path: Path | None, opener: FileOpener = whole_file) -> Iterator[Callable[[str], None]]:
+    """Lend a function that writes lines of UTF-8 to a file; without a path one that writes nothing."""
+    if path is None:
+        yield lambda line: None
+        return
+    with opener(path) as file:
 
         def write(line: str) -> None:
             if isinstance(file, GrowingFile) and file.full:

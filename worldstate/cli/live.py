@@ -245,11 +245,9 @@ def _trust(arguments: argparse.Namespace) -> "Trust":
         problem = f"expected a secret of at least {SHORTEST_KEY} bytes, got {len(key)}"
         raise ground.InputFileError(arguments.key, problem)
     try:
-        allow = tuple(map(socket.gethostbyname, arguments.allow))
+        return Trust(tuple(map(socket.gethostbyname, arguments.allow)), key)
     except (OSError, UnicodeError) as error:
-        got = ", ".join(arguments.allow)
-        raise InvalidArgumentError(f"--allow: expected hosts, got {got} ({error})") from error
-    return Trust(allow, key)
+        raise InvalidArgumentError(f"--allow: expected hosts, got {arguments.allow} ({error})") from error
 
 
 def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
@@ -270,19 +268,17 @@ def _listen(
     steps: "Iterator[LiveStep]",
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
-    from worldstate.adapters.files.file_io import line_writer
+    from worldstate.adapters.files.file_io import GrowingFile, line_writer
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
-    from worldstate.adapters.state_log import states_writer
     from worldstate.operations.recordings.recording_report import WarningMeter, calibration_words
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice = _loss_notices()
-    lines = partial(line_writer, growing=True, most_bytes=exports.most_bytes(arguments))
     start_s = ground.seconds(source.start_ns)
     longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
         _kept(arguments) as keep,
-        states_writer(arguments.out, lines) as write,
+        line_writer(arguments.out, partial(GrowingFile, most_bytes=exports.most_bytes(arguments))) as write,
         exports.exported_hops(arguments, source, given.car.crossing_m, live=True) as export,
         _view(arguments) as show,
         command.stopped_by_signals(sound.close),

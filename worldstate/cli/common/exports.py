@@ -153,16 +153,16 @@ def _websocket(port: str, paced: bool, origins: list[str]) -> "Iterator[LogSink]
 
 def _stack(name: str, target: str, crossing_m: float, live: bool, arguments: argparse.Namespace) -> "Stack":
     from worldstate.adapters.export import other_stacks
-    from worldstate.adapters.files.file_io import line_writer
+    from worldstate.adapters.files.file_io import GrowingFile, whole_file
     from worldstate.adapters.own_parts import ExporterPart, load_part, own_exporter
     from worldstate.adapters.ros.bag_writer import state_bag
 
-    lines = partial(line_writer, growing=live, most_bytes=most_bytes(arguments))
+    opener = partial(GrowingFile, most_bytes=most_bytes(arguments)) if live else whole_file
     comes = live and arguments.odometry is not None
     own: dict[str, ExporterPart] = {
-        "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m, live=live),
-        "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m, lines, comes=comes),
-        "mot": lambda path: other_stacks.mot_lines(Path(path), lines),
+        "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m, opener),
+        "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m, opener, comes=comes),
+        "mot": lambda path: other_stacks.mot_lines(Path(path), opener),
         "odas": partial(other_stacks.odas_socket, live=live),
         "rosbag": lambda path: state_bag(Path(path), crossing_m),
         "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),
