@@ -1,13 +1,12 @@
 """Snapshots of a log in any form: JSON lines of `worldstate run --out`, MCAP, or a bag of ROS 2."""
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.export.log_messages import IMAGE_TOPIC, SNAPSHOT_TOPIC, SOUND_TOPIC, read_messages
 from worldstate.adapters.export.scene import CompressedImage, RawAudio
-from worldstate.adapters.files.file_io import GrowingFile, line_writer, refused_as_file
+from worldstate.adapters.files.file_io import refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
 from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
@@ -72,27 +71,6 @@ def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:
             got = f"got {seconds(stamp_ns):.1f} s"
             raise InputFileError(path, f"expected a time from {span}, in which it has snapshots, {got}")
         return WorldState.from_dict(nearest[1])
-
-
-def states_writer(path: Path | None) -> AbstractContextManager[Callable[[str], None]]:
-    """Lend a function that writes a snapshot's line; without a path one that writes nothing."""
-    return nullcontext(lambda line: None) if path is None else line_writer(path)
-
-
-@contextmanager
-def growing_lines(path: Path | None, most_bytes: int | None = None) -> Iterator[Callable[[str], None]]:
-    """Lend a function that writes a snapshot's line to a `GrowingFile`; without a path it writes nothing."""
-    if path is None:
-        yield lambda line: None
-        return
-    with GrowingFile(path, most_bytes) as log:
-
-        def write(line: str) -> None:
-            if log.full:
-                log.begin()
-            log.write(f"{line}\n".encode())
-
-        yield write
 
 
 def _json_lines(path: str | Path) -> Iterator[str]:

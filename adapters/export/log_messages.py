@@ -19,7 +19,7 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.files.file_io import GrowingFile, atomic_path
+from worldstate.adapters.files.file_io import GrowingFile, atomic_path, whole_file
 from worldstate.ground import FloatArray, InputFileError, nanoseconds
 from worldstate.ground.errors import MissingExtraError
 from worldstate.ground.extras import check_extra, optional
@@ -248,7 +248,7 @@ def _colors(
 def mcap_file(path: Path) -> Iterator[LogSink]:
     """Lend a function that writes messages to an MCAP file, which takes its name when the block ends."""
     check_extra("mcap")
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with whole_file(path) as file:
         messages = _McapMessages(file)
         yield messages.write
         messages.finish()

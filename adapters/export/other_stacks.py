@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from worldstate.adapters.files.file_io import atomic_path, line_writer
+from worldstate.adapters.files.file_io import FileOpener, GrowingFile, line_writer
 from worldstate.ground import FloatArray, InvalidArgumentError, seconds
 from worldstate.ground.extras import check_extra, optional
 from worldstate.state import Entity, WorldState
@@ -182,10 +182,15 @@ def is_localised(state: WorldState) -> bool:
 
 
 @contextmanager
-def autoware_lines(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes the messages of states, one a line; the first state must have a pose."""
-    started = False
-    with line_writer(path) as write:
+def autoware_lines(
+    path: Path, crossing_m: float, opener: FileOpener, *, comes: bool
+) -> Iterator[Callable[[WorldState], None]]:
+    """Lend a function that writes the messages of states, one a line.
+
+    The first state must have a pose, unless one `comes` by a running odometry.
+    """
+    started = comes
+    with line_writer(path, opener) as write:
 
         def write_state(state: WorldState) -> None:
             nonlocal started
@@ -303,22 +308,22 @@ def _set(part: Any, **values: float) -> None:
 
 
 @contextmanager
-def osi_trace(path: Path, crossing_m: float) -> Iterator[Callable[[WorldState], None]]:
+def osi_trace(path: Path, crossing_m: float, opener: FileOpener) -> Iterator[Callable[[WorldState], None]]:
     """Lend a function that writes states to a trace: of one channel, or multi-channel where it ends in .mcap.
 
-    The name of the latter is extended to OSI's convention, of which the number of states is a part.
+    The name of the latter is extended to OSI's convention at the end: the number of states is a part of it.
     """
     check_extra("osi3")
     many, states = path.suffix.lower() == ".mcap", count()
     opened = _osi_mcap if many else _osi_lengths
-    with atomic_path(path) as temporary, temporary.open("wb") as file, opened(file) as write:
+    with opener(path) as file, opened(file) as write:
         yield lambda state: write(osi_sensor_data(state, crossing_m), next(states))
     if many:
         path.rename(path.with_name(_osi_name(path.name, next(states))))
 
 
 @contextmanager
-def _osi_lengths(file: BinaryIO) -> Iterator[Callable[[Any, int], None]]:
+def _osi_lengths(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], None]]:
     """Lend a function that writes a message after its length, little endian."""
 
     def write(data: Any, number: int) -> None:
@@ -329,10 +334,10 @@ def _osi_lengths(file: BinaryIO) -> Iterator[Callable[[Any, int], None]]:
 
 
 @contextmanager
-def _osi_mcap(file: BinaryIO) -> Iterator[Callable[[Any, int], None]]:
+def _osi_mcap(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], None]]:
     """Lend a function that writes a message to OSI's multi-channel trace."""
     osi, protobuf = _osi_versions()
-    writer = optional("mcap.writer").Writer(file)
+    writer = optional("mcap.writer").Writer(file, chunk_size=1 << 12)  # a second of states
     writer.start()
     bounds = {f"{bound}_osi_version": osi for bound in ("min", "max")}
     bounds |= {f"{bound}_protobuf_version": protobuf for bound in ("min", "max")}
@@ -411,7 +416,7 @@ class _Numbers:
 
 
 @contextmanager
-def mot_lines(path: Path) -> Iterator[Callable[[WorldState], None]]:
+def mot_lines(path: Path, opener: FileOpener) -> Iterator[Callable[[WorldState], None]]:
     """Lend a function that writes states as text of MOTChallenge 2015, tracks in space.
 
     A line is ``frame, id, -1, -1, -1, -1, conf, x, y, z``: number of the state from 1, that of the entity,
@@ -419,7 +424,7 @@ def mot_lines(path: Path) -> Iterator[Callable[[WorldState], None]]:
     a moving entity of which no distance is stated has no line.
     """
     numbers, frames = _Numbers(), count(1)
-    with line_writer(path) as write:
+    with line_writer(path, opener) as write:
 
         def write_state(state: WorldState) -> None:
             frame, known = next(frames), numbers.of(state)

@@ -334,7 +334,7 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
     said = f"{cue.direction}: risk {_short(cue.risk)}"
     if cue.within is not None and "3" in cue.within:
         said += f", in 3 s {_short(cue.within['3'])}"
-    said += " ADVISORY" if raised else ""
+    said += (" ADVISORY" if raised else "") + ("" if state.calibrated else ", not calibrated")
     text = _text(cue.azimuth_rad, CUE_M + 2.0, said, _DECISION if raised else _GREY)
     pairs = _pairs(risk=cue.risk, confidence=cue.confidence, advisory=raised, within=cue.within)
     return _item(state, f"cue {cue.direction}", metadata=pairs, triangles=(shape,), texts=(text,))

@@ -14,10 +14,10 @@ import shutil
 import uuid
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Self, TypeVar, get_args, get_type_hints
+from typing import Any, BinaryIO, Self, TypeAlias, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -42,6 +42,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         except BaseException:  # a second Ctrl-C; the first one is on its way up already
             _remove(temporary)
             raise
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[BinaryIO]:
+    """Lend an open file that takes its name at the end."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        yield file
 
 
 def check_target(path: str | Path) -> Path:
@@ -85,11 +92,23 @@ def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence
         writer.writerows(rows)
 
 
+FileOpener: TypeAlias = Callable[[Path], "AbstractContextManager[BinaryIO | GrowingFile]"]
+
+
 @contextmanager
-def line_writer(path: str | Path) -> Iterator[Callable[[str], None]]:
-    """Lend a function that writes lines of UTF-8 to a file, which takes its name at the end."""
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        yield lambda line: print(line, file=file)
+def line_writer(path: Path | None, opener: FileOpener = whole_file) -> Iterator[Callable[[str], None]]:
+    """Lend a function that writes lines of UTF-8 to a file; without a path one that writes nothing."""
+    if path is None:
+        yield lambda line: None
+        return
+    with opener(path) as file:
+
+        def write(line: str) -> None:
+            if isinstance(file, GrowingFile) and file.full:
+                file.begin()
+            file.write(f"{line}\n".encode())
+
+        yield write
 
 
 class GrowingFile:
@@ -306,7 +325,7 @@ _MAX_DIRECTORY_BYTES = 1 << 16
 
 def save_npz(path: str | Path, values: Mapping[str, Any]) -> None:
     """Write arrays by name."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with whole_file(path) as file:
         np.savez_compressed(file, **values)
 
 

@@ -212,7 +212,7 @@ class DetectionSocket(DatagramSocket[DetectionFrame]):
 
 
 class OdometrySocket(DatagramSocket[OdometryRecord]):
-    """Odometry of a running vehicle, for `Listener.tell`.
+    """Odometry of a running vehicle, for `Listener.add`.
 
     ``{"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}``, with a localiser "x_m", "y_m" and "yaw_rad"
     in the map, too. The last one holds until the next. The filter puts what is up to two seconds late where

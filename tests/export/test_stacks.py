@@ -1,5 +1,7 @@
 """OSI, Autoware and ODAS: read back by their own package, or by a parser written from their definitions."""
 
+import argparse
+import io
 import json
 import math
 import os
@@ -17,6 +19,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader
+from osi3.osi_sensordata_pb2 import SensorData
 from scripted_states import EGO, scripted_states
 
 from worldstate.adapters.export import other_stacks
@@ -26,7 +31,9 @@ from worldstate.adapters.export.other_stacks import (
     lane_objects,
     osi_sensor_data,
 )
+from worldstate.cli.common.exports import open_exports
 from worldstate.cli.main import main
+from worldstate.ground.errors import InvalidArgumentError
 
 STATES = scripted_states()
 HIDDEN, PLACED = STATES[0], STATES[-1]
@@ -270,6 +277,47 @@ def test_a_pose_that_is_lost_on_the_way_leaves_states_out(tmp_path):
     out = tmp_path / "objects.jsonl"
     assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", f"autoware={out}"]) == 0
     assert len(out.read_text().splitlines()) == 2
+
+
+def exporting(export, live=True, **options):
+    asked = {"export": [export], "origin": [], "rotate_mib": None, "odometry": None} | options
+    return open_exports(argparse.Namespace(**asked), live=live)
+
+
+def test_a_pose_that_a_running_localiser_has_not_told_yet_does_not_end_a_live_run(tmp_path):
+    out = tmp_path / "objects.jsonl"
+    with exporting(f"autoware={out}", odometry="127.0.0.1:9000") as exports:
+        for state in (replace(HIDDEN, ego=None), PLACED):
+            exports.state(state)
+    assert len(out.read_text().splitlines()) == 1
+    with (
+        pytest.raises(InvalidArgumentError, match="expected odometry"),
+        exporting(f"autoware={out}") as exports,
+    ):
+        exports.state(replace(HIDDEN, ego=None))
+
+
+@pytest.mark.parametrize("target", ["autoware=out.jsonl", "mot=out.txt", "osi=out.osi", "osi=out.mcap"])
+def test_what_a_live_run_has_exported_is_there_while_it_goes_on(target, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with exporting(target) as exports:
+        for seq in range(40):
+            exports.state(replace(PLACED, seq=seq, stamp_ns=seq * 10**8))
+        kept = (tmp_path / target.partition("=")[2]).read_bytes()
+    assert kept.count(b"\n") == 40 or len(osi_messages(kept, target)) >= 30
+
+
+def osi_messages(kept, target):
+    """Return the messages of a trace that was not ended."""
+    found = []
+    if target.endswith("mcap"):
+        reader = NonSeekingReader(io.BytesIO(kept))
+        with suppress(EndOfFile):
+            found.extend(message.data for *_, message in reader.iter_messages(log_time_order=False))
+    while target.endswith("osi") and kept:
+        end = 4 + int.from_bytes(kept[:4], "little")
+        found, kept = [*found, kept[4:end]], kept[end:]
+    return [SensorData.FromString(one) for one in found]
 
 
 def stops_for(message, least_confidence=0.05, kinds=(0, 1, 2, 3, 4, 5, 6)):

@@ -46,6 +46,20 @@ def test_a_vehicle_is_not_who():
     assert len(counted) <= 20, counted
 
 
+# Words that pages and messages use in a sense of ours.
+OURS = """absence, advisory, arm, block, budget, chance, co-evidence, context, cue, domain, ego,
+ensemble, entity, explanation, feature, frame, guard, hand-over, heard, hop, image, lead time, look,
+looming, masked, miss rate, onset, pass, phantom, preset, prominence, reference, risk, scan, sequence,
+sighting, signature, simulation, site, snapshot, stream, T0, time to visible, uncalibrated, unqueried,
+window"""
+
+
+def test_every_term_of_ours_is_in_the_glossary():
+    page = (ROOT / "docs" / "reference" / "glossary.md").read_text(encoding="utf-8")
+    entries = re.split(r", |\n", "\n".join(re.findall(r"^(.+)\n: ", page, flags=re.M)))
+    assert set(re.split(r",\s", OURS)) - set(entries) == set()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_lines_of_a_page_can_be_read_as_text(page):
     """Prose within 140 characters; tables and commands are as long as they are."""

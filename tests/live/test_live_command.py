@@ -55,6 +55,7 @@ def test_states_are_those_of_run_and_no_sound_is_kept(street, tmp_path, capsys):
     assert live.read_text() == run.read_text()
     assert [path.name for path in live.parent.iterdir()] == ["states.jsonl"]
     assert report["states"] == 11
+    assert report["calibration"] == "uncalibrated"
     assert report["overruns"] == report["lost_s"] == 0
     assert 0.0 < report["latency_median_s"] <= report["latency_p99_s"] <= report["latency_largest_s"]
     assert report["cpu_s"] > 0.0
@@ -95,6 +96,7 @@ def test_the_view_shows_bearing_risk_and_losses(street):
     assert "2.0 s   latency" in shown
     assert "3 overruns, 0.07 s lost" in shown or "3 overruns, 0.08 s lost" in shown
     assert [line.split()[0] for line in shown.splitlines() if "risk" in line] == ["left", "right"]
+    assert "not calibrated" in shown
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,8 +16,8 @@ import soundfile
 
 from worldstate.adapters.export.log_messages import growing_mcap, state_messages
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
-from worldstate.adapters.files.file_io import GrowingFile
-from worldstate.adapters.state_log import growing_lines, read_log
+from worldstate.adapters.files.file_io import GrowingFile, line_writer
+from worldstate.adapters.state_log import read_log
 from worldstate.cli import live
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, WorldstateError
@@ -146,7 +147,7 @@ def test_the_belief_is_kept_every_minute_and_at_an_error(street, tmp_path, monke
 
 def test_a_log_that_is_full_goes_on_in_a_new_file(tmp_path):
     path = tmp_path / "log.jsonl"
-    with growing_lines(path, 100) as write:
+    with line_writer(path, partial(GrowingFile, most_bytes=100)) as write:
         for number in range(60):
             write(f'{{"number": {number:>10}}}')
     assert sorted(one.name for one in tmp_path.iterdir()) == ["log.1.jsonl", "log.jsonl"]

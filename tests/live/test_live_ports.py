@@ -1,5 +1,6 @@
 """Whose datagrams a port takes."""
 
+import argparse
 import hashlib
 import hmac
 import json
@@ -7,11 +8,14 @@ import socket
 import time
 
 import numpy as np
+import pytest
 import soundfile
 
 from worldstate.adapters.live import live_sensors
 from worldstate.adapters.live.live_sensors import OdometrySocket, Trust
+from worldstate.cli.live import _trust
 from worldstate.cli.main import main
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import nanoseconds
 
 SECRET = b"sixteen bytes or more"
@@ -67,6 +71,13 @@ def test_only_addresses_that_are_allowed_are_taken():
     speeds, problem = taken(Trust(allow=("127.0.0.2",)), *sent, hosts=("127.0.0.1", "127.0.0.2"))
     assert speeds == [2]
     assert "expected one of 127.0.0.2, got 127.0.0.1" in problem
+
+
+def test_a_host_is_allowed_by_its_name_too():
+    asked = argparse.Namespace(allow=["localhost", "127.0.0.2"], key=None)
+    assert _trust(asked).allow == ("127.0.0.1", "127.0.0.2")
+    with pytest.raises(InvalidArgumentError, match="--allow: expected hosts"):
+        _trust(argparse.Namespace(allow=["no such host"], key=None))
 
 
 def test_numbers_rise_and_what_is_old_is_left_out():

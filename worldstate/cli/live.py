@@ -35,6 +35,7 @@ Examples
 
 import argparse
 import math
+import socket
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -243,7 +244,10 @@ def _trust(arguments: argparse.Namespace) -> "Trust":
     if key is not None and len(key) < SHORTEST_KEY:
         problem = f"expected a secret of at least {SHORTEST_KEY} bytes, got {len(key)}"
         raise ground.InputFileError(arguments.key, problem)
-    return Trust(tuple(arguments.allow), key)
+    try:
+        return Trust(tuple(map(socket.gethostbyname, arguments.allow)), key)
+    except (OSError, UnicodeError) as error:
+        raise InvalidArgumentError(f"--allow: expected hosts, got {arguments.allow} ({error})") from error
 
 
 def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
@@ -264,9 +268,9 @@ def _listen(
     steps: "Iterator[LiveStep]",
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
+    from worldstate.adapters.files.file_io import GrowingFile, line_writer
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
-    from worldstate.adapters.state_log import growing_lines
-    from worldstate.operations.recordings.recording_report import WarningMeter
+    from worldstate.operations.recordings.recording_report import WarningMeter, calibration_words
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice = _loss_notices()
@@ -274,7 +278,7 @@ def _listen(
     longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
         _kept(arguments) as keep,
-        growing_lines(arguments.out, exports.most_bytes(arguments)) as write,
+        line_writer(arguments.out, partial(GrowingFile, most_bytes=exports.most_bytes(arguments))) as write,
         exports.exported_hops(arguments, source, given.car.crossing_m, live=True) as export,
         _view(arguments) as show,
         command.stopped_by_signals(sound.close),
@@ -299,6 +303,7 @@ def _listen(
         "latency_largest_s": latency.quantile_s(1.0),
         **cost.read(),
         "peak_risk": warnings.peak_risk,
+        "calibration": calibration_words(warnings.uncalibrated, warnings.states),
         "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
     }
 

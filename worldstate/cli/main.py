@@ -4,7 +4,7 @@ example: worldstate demo --out out/demo
 
 exit codes: 0 done, 1 `array check` found a fault, 2 bad input (one line on
 standard error says what came and what was expected), 130 after Ctrl-C, 143
-after SIGTERM; unfinished files are removed in each case
+after SIGTERM; unfinished files are removed, but for the logs of `live`
 """
 
 import json

@@ -110,7 +110,7 @@ def open_exports(
     """Open everything that was asked for.
 
     What comes too soon is played at the speed of its stamps, and files take their name at the end; not so of
-    a `live` run, which sets the pace and has no end.
+    a `live` run, which sets the pace and has no end: only its bags and Rerun files do.
     """
     with ExitStack() as opened:
         exports = Exports()
@@ -118,7 +118,7 @@ def open_exports(
             if name in _VIEWERS:
                 exports.viewers.append(opened.enter_context(_viewer(name, target, live, arguments)))
             else:
-                exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m, live)))
+                exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m, live, arguments)))
         yield exports
 
 
@@ -151,15 +151,18 @@ def _websocket(port: str, paced: bool, origins: list[str]) -> "Iterator[LogSink]
         yield send
 
 
-def _stack(name: str, target: str, crossing_m: float, live: bool) -> "Stack":
+def _stack(name: str, target: str, crossing_m: float, live: bool, arguments: argparse.Namespace) -> "Stack":
     from worldstate.adapters.export import other_stacks
+    from worldstate.adapters.files.file_io import GrowingFile, whole_file
     from worldstate.adapters.own_parts import ExporterPart, load_part, own_exporter
     from worldstate.adapters.ros.bag_writer import state_bag
 
+    opener = partial(GrowingFile, most_bytes=most_bytes(arguments)) if live else whole_file
+    comes = live and arguments.odometry is not None
     own: dict[str, ExporterPart] = {
-        "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m),
-        "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m),
-        "mot": lambda path: other_stacks.mot_lines(Path(path)),
+        "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m, opener),
+        "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m, opener, comes=comes),
+        "mot": lambda path: other_stacks.mot_lines(Path(path), opener),
         "odas": partial(other_stacks.odas_socket, live=live),
         "rosbag": lambda path: state_bag(Path(path), crossing_m),
         "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),

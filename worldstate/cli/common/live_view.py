@@ -48,6 +48,7 @@ def view_of(live: "LiveStep") -> RenderableType:
     lost = f"{live.overruns} overruns, {live.lost_s:.2f} s lost"
     head = Text(f"{ground.seconds(state.stamp_ns):9.1f} s   {late}   ")
     head.append(lost, style="red" if live.overruns else "green")
+    head.append("" if state.calibrated else "   not calibrated", style="bold red")
     return Group(head, _bearing(state), *map(_cue, state.cues), _entities(state.entities))
 
 

@@ -30,14 +30,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.state_log import read_log, states_writer
+    from worldstate.adapters.files.file_io import line_writer
+    from worldstate.adapters.state_log import read_log
     from worldstate.operations.recordings.recording_report import WarningMeter, calibration_words
 
     output.check_outputs(arguments, "out")
     crossing_m = ground.in_range("--crossing", arguments.crossing, 1.0, 100.0)
     meter = WarningMeter(t0_s=None)
     with (
-        states_writer(arguments.out) as write,
+        line_writer(arguments.out) as write,
         exports.open_exports(arguments, crossing_m=crossing_m) as opened,
         progress.progress_bar(f"reading {arguments.log.name}", None) as bar,
     ):

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.adapters.files.checkpoint_file import Checkpoint
+from worldstate.adapters.files.file_io import line_writer
 from worldstate.adapters.listener import Step, listen_steps
 from worldstate.adapters.source import Source
-from worldstate.adapters.state_log import states_writer
 from worldstate.ground.values import seconds
 from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, onset_outcome
 from worldstate.state import WorldState
@@ -199,7 +199,7 @@ def run_recording(
     """
     meter, health = WarningMeter(source.t0_s, source.hazard_free), HealthLog()
     started, end = time.perf_counter(), None
-    with states_writer(states_path) as write:
+    with line_writer(states_path) as write:
         for step in listen_steps(source):
             write(step.state.to_json())
             meter.update(step.state)
