@@ -59,8 +59,8 @@ from .recording import (
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
 JUNCTION, ALL = "junction", "all"
-# Below, nothing is left of the band that bearings and features are taken from.
-BANDWIDTHS_HZ = (700.0, 32_000.0)
+# Below, nothing is left of the band that bearings and features are taken from; above, it stays as it is.
+BANDWIDTHS_HZ = (700.0, 16_000.0)
 APPROACH_SIDES = ("left", "right")
 
 
@@ -99,7 +99,7 @@ class DatasetSettings:
     video_width_px : int
         Width of its images, 64 to 1936, OVAD's; the height follows. Boxes are those of the full size.
     bandwidth_hz : float, optional
-        Render up to here only, 700 to 32,000 Hz, at the rate `rate_for`; the full rate if not given.
+        Render up to here only, 700 to 16,000 Hz, at the rate `rate_for`; the full rate if not given.
     sounds : tuple of str
         What else sounds in every recording, of `SOUNDS`; a vehicle's signal is its own where there is one.
     preset : str
