@@ -250,7 +250,7 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
     if dynamic:
         parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
-    with progress_bar("simulating streets", None) as bar:
+    with progress_bar("simulating streets", static + dynamic) as bar:
         for part in parts:
             write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance(), go_on=True)
     return root
