@@ -76,7 +76,7 @@ from worldstate_lab.report.table import Cell, Table, Value, plain, write_documen
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.pass_cache import Hearing
+from worldstate_lab.trials.pass_cache import Hearer
 from worldstate_lab.trials.trial import Take, TakeList, find_takes
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
@@ -124,7 +124,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     arguments.seeds = seeds
     found = evaluate(
         takes,
-        Hearing(arguments.out / "cache", arguments.model),
+        Hearer(arguments.out / "cache", arguments.model),
         classifiers,
         arguments.jobs,
         track,
