@@ -18,7 +18,7 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.sound_file import SoundInput, SoundStream, as_sound, path_of
-from worldstate.adapters.camera.camera_channel import video_degradation, watched
+from worldstate.adapters.camera.camera_channel import seen_in, video_degradation
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector, read_any_detections
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
@@ -476,6 +476,6 @@ def _with_camera(
     elif detections is not None or video is None:
         raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
     else:
-        log, degradation = watched(open_video(video), detector, rates)
+        log, degradation = seen_in(open_video(video), detector, rates)
     log = None if log is None else log.shifted(camera.stamp_offset_s)
     return replace(source, detections=log, degradation=degradation)

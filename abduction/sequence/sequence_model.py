@@ -209,8 +209,8 @@ def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
     """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
     within = np.clip(posterior.within()[..., HORIZONS_S.index(3.0)], _SMALLEST, 1.0 - _SMALLEST)
     log_odds = np.log(within) - np.log1p(-within)
-    padded = np.concatenate([np.repeat(log_odds[:1], SMOOTHED_HOPS - 1, axis=0), log_odds])
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, SMOOTHED_HOPS, axis=0).mean(axis=-1))
+    recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
+    return np.asarray(log_odds[np.maximum(recent, 0)].mean(axis=1))
 
 
 def held(over: BoolArray, hops: int = HELD_HOPS) -> BoolArray:

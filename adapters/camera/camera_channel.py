@@ -34,7 +34,7 @@ class ImageHealth:
         return self.level
 
 
-def watched(video: Video, detector: Detector, rates: MissRates | None) -> tuple[DetectionLog, DegradationLog]:
+def seen_in(video: Video, detector: Detector, rates: MissRates | None) -> tuple[DetectionLog, DegradationLog]:
     """Return what a new detector finds in a video, each image decoded once, and d as last read from it.
 
     Rates are those measured for this detector and camera; without the scale of its health d is 0.

@@ -1,7 +1,7 @@
 """From image columns to azimuth in `base_link` and back."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.adapters.files.file_io import read_record, refused_as_file
 from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, in_range, wrap_angle
+from worldstate.ground.serialisation import ADDED
 from worldstate.measurement.measurement import Sighting
 
 
@@ -249,7 +250,8 @@ def read_camera(path: str | Path) -> PinholeCamera:
     Raises
     ------
     InputFileError
-        If the file is missing, too large, no JSON, or a number is missing or out of range.
+        If the file is missing, too large, no JSON, has a key that means nothing here, or a number is missing
+        or out of range.
 
     Examples
     --------
@@ -263,7 +265,7 @@ def read_camera(path: str | Path) -> PinholeCamera:
     [-45.0, 45.0]
     """
     with refused_as_file(path):
-        return read_record(CameraRecord, path, "camera").camera()
+        return read_record(CameraRecord, path, "camera", by_hand=True).camera()
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,6 +283,13 @@ class CameraRecord:
     position_m: tuple[float, float, float] | None = None
     stamp_offset_s: float | None = None
     name: str | None = None
+    detections: str | None = None
+    image_rate_hz: float | None = None
+    miss_rates: str | None = None
+    classes: tuple[str, ...] = field(default=("car", "motorcycle"), metadata=ADDED)
+    min_score: float = field(default=0.75, metadata=ADDED)
+    min_box_px: float = field(default=100.0, metadata=ADDED)
+    labels: tuple[str, ...] = field(default=("car",), metadata=ADDED)
 
     def camera(self) -> PinholeCamera:
         """Return the camera."""

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import decode
 from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_side
 
-from .file_io import check_keys, read_json, refused_as_file
+from .file_io import read_record, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +101,4 @@ def read_context(path: str | Path) -> Context:
     [('left', 31, False), ('right', -39, False)]
     """
     with refused_as_file(path):
-        given = read_json(path, "a context file")
-        check_keys(given, _ContextFile, "context")
-        return decode(_ContextFile, given, "context").context()
+        return read_record(_ContextFile, path, "context", by_hand=True).context()

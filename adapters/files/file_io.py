@@ -227,13 +227,16 @@ def read_json(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> object
         return decode_json(read_text(path, what, max_bytes), what)
 
 
-def read_record(kind: type[T], path: str | Path, what: str) -> T:
-    """Return the value of type `kind` that a JSON file holds."""
+def read_record(kind: type[T], path: str | Path, what: str, *, by_hand: bool = False) -> T:
+    """Return the value of type `kind` that a JSON file holds, which is checked for its keys if `by_hand`."""
     with refused_as_file(path):
-        return decode(kind, read_json(path, f"a {what} file"), what)
+        given = read_json(path, f"a {what} file")
+        if by_hand:
+            _check_keys(given, kind, what)
+        return decode(kind, given, what)
 
 
-def check_keys(given: object, kind: type, where: str) -> None:
+def _check_keys(given: object, kind: type, where: str) -> None:
     """Refuse keys that mean nothing in what is written by hand: a wrong name would be left out in silence."""
     if not isinstance(given, dict):  # the decoder says what it is
         return
@@ -244,7 +247,7 @@ def check_keys(given: object, kind: type, where: str) -> None:
         several, part = isinstance(value, list), _record_in(hints[key])
         for number, one in enumerate(value if several else [value]):
             if part is not None:
-                check_keys(one, part, f"{where}.{key}" + f"[{number}]" * several)
+                _check_keys(one, part, f"{where}.{key}" + f"[{number}]" * several)
 
 
 def _record_in(hint: Any) -> Any:

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
 from worldstate.adapters.files.array_file import checked_array, read_array
-from worldstate.adapters.files.file_io import check_keys, read_json, read_record, refused_as_file, write_json
+from worldstate.adapters.files.file_io import read_json, read_record, refused_as_file, write_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.checks import one_of
-from worldstate.ground.serialisation import ADDED, decode
+from worldstate.ground.serialisation import ADDED
 
 # No vehicle carries a sensor farther from its origin; such a number was written in millimetres.
 MAX_OFFSET_M = 30.0
@@ -179,10 +179,7 @@ def read_car(path: str | Path) -> CarSensors:
     [[1.2, 0.2, 1.6], [1.1, 0.0, 1.6]]
     """
     with refused_as_file(path):
-        given = read_json(path, "a car file")
-        check_keys(given, _CarFile, "car")
-        record = decode(_CarFile, given, "car")
-        return record.car(Path(path))
+        return read_record(_CarFile, path, "car", by_hand=True).car(Path(path))
 
 
 def write_aligned(
@@ -220,8 +217,8 @@ def read_camera_setup(path: str | Path) -> tuple[PinholeCamera, CameraSetup]:
         As `read_camera`.
     """
     with refused_as_file(path):
-        record = read_record(_CameraEntry, path, "camera")
-        return record.camera(), record.setup(Path(path).parent)
+        record = read_record(CameraRecord, path, "camera", by_hand=True)
+        return record.camera(), _setup(record, Path(path).parent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,32 +245,11 @@ class _ArrayRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class _CameraEntry(CameraRecord):
-    """What a car file holds of a camera."""
-
-    detections: str | None = None
-    image_rate_hz: float | None = None
-    miss_rates: str | None = None
-    classes: tuple[str, ...] = field(default=("car", "motorcycle"), metadata=ADDED)
-    min_score: float = field(default=0.75, metadata=ADDED)
-    min_box_px: float = field(default=100.0, metadata=ADDED)
-    labels: tuple[str, ...] = field(default=("car",), metadata=ADDED)
-
-    def setup(self, folder: Path) -> CameraSetup:
-        """Return what belongs to the camera, its files in a folder."""
-        if (rate_hz := self.image_rate_hz) is not None:
-            in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True)
-        detections, rates = (_beside(folder, file) for file in (self.detections, self.miss_rates))
-        boxes = DetectionFilter(frozenset(self.classes), self.min_score, self.min_box_px)
-        return CameraSetup(detections, rate_hz, rates, boxes, self.labels)
-
-
-@dataclass(frozen=True, slots=True)
 class _CarFile:
     """What a car file holds."""
 
     array: _ArrayRecord | None = None
-    cameras: tuple[_CameraEntry, ...] = field(default=(), metadata=ADDED)
+    cameras: tuple[CameraRecord, ...] = field(default=(), metadata=ADDED)
     name: str | None = None
     model: str | None = None
     odometry: str | None = None
@@ -294,7 +270,7 @@ class _CarFile:
             with _placed_at(where):
                 origin_m = (0.0, 0.0, 0.0) if self.array is None else self.array.position_m
                 cameras[record.name] = _relative(record, origin_m)
-                setups[record.name] = record.setup(folder)
+                setups[record.name] = _setup(record, folder)
         model, odometry = (_beside(folder, file) for file in (self.model, self.odometry))
         measured = {name: folder / file for name, file in self.measurements.items()}
         crossing_m = in_range("car.crossing_m", self.crossing_m, 1.0, 100.0)
@@ -303,6 +279,15 @@ class _CarFile:
 
 def _beside(folder: Path, file: str | None) -> Path | None:
     return None if file is None else folder / file
+
+
+def _setup(record: CameraRecord, folder: Path) -> CameraSetup:
+    """Return what belongs to a camera, its files in a folder."""
+    if (rate_hz := record.image_rate_hz) is not None:
+        in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True)
+    detections, rates = (_beside(folder, file) for file in (record.detections, record.miss_rates))
+    boxes = DetectionFilter(frozenset(record.classes), record.min_score, record.min_box_px)
+    return CameraSetup(detections, rate_hz, rates, boxes, record.labels)
 
 
 def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:

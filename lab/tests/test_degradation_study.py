@@ -48,7 +48,7 @@ from worldstate_lab.trials.pass_cache import Failed, PassCache, attempted
 
 from worldstate.abduction.co_evidence import Absent, default_miss_rates
 from worldstate.adapters.audio.sound_file import open_sound
-from worldstate.adapters.camera.camera_channel import watched
+from worldstate.adapters.camera.camera_channel import seen_in
 from worldstate.adapters.camera.camera_health import degrade, learn_health
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
 from worldstate.adapters.camera.detectors import MotionDetector
@@ -146,12 +146,12 @@ def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
 @pytest.mark.long
 def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
     first = SimpleNamespace(frames=lambda: islice(video.frames(), 90), frame_rate_hz=10.0, path="first")
-    found, d = watched(first, MotionDetector(), rates)
+    found, d = seen_in(first, MotionDetector(), rates)
     kept = detections_in(looks["mog2"], CLEAN)
     assert [len(frame) for frame in found.frames] == [len(frame) for frame in kept.frames[:90]]
     read = degradation_in(looks[READINGS], CLEAN, rates)
     assert np.median(d.degradation) == pytest.approx(np.median(read.degradation), abs=0.05)
-    assert watched(first, MotionDetector(), replace(rates, health=None))[1](0) == 0.0
+    assert seen_in(first, MotionDetector(), replace(rates, health=None))[1](0) == 0.0
 
 
 def test_d_is_read_from_the_images_alone(looks, rates):

@@ -37,7 +37,7 @@ from worldstate_lab.trials.classification import (
     windows_from_table,
 )
 from worldstate_lab.trials.listening import pass_time_s
-from worldstate_lab.trials.pass_cache import Failed, Hearing
+from worldstate_lab.trials.pass_cache import Failed, Hearer
 from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
 
 from worldstate.abduction.signature.site_estimate import SiteSignature
@@ -271,9 +271,9 @@ def test_another_model_hears_nothing_but_its_own_chain(tmp_path):
     signature = replace(model.signature, experts=model.signature.experts[:1])
     save_model(tmp_path / "other.json", replace(model, signature=signature))
     take, cache = Take(sound, "quiet", "quiet"), tmp_path / "cache"
-    heard = Hearing(cache)(take)
+    heard = Hearer(cache)(take)
     measured = {path: path.stat().st_mtime_ns for path in (cache / "front_end").iterdir()}
-    other = Hearing(cache, tmp_path / "other.json")(take)
+    other = Hearer(cache, tmp_path / "other.json")(take)
     assert {path: path.stat().st_mtime_ns for path in (cache / "front_end").iterdir()} == measured
     assert len(list((cache / "plain").glob("*.npz"))) == 2
     assert np.array_equal(heard.hops.features, other.hops.features)
@@ -285,12 +285,12 @@ def test_another_model_of_a_moving_ego_hears_its_drives_anew(tmp_path, monkeypat
     soundfile.write(tmp_path / "quiet.wav", noise, 48_000, subtype="FLOAT")
     write_array_xml(tmp_path / "array.xml", ovad_array())
     take, cache = Take(tmp_path / "quiet.wav", "quiet", "quiet", moving=True), tmp_path / "cache"
-    Hearing(cache)(take)
+    Hearer(cache)(take)
     before = read_model(moving_ego=True)
     another = replace(before, provenance=replace(before.provenance, dataset="another"))
     shipped = {False: read_model(), True: another}
     monkeypatch.setattr(pass_cache, "read_model", lambda path, *, moving_ego=False: shipped[moving_ego])
-    Hearing(cache)(take)
+    Hearer(cache)(take)
     assert len(list((cache / "plain").glob("*.npz"))) == 2
 
 
@@ -303,7 +303,7 @@ def test_a_model_is_not_scored_on_sound_that_it_was_not_made_for(microphones, ra
     noise = 0.01 * np.random.default_rng(0).standard_normal((rate_hz * 5 // 4, microphones))
     soundfile.write(tmp_path / "quiet.wav", noise, rate_hz, subtype="FLOAT")
     write_array_xml(tmp_path / "array.xml", array)
-    trial = Hearing(tmp_path / "cache")(Take(tmp_path / "quiet.wav", "quiet", "quiet"))
+    trial = Hearer(tmp_path / "cache")(Take(tmp_path / "quiet.wav", "quiet", "quiet"))
     assert dict(trial.chains) == {} and not {"shipped", "grounded"} & set(trial.hops.columns)
     assert np.isfinite(trial.hops.features).all()
     refused, rows = refused_methods([trial]), {method.name for method in methods_for([trial])}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from worldstate_lab.methods.line_of_sight import seen_early_s
-from worldstate_lab.trials.pass_cache import Hearing
+from worldstate_lab.trials.pass_cache import Hearer
 from worldstate_lab.trials.trial import Take, find_takes
 
 from worldstate.adapters.datasets.ovad import Recording
@@ -45,7 +45,7 @@ def found(request, tmp_path_factory):
         jobs = str(os.cpu_count() or 1)
         assert main(["evaluate", str(root), "--out", str(out), "--jobs", jobs]) == 0
         report = json.loads((out / "evaluation.json").read_text())
-    hearing = Hearing(out / "cache")
+    hearing = Hearer(out / "cache")
     return report, [hearing(take) for take in find_takes(root).static]
 
 
@@ -102,7 +102,7 @@ def test_who_was_heard_coming_is_who_comes(approaches, request, tmp_path):
     heard = list(approaches)
     if ROOT is None:  # two approaches may both be missed
         demo = Recording.open(request.getfixturevalue("approach").folder)
-        heard.append(Hearing(tmp_path)(Take.of(demo)))
+        heard.append(Hearer(tmp_path)(Take.of(demo)))
     warned = [trial for trial in heard if trial.chains["filtered"].alarm[trial.hops.before_sight()].any()]
     assert warned
     assert np.mean([_kept(trial) for trial in warned]) > 0.5

@@ -59,8 +59,8 @@ from .recording import (
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
 JUNCTION, ALL = "junction", "all"
-# Below, nothing is left of the band that bearings and features are taken from.
-BANDWIDTHS_HZ = (700.0, 32_000.0)
+# Below, nothing is left of the band that bearings and features are taken from; above, it stays as it is.
+BANDWIDTHS_HZ = (700.0, 16_000.0)
 APPROACH_SIDES = ("left", "right")
 
 
@@ -99,7 +99,7 @@ class DatasetSettings:
     video_width_px : int
         Width of its images, 64 to 1936, OVAD's; the height follows. Boxes are those of the full size.
     bandwidth_hz : float, optional
-        Render up to here only, 700 to 32,000 Hz, at the rate `rate_for`; the full rate if not given.
+        Render up to here only, 700 to 16,000 Hz, at the rate `rate_for`; the full rate if not given.
     sounds : tuple of str
         What else sounds in every recording, of `SOUNDS`; a vehicle's signal is its own where there is one.
     preset : str
@@ -250,7 +250,7 @@ def write_dataset(
     jobs : int
         Processes, 1 to 256.
     progress : callable, optional
-        Called with every finished recording, in order.
+        Called with every recording in order, once it is finished or found to be there.
     go_on : bool
         Leave recordings that the log lists and that are of these settings: what was interrupted is finished.
 
@@ -289,28 +289,22 @@ def write_dataset(
     folders = [_log_row(plan.environment, plan.approach, plan.number, 0).folder for plan in plans]
     for at in folders:
         refuse_foreign(folder / at)
-    if go_on:
-        pairs = zip(plans, folders, strict=True)
-        plans = [
-            plan
-            for plan, at in pairs
-            if at not in listed or not _is_of(folder / at, _drawn(wanted, listening, plan)[0])
-        ]
-    rows = []
+    rows, kept = [], [folder / at if go_on and at in listed else None for at in folders]
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as unlisted:
         simulate = partial(_simulate_one, Path(unlisted), wanted, listening)
-        with closing(in_processes(simulate, plans, jobs)) as simulated:
-            for row in simulated:
-                rows.append(row)
-                listed[row.folder] = row
-                _name_array(folder / ARRAY_NAME, listening)
-                with deferred_signals():
-                    try:
-                        put_in_place(folder / row.folder, Path(unlisted) / row.folder)
-                    finally:
-                        write_log(folder, [one for one in listed.values() if (folder / one.folder).is_dir()])
+        with closing(in_processes(simulate, list(zip(plans, kept, strict=True)), jobs)) as simulated:
+            for at, row in zip(folders, simulated, strict=True):
+                if row is not None:
+                    rows.append(row)
+                    listed[at] = row
+                    _name_array(folder / ARRAY_NAME, listening)
+                    with deferred_signals():
+                        try:
+                            put_in_place(folder / at, Path(unlisted) / at)
+                        finally:
+                            write_log(folder, [one for at, one in listed.items() if (folder / at).is_dir()])
                 if progress is not None:
-                    progress(row)
+                    progress(listed[at])
     return rows
 
 
@@ -406,8 +400,14 @@ def _is_of(folder: Path, settings: SimulationSettings) -> bool:
     return isinstance(truth, dict) and truth.get("settings") == json.loads(json.dumps(asdict(settings)))
 
 
-def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, plan: Plan) -> LogRow:
+def _simulate_one(
+    root: Path, wanted: DatasetSettings, array: MicrophoneArray, item: tuple[Plan, Path | None]
+) -> LogRow | None:
+    """Write a recording below `root`; None if it is of these settings where it is kept."""
+    plan, kept = item
     settings, rng = _drawn(wanted, array, plan)
+    if kept is not None and _is_of(kept, settings):
+        return None
     recording = simulate_recording(settings, rng, array)
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = None

@@ -16,6 +16,7 @@ from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
     HORIZONS_S,
     BoostedTrees,
+    SequenceAlarm,
     SequenceModel,
     SequencePosterior,
 )
@@ -100,6 +101,14 @@ def test_probabilities_within_rise_with_the_horizon_and_times_stand_in_their_int
     sure[..., GROUPS.index("coming_1.5s")] = 1.0
     low, best, high = SequencePosterior(sure, 0.0).time_to_visible_s()[0, 0]
     assert (best, round(low, 3), round(high, 3)) == (1.25, 1.025, 1.475)
+
+
+@pytest.mark.parametrize("hops", [0, 1, 2])
+def test_a_stream_shorter_than_what_is_smoothed_has_an_answer_a_hop(hops: int) -> None:
+    certain = np.zeros((hops, 2, len(GROUPS)))
+    certain[:, 0, 0] = certain[:, 1, -1] = 1.0  # One comes from the left, nothing from the right
+    raised = SequenceAlarm(0.0, 20.0).raised(SequencePosterior(certain, 0.0))
+    np.testing.assert_array_equal(raised, np.tile([True, False], (hops, 1)))
 
 
 @pytest.mark.parametrize(

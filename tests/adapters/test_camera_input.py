@@ -20,6 +20,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.listener import Listener, listen
 from worldstate.adapters.source import ListenSettings, open_source
+from worldstate.adapters.vehicle.car_file import read_camera_setup
 from worldstate.cli.common.sensors import given_sensors
 from worldstate.cli.main import PROGRAM, main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
@@ -58,6 +59,20 @@ def test_bad_lenses(tmp_path, text):
     (tmp_path / "camera.json").write_text(text)
     with pytest.raises(InputFileError, match=r"camera\.json"):
         read_camera(tmp_path / "camera.json")
+
+
+def test_a_key_that_means_nothing_is_refused_and_those_about_boxes_are_read(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(SIZE | {"fx": 500.0, "min_score": 0.4, "classes": ["tram"]}))
+    camera, setup = read_camera_setup(path)
+    assert camera == read_camera(path)
+    assert setup.boxes == DetectionFilter(frozenset({"tram"}), 0.4)
+    path.write_text(json.dumps(SIZE | {"fx": 500.0, "pitch": 3.0}))
+    for read in (read_camera, read_camera_setup):
+        with pytest.raises(
+            InputFileError, match=r"camera: expected keys among .*'pitch_deg'.*got \['pitch'\]"
+        ):
+            read(path)
 
 
 def test_every_box_is_put_down_to_one_reason():

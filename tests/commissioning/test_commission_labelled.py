@@ -7,8 +7,9 @@ import pytest
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.commissioning import commission
 from worldstate.commissioning.commission import windows_of_array
-from worldstate.commissioning.heard_stream import CommissionSettings
+from worldstate.commissioning.heard_stream import CommissionSettings, quick_settings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import OutOfDomainError
 
@@ -28,3 +29,29 @@ def test_a_table_that_names_no_array_is_of_this_one_and_one_of_another_is_refuse
     elsewhere = domain_of(MicrophoneArray(ARRAY.positions_m * [1.0, 1.1, 1.0]), [6000.0], ["SA1"])
     with pytest.raises(OutOfDomainError, match="not the array"):
         windows_of_array(replace(table, domain=elsewhere), CommissionSettings(), HERE)
+
+
+class LearnedError(Exception):
+    pass
+
+
+def test_real_windows_alone_are_fitted_once_for_all_folds_of_a_moving_ego(tmp_path, monkeypatch) -> None:
+    names, fitted = np.array(["DA1", "DB1", "DB2"]), []
+    table = FeatureTable(
+        np.ones((3, 60)), np.array(["left", "none", "front"]), names, names, names, (None,) * 3
+    )
+
+    def learn(streams, fit, *rest):
+        assert fit(streams[:1]) is fit(streams)
+        raise LearnedError
+
+    for name in ("heard_streams", "open_field_features", "open_field_windows"):
+        monkeypatch.setattr(commission, name, lambda *given: [1, 2])
+    monkeypatch.setattr(commission, "window_model", lambda *given: fitted.append(given) or object())
+    monkeypatch.setattr(commission, "learn_sequence", learn)
+    moving = quick_settings(CommissionSettings(moving_ego=True))
+    with pytest.raises(LearnedError):
+        commission.commission(ARRAY, moving, tmp_path, table=table)
+    ((windows, beside),) = fitted
+    assert windows.environments.tolist() == names.tolist()
+    assert beside is None

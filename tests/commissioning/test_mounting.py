@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.commissioning.heard_stream import HeardStream, hear_stream, mountings
+from worldstate.commissioning import commission
+from worldstate.commissioning.heard_stream import (
+    CommissionSettings,
+    HeardStream,
+    hear_stream,
+    mountings,
+    quick_settings,
+)
 from worldstate.commissioning.stream_exam import in_view_bearings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.recordings.hop_table import HopTable
@@ -38,6 +45,19 @@ def test_one_rendering_is_heard_by_every_array_as_it_would_be_alone() -> None:
     for name, column in alone.hops.columns.items():
         np.testing.assert_array_equal(right.hops.columns[name], column, err_msg=name)
     assert not np.array_equal(turned.hops.feature, right.hops.feature)
+
+
+def test_wrong_mountings_are_heard_in_as_many_processes_as_asked(tmp_path, monkeypatch) -> None:
+    """Half an hour of streams an ear: with one process the command takes as long as its whole exam."""
+    asked, heard = [], [passing(0.0), passing(2.0), passing(1.0)]
+    monkeypatch.setattr(commission, "_examined", lambda model, one: one)
+    monkeypatch.setattr(
+        commission, "in_processes", lambda work, items, jobs: asked.append(jobs) or [heard] * len(items)
+    )
+    settings = quick_settings(CommissionSettings())
+    found = commission.exam_of_mountings(ARRAY, None, settings, tmp_path, jobs=2)
+    assert asked == [2]
+    assert all({*streams} == {one} for streams, one in zip(found.values(), heard, strict=True))
 
 
 def passing(bearing_deg: float) -> HeardStream:

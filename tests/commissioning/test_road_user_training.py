@@ -13,9 +13,9 @@ from worldstate.commissioning.road_user_training import (
     CLASS_OF,
     CLASSES,
     RoadUserRows,
-    class_shares,
     fit_road_users,
     road_user_rows,
+    town_shares,
 )
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
@@ -47,7 +47,7 @@ def test_classes_that_differ_are_told_and_such_that_do_not_are_the_towns_shares(
     # Classes are said as often as they come in a town, though kinds are drawn equally often.
     said = fit_road_users(rows).probabilities(fresh.measures)
     expected = np.average(said, axis=0, weights=fresh.weights)
-    np.testing.assert_allclose(expected, class_shares(fresh), atol=0.1)
+    np.testing.assert_allclose(expected, town_shares(fresh), atol=0.1)
     # Nothing is to be learned of labels dealt by chance.
     dealt = replace(rows, kinds=np.random.default_rng(3).permutation(rows.kinds))
     nothing = road_user_exam(replace(dealt, measures=made_up_rows(4, apart=0.0).measures))

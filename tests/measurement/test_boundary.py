@@ -22,7 +22,7 @@ from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground import checks
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
-from worldstate.ground.values import NotUsable
+from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement import (
     Approach,
     Bearing,
@@ -297,3 +297,18 @@ def test_a_filter_that_is_certain_leaves_a_checkpoint_that_reads():
         look = Measurement(hop * 10**8, heard, answer, NotUsable("-"), NotUsable("-"))
         world = world.predict(0.1).update(look)
         assert WorldFilter.from_dict(world.to_dict()).state == world.state
+
+
+@pytest.mark.parametrize("text", [["1", "2"], ["1", 2], np.array(["1", "2"]), np.array(["1", "2"], object)])
+def test_numbers_written_as_text_are_no_numbers(text):
+    with pytest.raises(InvalidArgumentError, match="position_m: expected numbers, got "):
+        checks.finite_array("position_m", text, (2,))
+
+
+@pytest.mark.parametrize("turns", range(-3, 4))
+def test_angles_beside_half_a_turn_stay_in_their_range(turns):
+    half = (2 * turns + 1) * math.pi
+    for angle in (half, math.nextafter(half, -math.inf), math.nextafter(half, math.inf)):
+        both = np.array([wrap_angle(angle), wrap_angle(np.array([angle]))[0]])
+        assert (-math.pi < both).all() and (both <= math.pi).all()
+        np.testing.assert_allclose(np.exp(1j * both), np.exp(1j * angle), atol=1e-14)

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import soundfile
 from matplotlib.figure import Figure
 from PIL import Image
 from scripted_states import scripted_states
@@ -21,6 +22,7 @@ from worldstate.operations.viewing.state_figure import (
     write_birds_eye,
     write_state_figure,
 )
+from worldstate.state import WorldState
 
 TIME_S = 0.2 + 0.1 * np.arange(40)
 
@@ -92,6 +94,29 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(log, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     assert main(["log", "plot", str(log), *options]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("first_s", "last_s", "sound_s"),
+    [(1.0, 4.0, 0.0), (2.5, 4.0, 0.0), (3.0, 6.0, 2.0), (1_700_000_001.0, 1_700_000_004.0, 1_700_000_000.0)],
+    ids=["run", "run --resume", "run --start 2", "bag"],
+)
+def test_the_sound_is_drawn_on_the_clock_of_its_states(tmp_path, monkeypatch, first_s, last_s, sound_s):
+    """A single click lies where it was heard, two seconds after the first sample."""
+    sound = np.random.default_rng(0).normal(0.0, 1e-4, (32_000, 2))
+    sound[16_000:16_400] += np.random.default_rng(1).normal(0.0, 0.5, (400, 1))
+    soundfile.write(tmp_path / "click.wav", sound, 8000)
+    (tmp_path / "pair.csv").write_text("0,0.2,1\n0,-0.2,1\n")
+    stamps = [round(first_s * 10) * 10**8 + hop * 10**8 for hop in range(round((last_s - first_s) * 10) + 1)]
+    log = tmp_path / "states.jsonl"
+    log.write_text("".join(WorldState(stamp, 0).to_json() + "\n" for stamp in stamps))
+    drawn = []
+    monkeypatch.setattr(state_figure.style, "draw_power", lambda *parts: drawn.append(parts))
+    options = ["--recording", str(tmp_path / "click.wav"), "--array", str(tmp_path / "pair.csv")]
+    assert main(["log", "plot", str(log), "--out", str(tmp_path / "states.png"), *options]) == 0
+    ((_, time_s, _, power, _),) = drawn
+    loud = time_s[power.max(axis=1) > 0.9 * power.max()]
+    assert loud.mean() == pytest.approx(sound_s + 2.0, abs=0.1)
 
 
 @pytest.fixture

@@ -235,6 +235,20 @@ def test_other_commands_hear_a_bag_by_its_own_array(bag_of_approach, tmp_path, c
     assert len((tmp_path / "b.csv").read_text().splitlines()) > 50
 
 
+def test_the_camera_of_a_bag_labels_its_street(approach, bag_of_approach, tmp_path, capsys):
+    for name, path in (("folder", approach.folder), ("bag", bag_of_approach)):
+        assert main(["street", "label", str(path), "--out", str(tmp_path / name), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["n_passes"] == 1
+    of_folder, of_bag = (json.loads((tmp_path / name).read_text())["openlabel"] for name in ("folder", "bag"))
+    (one,), (other,) = (label["objects"].values() for label in (of_folder, of_bag))
+    assert (one["name"], one["type"]) == (other["name"], other["type"])
+    t0_s, t0_of_bag_s = (label["object_data"]["num"][0]["val"] for label in (one, other))
+    assert t0_of_bag_s - t0_s == pytest.approx(1_700_000_000, abs=1e-3)
+    windows = ["--out", str(tmp_path / "c"), "--windows", str(tmp_path / "labels.csv")]
+    assert main(["street", "label", str(bag_of_approach), *windows]) == 2
+    assert "--windows: expected none of a bag" in capsys.readouterr().err
+
+
 def test_sound_comes_back_sample_for_sample_in_either_layout(tmp_path):
     samples = sound_of(9600)
     write_blocks(tmp_path / "interleaved", samples)

@@ -99,6 +99,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--detections", action="append", default=[], metavar="HOST:PORT", help=told)
     sensors.add_lens_options(parser, group)
     sensors.add_detector_option(parser)
+    parser.set_defaults(detector=None)
     add = exports.add_output_options(parser).add_argument
     add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
     told = "begin a new JSONL and MCAP at so many MiB, and keep the one before as NAME.1.SUFFIX"
@@ -113,6 +114,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
     output.check_outputs(arguments, "out", "keep_sound", "save_state")
+    command.check_beside(arguments, detector="camera_device")
+    arguments.detector = arguments.detector or "motion"
     given = listening.checked_sensors(arguments, [] if arguments.play is None else [arguments.play])
     with ExitStack() as opened:
         recorded = None if arguments.play is None else _source(arguments, given, arguments.play)

@@ -28,17 +28,10 @@ Examples
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from worldstate import adapters, frontend
+from worldstate import adapters
 from worldstate.cli.common import exports, inputs, listening, output, sensors
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-
-if TYPE_CHECKING:
-    from worldstate.adapters.audio.sound_file import SoundInput
-    from worldstate.adapters.files.odometry_file import OdometryLog
-
-    Seen = Path | adapters.DetectionLog | None
 
 # What a first user needs.
 FIRST_OPTIONS = (
@@ -99,11 +92,15 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "adapters.Source":
+    from worldstate.adapters.files.odometry_file import read_odometry
     from worldstate.adapters.own_parts import other_modality
     from worldstate.operations.recordings.car_cameras import with_cameras
 
     several, detector, car = given.several(), given.detector(), given.car
-    sound, array, detections, ego = _input(arguments, given, None if several else given.detections())
+    sound, moves = inputs.sound_of(arguments), arguments.odometry or car.odometry
+    if arguments.start and inputs.bag_of(arguments) is not None:
+        raise InvalidArgumentError("--start: expected none with a bag, whose messages have stamps")
+    array, detections, ego = sensors.with_bag(given, sound, None if several else given.detections())
     measured = [f"{name}={path}" for name, path in car.measurements.items()] + arguments.measurements
     source = listening.open_given(
         given,
@@ -112,28 +109,10 @@ def _source(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "adap
         mask_dead=arguments.mask_dead,
         array=array,
         detections=detections,
-        ego=ego,
+        ego=ego if moves is None else read_odometry(moves),
         resume=arguments.resume,
         start_s=arguments.start or 0.0,
         detector=None if detector is None else detector(),
         others=[other_modality("--measurements", text) for text in measured],
     )
     return with_cameras(source, car, several) if several else source
-
-
-def _input(
-    arguments: argparse.Namespace, given: sensors.GivenSensors, seen: "Seen"
-) -> "tuple[SoundInput, frontend.MicrophoneArray | None, Seen, OdometryLog | None]":
-    """Return sound, array, detections and odometry: options, the car's, or what a bag holds."""
-    from worldstate.adapters.files.odometry_file import read_odometry
-    from worldstate.adapters.ros.bag_input import needed_array, read_bag
-
-    bag, moves = inputs.bag_of(arguments), arguments.odometry or given.car.odometry
-    if bag is None:
-        ego = None if moves is None else read_odometry(moves)
-        return inputs.sound_of(arguments), given.car.array, seen, ego
-    if arguments.start:
-        raise InvalidArgumentError("--start: expected none with a bag, whose messages have stamps")
-    held = read_bag(bag, inputs.topics_of(arguments))
-    seen = held.detections if seen is None else seen
-    return held.sound, needed_array(held.sound, given.car.array or held.array), seen, held.ego

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import asdict, fields, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -196,9 +196,10 @@ def commission(
     open_field = open_field_windows(
         open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs, settings.moving_ego)
     )
+    fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same in every fold
 
     def fit(some: Sequence[HeardStream]) -> EnsembleModel:
-        return window_model(*_table_and_beside(real, open_field, domain, some))
+        return fitted(*_table_and_beside(real, open_field, domain, some))
 
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
@@ -337,13 +338,14 @@ def exam_of_mountings(
     settings: CommissionSettings,
     folder: Path,
     *,
+    jobs: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> dict[str, list[ExaminedStream]]:
     """Let a model hear one junction of the exam as it would believe each wrong mounting of its array."""
     mounted = mountings(array, np.random.default_rng(settings.seed))
     examined: dict[str, list[ExaminedStream]] = {name: [] for name in mounted}
-    for stream in mounting_streams(settings):
-        heard = _heard(array, list(mounted.values()), folder, stream)
+    hear = partial(_heard, array, list(mounted.values()), folder)
+    for heard in in_processes(hear, mounting_streams(settings), jobs):
         for name, one in zip(mounted, heard, strict=True):
             examined[name].append(_examined(model, one))
         on_step()

@@ -154,7 +154,7 @@ def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
     equal = 1.0 / np.bincount(classes, minlength=len(CLASSES))[classes]
     weights = equal * len(classes) / equal.sum()
     slopes, biases = fit_softmax(rows.measures, classes, equal, weights, STRENGTH)
-    shares = class_shares(rows)
+    shares = town_shares(rows)
     rounded = (significant(one, _FIGURES) for one in (slopes, biases + np.log(shares), shares))
     return RoadUserModel((*MEASURES, *BANDS), CLASSES, *rounded)
 
@@ -164,7 +164,7 @@ def _tilted(rows: RoadUserRows, tilt_db: float) -> RoadUserRows:
     return replace(rows, measures=np.column_stack([rows.measures[:, : len(MEASURES)], bands]))
 
 
-def class_shares(rows: RoadUserRows) -> FloatArray:
+def town_shares(rows: RoadUserRows) -> FloatArray:
     """Return how frequent every class is near line of sight in a town, shape (classes,)."""
     return np.asarray(np.bincount(rows.classes, rows.weights, len(CLASSES)) / rows.weights.sum())
 

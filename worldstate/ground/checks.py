@@ -25,7 +25,8 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Fl
     array([1., 2., 3.])
     """
     try:
-        array = np.asarray(value, dtype=np.float64)
+        # By `dtype` it would read numbers written as text.
+        array = np.asarray(value).astype(np.float64, casting="same_kind", copy=False)
     except (TypeError, ValueError, OverflowError) as error:
         raise InvalidArgumentError(f"{name}: expected numbers, got {type(value).__name__}") from error
     if array.shape != shape:

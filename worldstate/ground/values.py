@@ -20,6 +20,7 @@ Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 # Share of a hop that could be heard below which nothing of it is read.
 LEAST_HEARD = 0.2
 
+_TURN = 2.0 * math.pi
 NANOSECONDS_PER_SECOND = 1_000_000_000
 SECONDS_PER_HOUR = 3600.0
 # Of signed 64 bits, less an hour: what is derived from a stamp, as the end of an advisory, is written too.
@@ -81,11 +82,10 @@ def wrap_angle(angle_rad: RealT) -> RealT:
     """
     if isinstance(angle_rad, float):
         # Ten times as fast as an array of one angle, of which a step of the filter has hundreds.
-        return math.pi - (math.pi - float(angle_rad)) % (2.0 * math.pi)
-    if isinstance(angle_rad, np.ndarray) and angle_rad.ndim and angle_rad.dtype == np.float64:
-        return np.pi - np.mod(np.pi - angle_rad, 2 * np.pi)
-    wrapped = np.pi - np.mod(np.pi - np.asarray(angle_rad, dtype=np.float64), 2 * np.pi)
-    return float(wrapped) if np.ndim(angle_rad) == 0 else wrapped  # type: ignore[return-value]
+        return math.pi - (math.pi - float(angle_rad)) % _TURN % _TURN
+    # Taken twice: of the least that is negative the first is rounded to a whole turn.
+    wrapped = np.pi - (np.pi - np.asarray(angle_rad, dtype=np.float64)) % _TURN % _TURN
+    return wrapped if wrapped.ndim else float(wrapped)  # type: ignore[return-value]
 
 
 def vertex(left: float, middle: float, right: float) -> float:

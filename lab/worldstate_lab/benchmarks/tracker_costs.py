@@ -62,7 +62,7 @@ _PREDICTOR, _UPDATER = KalmanPredictor(_TURN), KalmanUpdater(None)
 
 
 @dataclass(frozen=True, slots=True)
-class Scan:
+class SensorScan:
     """The detections of one sensor at one hop."""
 
     detections: tuple[Any, ...]
@@ -75,14 +75,14 @@ class Scan:
         return bool(self.sector_rad[0] <= float(state.state_vector[0]) <= self.sector_rad[1])
 
 
-def scans(measurement: Measurement, view_rad: tuple[float, float]) -> tuple[Scan, Scan]:
+def scans(measurement: Measurement, view_rad: tuple[float, float]) -> tuple[SensorScan, SensorScan]:
     """Return what the array and what the camera measured at a hop."""
     when = scan_time(measurement)
     heard = [measurement.bearing] if isinstance(measurement.bearing, Bearing) else []
     view = max(view_rad[1] - view_rad[0], 0.1)
     return (
-        Scan(_detected(heard, when), PEAK_DETECTION, PEAK_CLUTTER, (-np.inf, np.inf)),
-        Scan(_detected(measurement.sightings, when), BOX_DETECTION, BOX_CLUTTER / view, view_rad),
+        SensorScan(_detected(heard, when), PEAK_DETECTION, PEAK_CLUTTER, (-np.inf, np.inf)),
+        SensorScan(_detected(measurement.sightings, when), BOX_DETECTION, BOX_CLUTTER / view, view_rad),
     )
 
 
@@ -114,7 +114,7 @@ class GmPhd:
         self._hypothesiser = GaussianMixtureHypothesiser(gated, order_by_detection=True)
         self._components: list[Any] = []
 
-    def step(self, scans: Iterable[Scan], when: datetime) -> list[float]:
+    def step(self, scans: Iterable[SensorScan], when: datetime) -> list[float]:
         """Take the scans of a hop."""
         # Stone Soup asks for survival at every update: once a hop, not once a sensor.
         for scan, survival in zip(scans, (0.99, 1.0), strict=True):
@@ -123,7 +123,7 @@ class GmPhd:
             self._components = others + self._updated(searched, scan, survival, when)
         return [float(one.state_vector[0]) for one in self._components if one.weight > 0.5]
 
-    def _updated(self, components: list[Any], scan: Scan, survival: float, when: datetime) -> list[Any]:
+    def _updated(self, components: list[Any], scan: SensorScan, survival: float, when: datetime) -> list[Any]:
         births = [
             TaggedWeightedGaussianState(
                 [[azimuth], [0.0]],
@@ -159,7 +159,7 @@ class Jpda:
         self._reducing = PDAUpdater(None, gm_method=True)
         self._seen: dict[Any, datetime] = {}
 
-    def step(self, scans: Iterable[Scan], when: datetime) -> list[float]:
+    def step(self, scans: Iterable[SensorScan], when: datetime) -> list[float]:
         """Take the scans of a hop."""
         peaks, boxes = scans
         self._associated(peaks, when)
@@ -172,7 +172,7 @@ class Jpda:
                 del self._seen[track]
         return [float(track.state_vector[0]) for track in self._seen]
 
-    def _associated(self, scan: Scan, when: datetime) -> set[Any]:
+    def _associated(self, scan: SensorScan, when: datetime) -> set[Any]:
         """Update the tracks by a scan; return the detections that are likelier theirs than not."""
         tracks = {track for track in self._seen if scan.searches(track)}
         hypothesiser = PDAHypothesiser(

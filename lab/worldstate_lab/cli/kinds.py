@@ -29,10 +29,10 @@ from worldstate.commissioning.road_user_training import (
     FIRST_S,
     LAST_S,
     RoadUserRows,
-    class_shares,
     cross_validated,
     fit_road_users,
     road_user_rows,
+    town_shares,
     with_close,
 )
 from worldstate.commissioning.sequence_training import AUDIBLE_DB
@@ -62,14 +62,14 @@ class RoadUserExam:
 def road_user_exam(rows: RoadUserRows) -> RoadUserExam:
     """Judge every site by a model that never heard it, kinds as frequent as in a town."""
     near = rows.select(rows.counts)
-    return _examined(near, cross_validated(rows)[rows.counts], near.weights, class_shares(near))
+    return _examined(near, cross_validated(rows)[rows.counts], near.weights, town_shares(near))
 
 
 def stream_exam(rows: RoadUserRows, streams: Sequence[HeardStream]) -> RoadUserExam:
     """Judge hops of streams, as they come, by a model of other sites."""
     heard = RoadUserRows.joined([stream_rows(one) for one in streams])
     said = fit_road_users(rows).probabilities(heard.measures)
-    return _examined(heard, said, np.ones(len(said)), class_shares(rows))
+    return _examined(heard, said, np.ones(len(said)), town_shares(rows))
 
 
 def stream_rows(stream: HeardStream) -> RoadUserRows:

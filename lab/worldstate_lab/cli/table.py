@@ -76,7 +76,7 @@ from worldstate_lab.report.table import Cell, Table, Value, plain, write_documen
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.pass_cache import Hearing
+from worldstate_lab.trials.pass_cache import Hearer
 from worldstate_lab.trials.trial import Take, TakeList, find_takes
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
@@ -124,7 +124,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     arguments.seeds = seeds
     found = evaluate(
         takes,
-        Hearing(arguments.out / "cache", arguments.model),
+        Hearer(arguments.out / "cache", arguments.model),
         classifiers,
         arguments.jobs,
         track,
@@ -250,7 +250,7 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
     if dynamic:
         parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
-    with progress_bar("simulating streets", None) as bar:
+    with progress_bar("simulating streets", static + dynamic) as bar:
         for part in parts:
             write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance(), go_on=True)
     return root

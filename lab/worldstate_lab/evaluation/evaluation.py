@@ -36,7 +36,7 @@ from worldstate_lab.trials.classification import Classifiers
 from worldstate_lab.trials.listening import model_refusal
 from worldstate_lab.trials.pass_cache import (
     Failed,
-    Hearing,
+    Hearer,
     PassCache,
     attempted,
     fingerprint,
@@ -108,7 +108,7 @@ def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, st
 
 def evaluate(
     takes: TakeList,
-    hearing: Hearing,
+    hearing: Hearer,
     classifiers: Classifiers,
     jobs: int,
     track: Progress,
@@ -187,7 +187,7 @@ def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSe
 
 
 def _degradation(
-    takes: TakeList, hearing: Hearing, jobs: int, track: Progress, settings: DegradationSettings
+    takes: TakeList, hearing: Hearer, jobs: int, track: Progress, settings: DegradationSettings
 ) -> DegradationStudy:
     """Run the sweep; the recordings are worked on as all others are, and what was seen is kept."""
     model, filmed = read_model(settings.model), [take for take in takes.static if take.filmed]
@@ -209,7 +209,7 @@ def _degradation(
 class _StagedStream:
     """Work on one stream, in any process."""
 
-    hearing: Hearing
+    hearing: Hearer
     seed: int
 
     def __call__(self, take: Take) -> HopTable:
@@ -224,7 +224,7 @@ class _StagedStream:
         return PassCache(folder).tables("staged-streams", key, make)["advised"]
 
 
-def _staged(found: Evaluation, takes: TakeList, hearing: Hearing, jobs: int, track: Progress) -> StreamSweep:
+def _staged(found: Evaluation, takes: TakeList, hearing: Hearer, jobs: int, track: Progress) -> StreamSweep:
     """Stage every state of camera and roof on the hazard-free streams."""
     names = {str(t.hops.about["stream"]) for t in found.trials if "stream" in t.hops.about}
     streams = [take for take in takes.static if take.name in names]

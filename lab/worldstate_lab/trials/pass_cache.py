@@ -209,7 +209,7 @@ SCORES = ("shipped", "grounded", "rateless")
 
 
 @dataclass(frozen=True, slots=True)
-class Hearing:
+class Hearer:
     """How recordings are heard, and where what was heard is kept."""
 
     folder: Path

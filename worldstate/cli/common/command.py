@@ -146,7 +146,8 @@ def check_beside(arguments: argparse.Namespace, **other_of: str) -> None:
     """
     given = vars(arguments)
     for one, other in other_of.items():
-        if given[one] not in (None, []) and not given[other]:
+        # A number may be 0 where it is given, as that of a camera.
+        if given[one] not in (None, []) and (given[other] is None or given[other] is False):
             option, beside = (f"--{name.replace('_', '-')}" for name in (one, other))
             raise InvalidArgumentError(f"{option}: expected {beside} with it")
 

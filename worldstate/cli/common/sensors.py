@@ -7,15 +7,18 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate import adapters
+from worldstate import adapters, frontend
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
-from .inputs import add_array_options, describe, given_array, with_channels
+from .inputs import add_array_options, describe, given_array, topics_of, with_channels
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import SoundInput
+    from worldstate.adapters.files.odometry_file import OdometryLog
     from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
+
+    Seen = Path | adapters.DetectionLog | None
 
 # Background subtraction: its score is no confidence.
 MOVING = "motion", "knn"
@@ -181,12 +184,25 @@ def check_boxes(arguments: argparse.Namespace, recordings: int) -> None:
         raise InvalidArgumentError(f"{problem}, got {recordings}")
 
 
+def with_bag(
+    given: GivenSensors, sound: "SoundInput", seen: "Seen"
+) -> "tuple[frontend.MicrophoneArray | None, Seen, OdometryLog | None]":
+    """Return array and detections as given, of a bag those that it holds in their place; and its odometry."""
+    from worldstate.adapters.ros.bag_input import BagSound, needed_array, read_bag
+
+    if not isinstance(sound, BagSound):
+        return given.car.array, seen, None
+    held = read_bag(sound.path, topics_of(given.arguments))
+    array = needed_array(sound, given.car.array or held.array)
+    return array, held.detections if seen is None else seen, held.ego
+
+
 def recorded(
     arguments: argparse.Namespace, sound: "SoundInput", settings: "adapters.ListenSettings"
 ) -> "adapters.Source":
     """Return a recording of which sound, boxes and camera are used, and no model has to fit the array."""
     given = given_sensors(arguments)
-    array, seen = given.car.array, given.detections()
+    array, seen, _ = with_bag(given, sound, given.detections())
     heard = replace(settings, boxes=given.setup.boxes, uncalibrated=True)
     return adapters.open_source(sound, array=array, detections=seen, camera=given.camera, settings=heard)
 

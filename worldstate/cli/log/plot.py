@@ -22,6 +22,7 @@ from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.operations.viewing.state_figure import SoundPower
+    from worldstate.state import WorldState
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -56,7 +57,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         shown = min(states, key=lambda state: abs(state.stamp_ns - ground.nanoseconds(arguments.time)))
     if arguments.out is not None:
         arguments.input = arguments.recording
-        sound = _sound(arguments) if arguments.input else None
+        sound = _sound(arguments, states) if arguments.input else None
         operations.write_state_figure(states, arguments.out, title=title, sound=sound)
     if arguments.birds_eye is not None:
         write_birds_eye(shown, arguments.birds_eye, title=title)
@@ -68,11 +69,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     return output.CommandResult({"states": len(states), "birds_eye_s": shown_s, "written": written})
 
 
-def _sound(arguments: argparse.Namespace) -> "SoundPower":
+def _sound(arguments: argparse.Namespace, states: "list[WorldState]") -> "SoundPower":
     from worldstate.operations.viewing.state_figure import sound_power
 
     with (
         inputs.opened_front_end(arguments) as (audio, front_end),
         progress.progress_bar("listening", audio.duration_s) as bar,
     ):
-        return sound_power(audio, front_end, on_second=bar.advance)
+        return sound_power(audio, front_end, states, on_second=bar.advance)

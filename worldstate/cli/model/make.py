@@ -34,7 +34,6 @@ from worldstate.ground.errors import InvalidArgumentError
 if TYPE_CHECKING:
     from worldstate.commissioning.heard_stream import CommissionSettings
     from worldstate.commissioning.recorded_clips import RecordedClips
-    from worldstate.operations.metrics.approach_table import Figures
 
 # Alarms an hour by what the ego does: its own noise leaves less to be heard of others.
 ONSETS = {"standing": 30.0, "moving": 60.0}
@@ -114,7 +113,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     # The figures of the 56 microphones are those of a standing ego.
     told, lines = report if settings.moving_ego else stream_exam.beside_reference(report), list[str]()
     if arguments.mounting_errors:
-        mounted = _mounted(array, model, settings, folder)
+        with progress.progress_bar("mounting", len(heard_stream.mounting_streams(settings))) as bar:
+            heard = commission.exam_of_mountings(
+                array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance
+            )
+        mounted = {name: stream_exam.exam_figures(streams) for name, streams in heard.items()}
         report["mounting"] = mounted
         lines += ["", *stream_exam.mounting_lines(mounted)]
     if not settings.moving_ego:
@@ -149,16 +152,6 @@ def _recorded(arguments: argparse.Namespace) -> "RecordedClips | None":
         return None
     with progress.progress_bar("hearing", len(list(read_rows(table, ("file",))))) as bar:
         return read_recorded(folder, table, bar.advance)
-
-
-def _mounted(
-    array: "frontend.MicrophoneArray", model: "adapters.Model", settings: "CommissionSettings", folder: Path
-) -> "dict[str, Figures]":
-    from worldstate.commissioning import commission, heard_stream, stream_exam
-
-    with progress.progress_bar("mounting", len(heard_stream.mounting_streams(settings))) as bar:
-        heard = commission.exam_of_mountings(array, model, settings, folder, on_step=bar.advance)
-    return {name: stream_exam.exam_figures(streams) for name, streams in heard.items()}
 
 
 def _settings(arguments: argparse.Namespace) -> "CommissionSettings":

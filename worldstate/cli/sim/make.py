@@ -77,7 +77,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--duration", type=float, help="seconds each (default: 10)")
-    told = "render up to here only, at three to six times as many samples a second (default: 16,000)"
+    told = "render up to here only, 700 to 16,000 (default), at three to six times as many samples a second"
     add("--bandwidth", type=float, metavar="HZ", help=told)
     add("--video", action="store_true", help="render the camera's video, too")
     add("--video-width", type=int, metavar="PX", help="of its images (default: 1936)")

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 from worldstate import adapters
 from worldstate.cli.common import inputs, output, progress, sensors
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,6 +50,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.operations.labelling import label_files, pass_labels, street_figure
 
     output.check_outputs(arguments, "out", "windows", figures=("figure",))
+    if arguments.windows is not None and inputs.bag_of(arguments) is not None:
+        raise InvalidArgumentError("--windows: expected none of a bag, which `model features` does not read")
     source, detections = sensors.camera_source(arguments, inputs.sound_of(arguments))
     file = None if arguments.windows is None else label_files.file_below(source.audio_path, arguments.windows)
     tracks = pass_labels.box_tracks(detections, source.camera, source.settings.boxes)

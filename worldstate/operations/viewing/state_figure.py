@@ -61,15 +61,22 @@ class SoundPower:
 
 
 def sound_power(
-    audio: Audio, front_end: FrontEnd, on_second: Callable[[], None] = lambda: None
+    audio: Audio,
+    front_end: FrontEnd,
+    states: Sequence[WorldState],
+    on_second: Callable[[], None] = lambda: None,
 ) -> SoundPower:
-    """Read the power over azimuth of every hop of an open recording."""
+    """Read the power over azimuth of every hop of an open recording, on the clock of its states."""
     rows = []
     for block in audio.blocks(audio.sample_rate_hz):
         rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.process(block)]
         on_second()
     rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.finish()]
-    return _power([t for t, _ in rows], front_end.settings.azimuths_rad(), [row for _, row in rows])
+    ends_s, times_s = np.array([end_s for end_s, _ in rows]), _times(states)
+    # By --start, or of a bag, they begin with the first hop, on a clock that samples do not tell.
+    if times_s[-1] > ends_s[-1]:
+        ends_s += times_s[0] - ends_s[0]
+    return _power(ends_s.tolist(), front_end.settings.azimuths_rad(), [row for _, row in rows])
 
 
 def _power(ends_s: Sequence[float], azimuths_rad: FloatArray, rows: Sequence[Float32Array]) -> SoundPower:
