@@ -94,19 +94,16 @@ class BoostedTrees:
 
     def _scores(self, X: FloatArray) -> FloatArray:
         # Every tree of every row goes one question further. After a few most are in a leaf, which leads to
-        # itself; then only the others go on. Of flat indices this takes a twelfth of indices by row and tree.
+        # itself; then only the others go on, in half the time of a walk of all to the deepest leaf.
         trees, nodes = self.split.shape
-        ends = here = np.tile(np.arange(trees) * nodes, len(X))
+        ends = np.tile(np.arange(trees) * nodes, len(X))
         row = np.repeat(np.arange(len(X)) * X.shape[1], trees)
         for _ in range(_TOGETHER):
-            ends = here = self._step(X, row, here)
+            ends = self._step(X, row, ends)
         walking = np.flatnonzero(~self._leaf.take(ends))
-        here, row = ends[walking], row[walking]
         while len(walking):
-            here = self._step(X, row, here)
-            ends[walking] = here
-            on = ~self._leaf.take(here)
-            walking, here, row = walking[on], here[on], row[on]
+            ends[walking] = here = self._step(X, row[walking], ends[walking])
+            walking = walking[~self._leaf.take(here)]
         # Counted class by class: a product with a matrix of ones takes longer, and its sum of one row differs
         # from that of the same row among others.
         classes = len(self.baseline)
