@@ -171,6 +171,9 @@ def test_one_that_comes_is_ranked_above_one_that_drives_off_and_a_sure_chance_is
         figures = pass_figures([told])
         assert (figures["leaving"], figures["coming_leaving_auroc"]) == (1, area)
     assert (figures["certain_right"], figures["certain_said"]) == (None, 0.0)
+    alone = stream([("left", "left", 15.0), ("leaves", "right", 40.0)])
+    alone.vehicles.hazard[1], alone.rows.in_view[alone.rows.vehicle == 1] = False, True
+    assert pass_figures([stated(alone, 0.1)])["leaving"] == 0  # in view all the time
     told.followed.within[sure, 0] = 0.9
     told.followed.within[np.searchsorted(time_s, 45.0), 1] = 0.9
     figures = pass_figures([told])

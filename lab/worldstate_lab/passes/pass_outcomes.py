@@ -309,6 +309,8 @@ def _leaving(streams: Sequence[PassedStream]) -> Figures:
         loud = ~np.isin(vehicles.kind, QUIET_KINDS)
         for number in vehicles.vehicle[loud & (vehicles.flow == "leaves")].tolist():
             mine = (rows.vehicle == number) & ~rows.in_view
+            if not mine.any():
+                continue
             at_s = rows.time_s[mine][rows.loudness_db[mine].argmax()]
             if not (np.abs(entries_s - at_s) < _ALONE_S).any():
                 leaving.append(most[np.abs(time_s - at_s) <= 0.5 * _COMPARED_S].max(initial=0.0))
