@@ -314,7 +314,7 @@ class DomainGuard:
     signal_nats: float = field(default=0.0, metadata=ADDED)
     # Foreign sounds alone alarm in .14 of their hops; less 2 nats in .06, less all in .04. Of vehicles that
     # come while one is as loud as they are, .84, .63 and .42 are detected (43 sounds at five sites, kind and
-    # site never heard): docs/evidence/foreign_sounds.md.
+    # site never heard): lab/NOTES.md.
     margin: float = 2.0
 
     def __post_init__(self) -> None:

@@ -86,7 +86,7 @@ class StreetSides:
 
 
 # Of 0, .3, .5 and 1 for the doubt, ten passes of exam seeds 1 and 2 took the side from right in .838 of the
-# hops to .859, .878, .876 and .877 (docs/evidence/street.md).
+# hops to .859, .878, .876 and .877 (version 0.2).
 _DRAWN_TOGETHER, _DOUBT = 0.5, 0.5
 _ROUND = 0.1
 # Below, both means are the same within rounding.

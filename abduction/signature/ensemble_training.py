@@ -37,7 +37,7 @@ class Recipe:
     ridge: float  # Weight of half the squared norm of the coefficients beside the mean log loss, > 0
 
 
-# Chosen on eight junctions, every choice judged on a junction it was not made on: docs/evidence/signature.md.
+# Chosen on eight junctions, every choice judged on a junction it was not made on: lab/NOTES.md.
 RECIPES = (
     Recipe("mean", 1e-3),
     Recipe("median", 1e-3),

@@ -76,7 +76,7 @@ def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod
     ensemble = WindowMethod(
         partial(_site_ensemble, simulated=simulated), fit=partial(trained_ensemble, simulated=simulated)
     )
-    # The pattern alone, for a moving ego: streets of a standing one cost it (docs/evidence/signature.md).
+    # The pattern alone, for a moving ego: streets of a standing one cost it (lab/NOTES.md).
     distant = WindowMethod(_distant_site, afar=True)
     return {
         "baseline": WindowMethod(PublishedClassifier),

@@ -131,7 +131,7 @@ _LEAST_EDGE_STD_RAD = math.radians(0.5)
 # In the two seconds before T0 simulated drivers depart from the pace that they have then as under white
 # acceleration of .015 to .04 m^2/s^3 in the median, .04 to .26 in the mean square; with 1 m^2/s^3 and a scale
 # of 1 the stated variance of hidden places was four times the squared error. In the grid of densities and
-# scales of docs/evidence/smoothing.md these have one of the least errors, and state it rightly.
+# scales of lab/NOTES.md these have one of the least errors, and state it rightly.
 _ACCELERATION_PSD, _MANOEUVRE_K = 0.03, 1.2
 # Longer than a pass; solved once, at its end: with nothing seen yet, relinearised on the way, the range
 # runs off and the system is indeterminate.
