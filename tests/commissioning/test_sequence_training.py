@@ -48,7 +48,8 @@ def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten()
     rng = np.random.default_rng(5)
     model = train_sequence([_stream(rng) for _ in range(2)], rng, Growth(8, 16))
     fresh = _stream(rng)
-    margin_s = calibrated_margin_s(model, [_stream(rng), _stream(rng)])
+    others = [_stream(rng), _stream(rng)]
+    margin_s = calibrated_margin_s([(model.posterior(one.evidence), one.truth) for one in others])
     said = model.posterior(fresh.evidence)
     assert np.isclose(model.share.sum(), 1.0, atol=1e-4) and said.groups.shape == (1200, 2, len(GROUPS))
     soon = fresh.truth.coming_s[:, 0] <= 1.0

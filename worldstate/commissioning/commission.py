@@ -136,10 +136,11 @@ def learn_sequence(
     margins, quiet = [], dict[str, list[SequencePosterior]]()
     for outside in folds:
         model = train_sequence([labelled[i] for i in range(len(streams)) if i not in outside], rng, growth)
-        margins.append(calibrated_margin_s(model, [labelled[i] for i in outside]))
-        for i in outside:
+        said = {i: model.posterior(labelled[i].evidence) for i in outside}
+        margins.append(calibrated_margin_s([(one, labelled[i].truth) for i, one in said.items()]))
+        for i, posterior in said.items():
             if streams[i].hazard_free:
-                quiet.setdefault(streams[i].site, []).append(model.posterior(labelled[i].evidence))
+                quiet.setdefault(streams[i].site, []).append(posterior)
         on_step()
     alarm, margin_s = alarm_elsewhere(list(quiet.values()), onsets_per_hour), float(np.mean(margins))
     final = train_sequence(list(labelled.values()), rng, growth)

@@ -12,6 +12,7 @@ from worldstate.abduction.sequence.sequence_model import (
     LONGEST_S,
     BoostedTrees,
     SequenceModel,
+    SequencePosterior,
 )
 from worldstate.ground.errors import WorldstateError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
@@ -174,16 +175,15 @@ def exported(machine: object, check: FloatArray) -> BoostedTrees:
     return replace(trees, threshold=threshold, value=value)
 
 
-def calibrated_margin_s(model: SequenceModel, streams: Sequence[LabelledStream]) -> float:
-    """Return what the interval of the time to visible must be widened by, on streams not trained on.
+def calibrated_margin_s(said: Sequence[tuple[SequencePosterior, StreamTruth]]) -> float:
+    """Return what the interval of the time to visible must be widened by, said of streams not trained on.
 
     Source: Y. Romano, E. Patterson and E. Candes, "Conformalized quantile regression", NeurIPS 2019.
     """
     misses = []
-    for one in streams:
-        times = model.posterior(one.evidence).time_to_visible_s()
-        coming = one.truth.coming_s <= LONGEST_S
-        true = one.truth.coming_s[coming]
+    for posterior, truth in said:
+        times, coming = posterior.time_to_visible_s(), truth.coming_s <= LONGEST_S
+        true = truth.coming_s[coming]
         misses.append(np.maximum(times[coming][:, 0] - true, true - times[coming][:, 2]))
     every = np.concatenate(misses)
     return float(np.quantile(every, min(COVERAGE * (1.0 + 1.0 / every.size), 1.0)))
