@@ -23,7 +23,8 @@ from worldstate.adapters.ros.bag_input import read_bag
 from worldstate.adapters.ros.bag_writer import write_bag
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
-from worldstate.commissioning.heard_stream import hear_recording
+from worldstate.commissioning.commission import commission
+from worldstate.commissioning.heard_stream import CommissionSettings, hear_recording, quick_settings
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError, OutOfDomainError, wrap_angle
@@ -61,11 +62,18 @@ class Heard:
         return list(listen_steps(open_source(sound, array=self.array, model=self.model)))
 
 
-@pytest.fixture(scope="module", params=["roof of 56", "ring of 7"])
-def heard(request: pytest.FixtureRequest) -> Heard:
+COMMISSIONED = "ring of 7, commissioned"
+
+
+@pytest.fixture(
+    scope="module", params=["roof of 56", "ring of 7", pytest.param(COMMISSIONED, marks=pytest.mark.slow)]
+)
+def heard(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Heard:
     rng, model = np.random.default_rng(3), read_model()
     array = ovad_array() if request.param == "roof of 56" else RING
-    if array is RING:
+    if request.param == COMMISSIONED:
+        model = commission(RING, quick_settings(CommissionSettings()), tmp_path_factory.mktemp("streams"))
+    elif array is RING:
         # As `model make` makes one of an array: any windows that depend on all of the feature will do.
         domain = domain_of(RING, [6000], ["SA1"])
         model = replace(model, signature=replace(model.signature, domain=domain))
@@ -76,6 +84,15 @@ def heard(request: pytest.FixtureRequest) -> Heard:
 @pytest.fixture(scope="module")
 def at_full_rate(heard: Heard) -> list[Step]:
     return heard.steps(heard.pipe(FULL_HZ))
+
+
+def chances(step: Step) -> dict[tuple[str, str], float]:
+    """Return the risk of each side and, where they are said, its chances within so many seconds."""
+    return {
+        (cue.direction, within): chance
+        for cue in step.state.cues
+        for within, chance in {"risk": cue.risk, **(cue.within or {})}.items()
+    }
 
 
 @pytest.mark.long
@@ -93,8 +110,8 @@ def test_the_same_sound_is_heard_alike_at_any_rate(heard: Heard, at_full_rate: l
     off_deg = np.degrees([abs(wrap_angle(a.azimuth_rad - b.azimuth_rad)) for a, b in both])
     assert off_deg.max() < 0.5
     for one, other in pairs:
-        risks = [{cue.direction: cue.risk for cue in step.state.cues} for step in (one, other)]
-        assert all(abs(risks[0].get(side, 0.0) - risk) < 0.02 for side, risk in risks[1].items())
+        said = [chances(step) for step in (one, other)]
+        assert all(abs(said[0].get(what, 0.0) - chance) < 0.02 for what, chance in said[1].items())
         np.testing.assert_allclose(one.frame.feature, other.frame.feature, atol=1e-3)
 
 
