@@ -301,7 +301,9 @@ def _report(found: Evaluation, compared: Sequence[Comparison]) -> dict[str, obje
             "equal_detection": found.equal,
             "degradation": None if found.degradation is None else degradation_record(found.degradation),
             "staged_streams": found.staged,
-            "front_end": None if found.front_end is None else found.front_end.figures,
+            "front_end": None
+            if (study := found.front_end) is None
+            else {**study.figures, "bearing_srp_by_junction": study.by_site},
             "against": [_difference(one) for one in compared],
         }
     )
