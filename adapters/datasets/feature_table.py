@@ -171,9 +171,7 @@ def read_features(path: str | Path) -> FeatureTable:
     features, labels, t0_frames = zip(*windows, strict=True)
     classes, ids, environments, recordings = (np.array(column) for column in zip(*labels, strict=True))
     domain = Path(f"{path}.json")
-    made_with = None
-    if domain.is_file():
-        made_with = read_record(ModelDomain, domain, "domain")
+    made_with = read_record(ModelDomain, domain, "domain") if domain.is_file() else None
     return FeatureTable(np.array(features), classes, ids, environments, recordings, t0_frames, made_with)
 
 

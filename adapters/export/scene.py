@@ -312,7 +312,7 @@ def _ego() -> SceneArrow:
 def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:
     """Draw the edge as a line and what lies behind it as a sector."""
     near, far = (_at(occluder.edge_azimuth_rad, radius_m) for radius_m in (4.0, SECTOR_M))
-    edge = SceneLine(0, (near, far), _ink(_GREY))
+    edge = SceneLine(0, (near, far), Rgba(*_GREY, 1.0))
     behind = _sector(hidden_sector(occluder), SECTOR_M, Rgba(*_GREY, 0.12), "occluder")
     pairs = _pairs(direction=occluder.direction, assumed=occluder.assumed)
     return _item(state, f"occluder {occluder.id}", metadata=pairs, lines=(edge,), triangles=(behind,))
@@ -400,11 +400,7 @@ def _at(azimuth_rad: float, radius_m: float, height_m: float = 0.0) -> Xyz:
 
 
 def _text(azimuth_rad: float, radius_m: float, text: str, color: tuple[float, float, float]) -> SceneText:
-    return SceneText(Placed(_at(azimuth_rad, radius_m, 1.0)), text, _ink(color))
-
-
-def _ink(color: tuple[float, float, float]) -> Rgba:
-    return Rgba(*color, 1.0)
+    return SceneText(Placed(_at(azimuth_rad, radius_m, 1.0)), text, Rgba(*color, 1.0))
 
 
 def _pairs(**values: object) -> tuple[ScenePair, ...]:
