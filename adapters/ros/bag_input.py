@@ -363,15 +363,6 @@ def _first_second(blocks: Iterator[AudioBlock], sound: BagSound) -> list[AudioBl
 
 
 @dataclass(frozen=True, slots=True)
-class BagTopics:
-    """Topics to read, each None for the only one of its type."""
-
-    audio: str | None = None
-    detections: str | None = None
-    odometry: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class BagInput:
     """All that a bag holds; None for what it does not."""
 
@@ -387,21 +378,22 @@ def read_sound(path: Path, topic: str | None = None) -> tuple[BagSound, Micropho
         return sound_of_bag(bag, topic), _array(bag)
 
 
-def read_bag(path: Path, topics: BagTopics | None = None) -> BagInput:
-    """Read a bag but for its samples, which are read when they are listened to.
+def read_bag(
+    path: Path, *, audio: str | None = None, detections: str | None = None, odometry: str | None = None
+) -> BagInput:
+    """Read a bag but for its samples, of the topics named or else the only ones of their types.
 
     Raises
     ------
     InputFileError
         If it is damaged, has no sound, several topics would do, or a message holds what cannot be.
     """
-    chosen = topics or BagTopics()
     with open_bag(path) as bag, refused_as_file(path):
-        sound = sound_of_bag(bag, chosen.audio)
-        seen = bag.topic("--topic detections=", chosen.detections, types.DETECTIONS)
-        driven = bag.topic("--topic odometry=", chosen.odometry, types.ODOMETRY)
-        detections = None if seen is None else _detections(bag, seen)
-        return BagInput(sound, _array(bag), detections, None if driven is None else _ego(bag, driven))
+        sound = sound_of_bag(bag, audio)
+        seen = bag.topic("--topic detections=", detections, types.DETECTIONS)
+        driven = bag.topic("--topic odometry=", odometry, types.ODOMETRY)
+        boxes = None if seen is None else _detections(bag, seen)
+        return BagInput(sound, _array(bag), boxes, None if driven is None else _ego(bag, driven))
 
 
 def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneArray:
