@@ -325,15 +325,12 @@ class SoundStream(ABC):
 
     __slots__ = ()
 
+    start_ns: int = 0  # Time of the first sample on the clock of the recorder; 0 where nothing tells
+
     @property
     @abstractmethod
     def name(self) -> str:
         """For messages."""
-
-    @property
-    def start_ns(self) -> int:
-        """Time of the first sample on the clock of the recorder; 0 where nothing tells."""
-        return 0
 
     @abstractmethod
     def open(self) -> Audio:
@@ -393,8 +390,7 @@ class RawPcm(SoundStream):
         """Return samples of full scale 1, shape (n, channels)."""
         raw = {"format": "RAW", "subtype": SUBTYPES[self.encoding], "endian": "LITTLE"}
         about = {"samplerate": self.sample_rate_hz, "channels": self.channels, "always_2d": True}
-        samples: Float32Array = soundfile.read(io.BytesIO(data), dtype="float32", **raw, **about)[0]
-        return samples
+        return np.asarray(soundfile.read(io.BytesIO(data), dtype="float32", **raw, **about)[0])
 
 
 # An open recording is one whose samples come from elsewhere, such as microphones that run.
