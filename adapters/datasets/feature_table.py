@@ -233,8 +233,7 @@ def _window(
     if max(map(len, labels)) > LONGEST_NAME:
         raise InputFileError(path, f"line {line}: expected names of at most {LONGEST_NAME} characters")
     features = np.array([number(path, line, row, column) for column in FEATURE_COLUMNS])
-    t0_frame = t0_of(path, line, row)
-    return features, labels, t0_frame
+    return features, labels, t0_of(path, line, row)
 
 
 def t0_of(path: str | Path, line: int, row: dict[str, str]) -> int | None:

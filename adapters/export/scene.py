@@ -342,8 +342,7 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
 
 def _entity(state: WorldState, entity: Entity) -> SceneItem:
     """Draw where it is in nine of ten cases, and where it will be; a box only where a position is known."""
-    hidden = entity.status == "hidden"
-    color = _HIDDEN if hidden else _IN_VIEW
+    color = _HIDDEN if entity.status == "hidden" else _IN_VIEW
     density = entity.existence_probability
     sector_rad = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
     shapes = (_sector(sector_rad, SECTOR_M, Rgba(*color, 0.05 + 0.3 * density), "entity"),)
