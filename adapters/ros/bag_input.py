@@ -64,10 +64,10 @@ class BagReader:
         found = {one.topic: one.msgtype for one in self.reader.connections}
         fit = sorted(topic for topic, kind in found.items() if kind in kinds)
         if given is not None and given not in fit:
-            problem = f"expected {_either(kinds)} on {given} ({option}), got {self.told()}"
+            problem = f"expected {' or '.join(kinds)} on {given} ({option}), got {self.told()}"
             raise InputFileError(self.path, problem)
         if given is None and len(fit) > 1:
-            problem = f"expected {option} with one of {', '.join(fit)}, which all hold {_either(kinds)}"
+            problem = f"expected {option} with one of {', '.join(fit)}, which all hold {' or '.join(kinds)}"
             raise InputFileError(self.path, problem)
         return given or next(iter(fit), None)
 
@@ -143,10 +143,6 @@ def refused_as_bag(path: Path) -> Iterator[None]:
         if "rofile" in said:  # An MCAP file of another program, such as `run --export mcap=FILE`
             said += "; `worldstate log replay` reads files of snapshots"
         raise InputFileError(path, f"expected a bag of ROS 2 that can be read ({said:.200})") from error
-
-
-def _either(kinds: tuple[str, ...]) -> str:
-    return " or ".join(kinds)
 
 
 _LOG = logging.getLogger(__name__)
@@ -470,7 +466,7 @@ def sound_of_bag(bag: BagReader, topic: str | None) -> BagSound:
     """Return the sound of a bag; refuse one without."""
     heard = bag.topic("--topic audio=", topic, *AUDIO_KINDS)
     if heard is None:
-        raise InputFileError(bag.path, f"expected a topic of {_either(AUDIO_KINDS)}, got {bag.told()}")
+        raise InputFileError(bag.path, f"expected a topic of {' or '.join(AUDIO_KINDS)}, got {bag.told()}")
     return BagSound(bag.path, heard, next(audio_blocks(bag, heard)).stamp_ns)
 
 
