@@ -37,14 +37,6 @@ _WIDEST_PX, _QUALITY = 1000, 80
 Told: TypeAlias = (
     WorldState | scene.SceneUpdate | scene.CompressedImage | scene.RawAudio | scene.FrameTransform
 )
-# The name that a viewer knows each by.
-_SCHEMA_NAMES: dict[type, str] = {
-    WorldState: "worldstate.Snapshot",
-    scene.SceneUpdate: "foxglove.SceneUpdate",
-    scene.CompressedImage: "foxglove.CompressedImage",
-    scene.RawAudio: "foxglove.RawAudio",
-    scene.FrameTransform: "foxglove.FrameTransform",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +58,9 @@ class LogMessage:
     @property
     def schema_name(self) -> str:
         """Name of the type of the value."""
-        return _SCHEMA_NAMES[type(self.value)]
+        # What is drawn is named as Foxglove names it.
+        own = isinstance(self.value, WorldState)
+        return "worldstate.Snapshot" if own else f"foxglove.{type(self.value).__name__}"
 
     @property
     def schema(self) -> bytes:
