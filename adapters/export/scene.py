@@ -230,14 +230,12 @@ _HEIGHT_M = {"occluder": 0.0, "searched": 0.02, "cue": 0.04, "entity": 0.06}
 _STEP_RAD = math.radians(5.0)
 _CAR = Xyz(4.5, 1.8, 1.5)
 # The palette of the figures, by meaning; grey is what hides. Decisions are lighter: viewers are dark.
-_GREY, _HIDDEN, _IN_VIEW, _SEARCHED, _DECISION, _HEARD = (
-    (0.5, 0.5, 0.5),
-    (0.835, 0.369, 0.0),
-    (0.0, 0.447, 0.698),
-    (0.0, 0.62, 0.451),
-    (0.5, 0.42, 0.9),
-    (0.8, 0.475, 0.655),
-)
+_GREY = (0.5, 0.5, 0.5)
+_HIDDEN = (0.835, 0.369, 0.0)
+_IN_VIEW = (0.0, 0.447, 0.698)
+_SEARCHED = (0.0, 0.62, 0.451)
+_DECISION = (0.5, 0.42, 0.9)
+_HEARD = (0.8, 0.475, 0.655)
 
 
 def scene_update(state: WorldState) -> SceneUpdate:
