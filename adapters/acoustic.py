@@ -71,7 +71,6 @@ class Signature(Protocol):
 
     def evidence(self, feature: FloatArray, /) -> SignatureEvidence:
         """Return log-likelihoods of one feature vector."""
-        ...
 
 
 class AcousticAdapter(MeasurementAdapter[Float32Array]):

@@ -151,13 +151,14 @@ class Listener:
         self.world = source.world()
         self._source, self._rate_hz = source, sample_rate_hz
         self._signature, self._reader = source.signature(), source.reader()
-        self._vision = source.co_evidence or source.camera_channel()
+        vision = source.co_evidence or source.camera_channel()
+        self._cameras = vision.cameras if isinstance(vision, SeveralCameras) else {SENSOR: vision}
         self._adapter = AcousticAdapter(
             source.array,
             sample_rate_hz,
             self._signature,
             start_ns=source.start_ns,
-            vision=self._vision,
+            vision=vision,
             grounding=source.settings.grounding,
             guard=source.guard,
             road_users=source.road_users,
@@ -183,11 +184,6 @@ class Listener:
         for name, query in self._cameras.items():
             if name in senses.eyes:
                 query.go_on(senses.eyes[name])
-
-    @property
-    def _cameras(self) -> dict[str, VisionQuery]:
-        vision = self._vision
-        return vision.cameras if isinstance(vision, SeveralCameras) else {SENSOR: vision}
 
     def push(self, block: Float32Array | None) -> list[WorldState]:
         """Take the next samples; return the state after each hop that ends in them.

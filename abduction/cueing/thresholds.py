@@ -67,7 +67,6 @@ class _Losses(NamedTuple):
     held: FloatArray
     shares: FloatArray
     recordings: int
-    single: bool
 
 
 def conformal_threshold(
@@ -197,8 +196,7 @@ def _losses(hazard_free: Sequence[ArrayLike], sustain_hops: int) -> _Losses:
     held = np.concatenate([sustained_statistic(stream, sustain_hops) for stream in streams])
     shares = np.concatenate([np.full(stream.size, 1.0 / stream.size) for stream in streams])
     order = np.argsort(-held, kind="stable")
-    single = all(stream.size == 1 for stream in streams)
-    return _Losses(held[order], shares[order], len(streams), single)
+    return _Losses(held[order], shares[order], len(streams))
 
 
 def _smallest_threshold(losses: _Losses, allowed: float) -> float:
@@ -224,7 +222,7 @@ def _p_value(total: float, losses: _Losses, alpha: float) -> float:
 
     n = losses.recordings
     tail = float(binom.cdf(math.ceil(total - 1e-9), n, alpha))
-    if losses.single:
+    if losses.held.size == losses.recordings:
         return tail
     mean = min(total / n, alpha)
     # Kullback-Leibler divergence of the two laws of one loss, nats.

@@ -277,30 +277,14 @@ _AZIMUTH_CELL_RAD = float(np.radians(1.0))
 _RANGES_M = np.geomspace(5.0, 60.0, 24)
 
 
-@dataclass(frozen=True, slots=True)
-class Background:
-    """Density of an observable that belongs to no source; all other densities are relative to it."""
-
-    mean: float  # Of a broad normal law, in the observable's unit
-    std: float
-
-    def log_density(self, value: float) -> float:
-        r"""Return the log density at a value, nats.
-
-        .. math:: \log p = -\tfrac12 (x - \mu)^2 / \sigma^2 - \log(\sigma \sqrt{2 \pi})
-        """
-        return float(-0.5 * ((value - self.mean) / self.std) ** 2 - np.log(self.std * np.sqrt(2 * pi)))
-
-
+# Of observables that belong to no source, broad normal laws: all other densities are relative to theirs.
 BACKGROUNDS = {
-    LINE_SPACING: Background(70.0, 40.0),
-    "tyre_shape_db": Background(0.0, 10.0),
-    "doppler_ratio": Background(1.0, 0.05),
-    "radial_speed_m_s": Background(0.0, 10.0),
-    "inverse_tta_hz": Background(0.0, 1.0),
+    LINE_SPACING: Observable(70.0, 40.0),
+    "tyre_shape_db": Observable(0.0, 10.0),
+    "doppler_ratio": Observable(1.0, 0.05),
+    "radial_speed_m_s": Observable(0.0, 10.0),
+    "inverse_tta_hz": Observable(0.0, 1.0),
 }
-
-
 # Deviation of the azimuth of a source in plain view, and of the strongest direction of a hidden one: it is a
 # wall or an edge that is heard, whose side says little of the side that the vehicle comes from.
 _VISIBLE_STD_RAD, _HIDDEN_STD_RAD = float(np.radians(35.0)), np.inf
@@ -456,7 +440,7 @@ def _log_couplings(
     for coupling in descriptor.couplings:
         seen = observation.signature.get(coupling.observable)
         if seen is not None and coupling.observable not in settings.without:
-            background = BACKGROUNDS[coupling.observable].log_density(seen.value)
+            background = _log_normal(BACKGROUNDS[coupling.observable], seen.value, 0.0)
             total += coupling.log_likelihood(seen.value, seen.std, _SPEEDS_M_S) - background
     return total
 
@@ -465,10 +449,10 @@ def _log_approach(observation: GroundedObservation, settings: GroundedSettings) 
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
     if isinstance(speed, Observable) and "radial_speed_m_s" not in settings.without:
-        background = BACKGROUNDS["radial_speed_m_s"].log_density(speed.value)
+        background = _log_normal(BACKGROUNDS["radial_speed_m_s"], speed.value, 0.0)
         return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - background
     if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in settings.without:
-        background = BACKGROUNDS["inverse_tta_hz"].log_density(inverse_tta.value)
+        background = _log_normal(BACKGROUNDS["inverse_tta_hz"], inverse_tta.value, 0.0)
         ranges = _SPEED_CELL_M_S / _RANGES_M
         over_range = _log_normal(inverse_tta, _SPEEDS_M_S[:, None] / _RANGES_M, ranges)
         return np.asarray(np.logaddexp.reduce(over_range, axis=1) - np.log(_RANGES_M.size) - background)
@@ -485,7 +469,7 @@ def _over_azimuth(bearing: Observable | NotUsable, std_rad: float) -> FloatArray
     return np.asarray(prior + fit - np.logaddexp.reduce(fit - np.log(fit.size)))
 
 
-def _log_normal(seen: Observable, expected: FloatArray, cell: FloatArray | float) -> FloatArray:
+def _log_normal(seen: Observable, expected: FloatArray | float, cell: FloatArray | float) -> FloatArray:
     """Log density of what was seen; a spread below half a cell of the grid is held there."""
     std = np.maximum(seen.std, np.asarray(cell) / 2.0)
     return np.asarray(-0.5 * ((seen.value - expected) / std) ** 2 - np.log(std * np.sqrt(2 * pi)))

@@ -162,24 +162,20 @@ class SiteEnsembleClassifier:
             raise InvalidArgumentError(f"X: expected windows with a reference, got shape {inputs.shape}")
         codes = _codes(checked_labels(y, len(inputs)))
         sites = None if groups is None else np.asarray(groups)
-        windows, empty = ensemble.split_reference(inputs)[0], codes == NONE
+        (windows, learned), empty = ensemble.split_reference(inputs), codes == NONE
         prior_s = ensemble.PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
-        levels, reference, codes = _with_mirror_images(*ensemble.split_reference(inputs), codes)
-        home = ensemble.SiteReference.from_row(reference.mean(axis=0))
-        silence = levels[codes == NONE].mean(axis=0)
-        weights = np.ones(len(codes))
+        real = _with_mirror_images(windows, learned, codes)
+        home = ensemble.SiteReference.from_row(real[1].mean(axis=0))
+        silence = real[0][real[2] == NONE].mean(axis=0)
+        ones = np.ones(len(real[2]))
+        rows = [(*real, ones)]
         if heard is not None:
             again = np.array([one.beside(home, silence, prior_s).row for one in heard])
-            more = _with_mirror_images(ensemble.split_reference(inputs)[0], again, _codes(np.asarray(y)))
-            levels, reference, codes = (
-                np.concatenate(pair) for pair in zip((levels, reference, codes), more, strict=True)
-            )
-            weights = np.repeat([1.0 - HEARD_PART, HEARD_PART], len(weights))
+            more = _with_mirror_images(windows, again, codes)
+            rows = [(*real, (1.0 - HEARD_PART) * ones), (*more, HEARD_PART * ones)]
         if self.simulated is not None and sites is not None:
-            made = _simulated_rows(self.simulated.at(sites), home)
-            levels, reference, codes, weights = (
-                np.concatenate(pair) for pair in zip((levels, reference, codes, weights), made, strict=True)
-            )
+            rows.append(_simulated_rows(self.simulated.at(sites), home))
+        levels, reference, codes, weights = map(np.concatenate, zip(*rows, strict=True))
         # The four of the data, and what else there are windows of; scikit-learn sorts its columns the same.
         known = np.union1d(np.arange(len(CLASSES)), codes)
         views = ensemble.expert_views({recipe.view for recipe in self.recipes}, levels, reference)

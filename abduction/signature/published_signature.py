@@ -177,8 +177,7 @@ class SignatureModel:
         Machine Learning 20, 1995.
         """
         features = finite_array("X", X, (None, self.n_features))
-        values: FloatArray = (features - self.mean) / self.scale @ self.coefficients.T + self.intercepts
-        return values
+        return np.asarray((features - self.mean) / self.scale @ self.coefficients.T + self.intercepts)
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
@@ -242,8 +241,7 @@ def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
     right_side[n_classes] = 1.0
     solution = np.linalg.solve(_optimality_matrix(bounded, n_classes), right_side)[:, :n_classes, 0]
     positive = np.maximum(solution, SMALLEST_PROBABILITY)
-    probabilities: FloatArray = positive / positive.sum(axis=1, keepdims=True)
-    return probabilities
+    return np.asarray(positive / positive.sum(axis=1, keepdims=True))
 
 
 def _optimality_matrix(pairwise: FloatArray, n_classes: int) -> FloatArray:

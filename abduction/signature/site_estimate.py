@@ -29,7 +29,6 @@ from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in
 from worldstate.ground.serialisation import Check
 
 from .ensemble import EnsembleModel, SiteReference, log_levels
-from .published_signature import ModelDomain
 
 # Share of the difference in level that is carried over; all of the pattern is.
 _LEVEL_GAIN = 0.25
@@ -175,6 +174,8 @@ class SiteSignature:
     ----------
     estimate : SiteEstimate
         All that is carried from window to window; `Checkpoint` writes it to disk.
+    domain, reference_prior
+        Those of the model.
 
     Examples
     --------
@@ -194,20 +195,10 @@ class SiteSignature:
         *,
         estimate: SiteEstimate | None = None,
     ) -> None:
-        self._model = model
+        self._model, self.domain, self.reference_prior = model, model.domain, model.reference_prior
         self._settings = settings or SiteEstimateSettings()
         self.estimate = estimate or SiteEstimate.start(model.n_features)
         finite_array("estimate", self.estimate.level, (model.n_features,))
-
-    @property
-    def reference_prior(self) -> tuple[float, ...]:
-        """That of the model."""
-        return self._model.reference_prior
-
-    @property
-    def domain(self) -> ModelDomain | None:
-        """What the model was made for."""
-        return self._model.domain
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         """Return the log-likelihoods of the next window, then learn from it.

@@ -39,8 +39,7 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatA
     """
     posteriors = finite_array("probabilities", probabilities, (None, len(CLASSES)))
     hazard = posteriors[:, LEFT] + posteriors[:, RIGHT]
-    statistic: FloatArray = hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE])
-    return statistic
+    return np.asarray(hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE]))
 
 
 def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatArray:

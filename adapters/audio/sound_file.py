@@ -234,7 +234,14 @@ def open_audio(
 def _opened(path: Path, opened: ExitStack) -> AudioSource:
     """Open a file on the stack that closes it, whatever is silent in it."""
     source = opened.enter_context(AudioSource(path, _open_file(path)))
-    _check(source)
+    size = data_size(path)
+    if size is not None and size[0] > size[1]:
+        problem = f"cut short: expected {size[0]} bytes of samples by its header, got {size[1]}"
+        raise InputFileError(path, problem)
+    if source.frames == 0:
+        raise InputFileError(path, "expected samples, the recording is empty")
+    source.span(source.frames - 1, 1)  # which a FLAC file that was cut short cannot give
+    source.silent_channels = constant_channels(source.span(0, min(source.sample_rate_hz, source.frames)))
     return source
 
 
@@ -251,17 +258,6 @@ def _open_file(path: Path) -> Any:
         file.close()
         raise InputFileError(path, f"expected WAV, RF64, W64 or FLAC with plain samples, got {kind}")
     return file
-
-
-def _check(source: AudioSource) -> None:
-    size = data_size(source.path)
-    if size is not None and size[0] > size[1]:
-        problem = f"cut short: expected {size[0]} bytes of samples by its header, got {size[1]}"
-        raise InputFileError(source.path, problem)
-    if source.frames == 0:
-        raise InputFileError(source.path, "expected samples, the recording is empty")
-    source.span(source.frames - 1, 1)  # which a FLAC file that was cut short cannot give
-    source.silent_channels = constant_channels(source.span(0, min(source.sample_rate_hz, source.frames)))
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:
@@ -329,15 +325,12 @@ class SoundStream(ABC):
 
     __slots__ = ()
 
+    start_ns: int = 0  # Time of the first sample on the clock of the recorder; 0 where nothing tells
+
     @property
     @abstractmethod
     def name(self) -> str:
         """For messages."""
-
-    @property
-    def start_ns(self) -> int:
-        """Time of the first sample on the clock of the recorder; 0 where nothing tells."""
-        return 0
 
     @abstractmethod
     def open(self) -> Audio:
@@ -397,8 +390,7 @@ class RawPcm(SoundStream):
         """Return samples of full scale 1, shape (n, channels)."""
         raw = {"format": "RAW", "subtype": SUBTYPES[self.encoding], "endian": "LITTLE"}
         about = {"samplerate": self.sample_rate_hz, "channels": self.channels, "always_2d": True}
-        samples: Float32Array = soundfile.read(io.BytesIO(data), dtype="float32", **raw, **about)[0]
-        return samples
+        return np.asarray(soundfile.read(io.BytesIO(data), dtype="float32", **raw, **about)[0])
 
 
 # An open recording is one whose samples come from elsewhere, such as microphones that run.

@@ -94,8 +94,7 @@ def blurred(frame: ImageArray, sigma_px: float, rng: np.random.Generator) -> Ima
 
 
 def _darkened(frame: ImageArray, factor: float, rng: np.random.Generator) -> ImageArray:
-    table = np.round(np.arange(256) * factor).astype(np.uint8)
-    return table[frame]
+    return np.round(np.arange(256) * factor).astype(np.uint8)[frame]
 
 
 def _noisy(frame: ImageArray, sigma: float, rng: np.random.Generator) -> ImageArray:
@@ -228,8 +227,7 @@ class CameraHealth:
         if quality.sharpness is not None:
             blur = float(np.interp(-quality.sharpness, -np.array(self.sharpness), LEVELS))
         darkness = darkness_of(min(quality.brightness / self.brightness, 1.0))
-        noise = float(np.interp(quality.noise, self.noise, LEVELS))
-        return Health(blur, darkness, noise)
+        return Health(blur, darkness, float(np.interp(quality.noise, self.noise, LEVELS)))
 
 
 def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> CameraHealth:

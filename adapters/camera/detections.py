@@ -268,7 +268,6 @@ class Detector(Protocol):
         DetectionFrame
             Boxes in pixels, scores in [0, 1], labels.
         """
-        ...
 
 
 def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionLog:

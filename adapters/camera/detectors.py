@@ -116,8 +116,7 @@ class MotionDetector:
         speck = np.ones((3, 3), dtype=np.uint8)
         joint = np.ones((frame.shape[1] // 80 * 2 + 1,) * 2, dtype=np.uint8)
         mask = self._cv2.morphologyEx(mask, self._cv2.MORPH_OPEN, speck)
-        joined: ImageArray = self._cv2.morphologyEx(mask, self._cv2.MORPH_CLOSE, joint)
-        return joined
+        return np.asarray(self._cv2.morphologyEx(mask, self._cv2.MORPH_CLOSE, joint))
 
     def _objects(self, frame: ImageArray, mask: ImageArray, scale: FloatArray) -> DetectionFrame:
         _, labels, stats, _ = self._cv2.connectedComponentsWithStats(mask, connectivity=8)
@@ -145,8 +144,7 @@ def reduced_to(frame: ImageArray, width_px: int) -> ImageArray:
     if width <= width_px:
         return frame
     cv2, size = optional("cv2"), (width_px, max(round(height * width_px / width), 1))
-    small: ImageArray = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
-    return small
+    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA))
 
 
 def _difference(frame: ImageArray, background: ImageArray) -> Float32Array:
@@ -154,8 +152,7 @@ def _difference(frame: ImageArray, background: ImageArray) -> Float32Array:
     cv2 = optional("cv2")
     apart = cv2.absdiff(frame, background)
     apart = apart if apart.ndim == 2 else apart.max(axis=2)
-    smooth: Float32Array = cv2.GaussianBlur(apart.astype(np.float32), (0, 0), _SMOOTHING_PX)
-    return smooth
+    return np.asarray(cv2.GaussianBlur(apart.astype(np.float32), (0, 0), _SMOOTHING_PX))
 
 
 def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> float:
@@ -347,8 +344,7 @@ def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, 
         raise InvalidArgumentError(f"output: expected finite numbers of shape (1, ., .), got {array.shape}")
     rows, columns = array.shape[1:]
     if columns == 5 + classes:
-        per_class = array[0, :, 5:] * array[0, :, 4:5]
-        return _from_centres(array[0, :, :4], per_class)
+        return _from_centres(array[0, :, :4], array[0, :, 5:] * array[0, :, 4:5])
     if rows == 4 + classes:
         return _from_centres(array[0, :4].T, array[0, 4:].T)
     if columns == 6:

@@ -126,18 +126,12 @@ def _rate_hz(path: Path) -> int:
 
 def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
     """Return the second before the end of the window, shape (n, M)."""
-    length = round(WINDOW_S * source.sample_rate_hz)
-    return source.span(_ends_at(source, window) - length, length)
-
-
-def _ends_at(source: AudioSource, window: LabelledWindow) -> int:
-    """Return the sample that a window of a second ends before."""
-    rate = source.sample_rate_hz
+    rate, length = source.sample_rate_hz, round(WINDOW_S * source.sample_rate_hz)
     end = source.frames if window.end_s is None else round(window.end_s * rate)
-    if end > source.frames or end < round(WINDOW_S * rate):
+    if end > source.frames or end < length:
         at = "" if window.end_s is None else f" before {window.end_s:g} s"
         raise InputFileError(source.path, f"expected a second of sound{at}, got {source.duration_s:.3g} s")
-    return end
+    return source.span(end - length, length)
 
 
 def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> LabelledWindow:

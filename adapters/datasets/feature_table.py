@@ -171,9 +171,7 @@ def read_features(path: str | Path) -> FeatureTable:
     features, labels, t0_frames = zip(*windows, strict=True)
     classes, ids, environments, recordings = (np.array(column) for column in zip(*labels, strict=True))
     domain = Path(f"{path}.json")
-    made_with = None
-    if domain.is_file():
-        made_with = read_record(ModelDomain, domain, "domain")
+    made_with = read_record(ModelDomain, domain, "domain") if domain.is_file() else None
     return FeatureTable(np.array(features), classes, ids, environments, recordings, t0_frames, made_with)
 
 
@@ -235,8 +233,7 @@ def _window(
     if max(map(len, labels)) > LONGEST_NAME:
         raise InputFileError(path, f"line {line}: expected names of at most {LONGEST_NAME} characters")
     features = np.array([number(path, line, row, column) for column in FEATURE_COLUMNS])
-    t0_frame = t0_of(path, line, row)
-    return features, labels, t0_frame
+    return features, labels, t0_of(path, line, row)
 
 
 def t0_of(path: str | Path, line: int, row: dict[str, str]) -> int | None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.files.file_io import GrowingFile, atomic_path, whole_file
+from worldstate.adapters.files.file_io import FileOpener, GrowingFile, atomic_path, whole_file
 from worldstate.ground import FloatArray, InputFileError, nanoseconds
 from worldstate.ground.errors import MissingExtraError
 from worldstate.ground.extras import check_extra, optional
@@ -37,14 +37,6 @@ _WIDEST_PX, _QUALITY = 1000, 80
 Told: TypeAlias = (
     WorldState | scene.SceneUpdate | scene.CompressedImage | scene.RawAudio | scene.FrameTransform
 )
-# The name that a viewer knows each by.
-_SCHEMA_NAMES: dict[type, str] = {
-    WorldState: "worldstate.Snapshot",
-    scene.SceneUpdate: "foxglove.SceneUpdate",
-    scene.CompressedImage: "foxglove.CompressedImage",
-    scene.RawAudio: "foxglove.RawAudio",
-    scene.FrameTransform: "foxglove.FrameTransform",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +58,9 @@ class LogMessage:
     @property
     def schema_name(self) -> str:
         """Name of the type of the value."""
-        return _SCHEMA_NAMES[type(self.value)]
+        # What is drawn is named as Foxglove names it.
+        own = isinstance(self.value, WorldState)
+        return "worldstate.Snapshot" if own else f"foxglove.{type(self.value).__name__}"
 
     @property
     def schema(self) -> bytes:
@@ -245,25 +239,20 @@ def _colors(
 
 
 @contextmanager
-def mcap_file(path: Path) -> Iterator[LogSink]:
-    """Lend a function that writes messages to an MCAP file, which takes its name when the block ends."""
-    check_extra("mcap")
-    with whole_file(path) as file:
-        messages = _McapMessages(file)
-        yield messages.write
-        messages.finish()
+def mcap_file(path: Path, opener: FileOpener = whole_file) -> Iterator[LogSink]:
+    """Lend a function that writes messages to an MCAP file.
 
-
-@contextmanager
-def growing_mcap(path: Path, most_bytes: int | None = None) -> Iterator[LogSink]:
-    """Lend a function that writes messages to a `GrowingFile`, of which a killed run loses half a second."""
+    It takes its name when the block ends; of a `GrowingFile`, which has it before, a killed run loses half a
+    second.
+    """
     check_extra("mcap")
-    with GrowingFile(path, most_bytes) as file:
+    with opener(path) as file:
         messages = _McapMessages(file)
 
         def write(message: LogMessage) -> None:
             nonlocal messages
-            if file.full and message.topic == SNAPSHOT_TOPIC:  # the scene of a state follows it
+            # The scene of a state follows it.
+            if isinstance(file, GrowingFile) and file.full and message.topic == SNAPSHOT_TOPIC:
                 messages.finish()
                 file.begin()
                 messages = _McapMessages(file)
@@ -351,7 +340,7 @@ _MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.
 # Of a message: its channel and number, then its time.
 _MESSAGE, _MESSAGE_HEAD = 5, struct.Struct("<6xQ")
 # Of the index of a chunk: its first and last time and where it stands; its last 16 bytes are its sizes.
-_INDEX, _INDEX_HEAD = 8, struct.Struct("<QQQ")
+_INDEX, _INDEX_HEAD, _INDEX_SIZES = 8, struct.Struct("<QQQ"), struct.Struct("<QQ")
 # Readers of bags hold every chunk whose times overlap, decoded.
 _MOST_AT_ONCE = 1 << 29
 
@@ -379,7 +368,8 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
             kind, length = _RECORD.unpack(file.read(_RECORD.size))
             at += _RECORD.size + length
             if kind == _INDEX and _INDEX_HEAD.size < length <= _LARGEST_RECORD:
-                first, last, place, sizes = _indexed(file.read(length))
+                index = file.read(length)
+                (first, last, place), sizes = _INDEX_HEAD.unpack_from(index), _INDEX_SIZES.unpack(index[-16:])
                 known, span = chunks.get(place, (None, ()))
                 if known != sizes:
                     raise InputFileError(path, f"expected an index of its chunks, got none at byte {place}")
@@ -401,13 +391,6 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
     if (most := max(accumulate(size for *_, size in sorted(times)), default=0)) > _MOST_AT_ONCE:
         limit = f"expected at most {_MOST_AT_ONCE >> 20} MiB in chunks of one time"
         raise InputFileError(path, f"{limit}, got {most >> 20}")
-
-
-def _indexed(index: bytes) -> tuple[int, int, int, tuple[int, int]]:
-    """Return first and last time of an indexed chunk, where it stands, and its sizes, packed and not."""
-    first, last, place = _INDEX_HEAD.unpack_from(index)
-    sizes = index[-16:]
-    return first, last, place, (int.from_bytes(sizes[:8], "little"), int.from_bytes(sizes[8:], "little"))
 
 
 def _compressed_bytes(chunk: bytes) -> int:

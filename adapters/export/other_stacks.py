@@ -55,8 +55,7 @@ class LaneObject:
     def path_m(self) -> FloatArray:
         """Return where it is now and every half second until 3 s from now, shape (7, 2)."""
         after_s = PATH_STEP_S * np.arange(PATH_STEPS + 1)[:, None]
-        path: FloatArray = self.position_m + after_s * self.velocity_mps
-        return path
+        return np.asarray(self.position_m + after_s * self.velocity_mps)
 
 
 def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[LaneObject]:
@@ -281,9 +280,8 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
     >>> osi_sensor_data(WorldState(1_500_000_000, 7)).moving_object_header.cycle_counter
     7
     """
-    described, data = optional("osi3.osi_version_pb2"), optional("osi3.osi_sensordata_pb2").SensorData()
-    version = described.DESCRIPTOR.GetOptions().Extensions[described.current_interface_version]
-    data.version.CopyFrom(version)
+    data = optional("osi3.osi_sensordata_pb2").SensorData()
+    data.version.CopyFrom(_osi_version())
     for stamp in (data.timestamp, data.last_measurement_time, data.moving_object_header.measurement_time):
         stamp.seconds, stamp.nanos = divmod(state.stamp_ns, 1_000_000_000)
     data.sensor_id.value = 1
@@ -356,10 +354,14 @@ def _osi_mcap(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], Non
     writer.finish()
 
 
+def _osi_version() -> Any:
+    described = optional("osi3.osi_version_pb2")
+    return described.DESCRIPTOR.GetOptions().Extensions[described.current_interface_version]
+
+
 def _osi_versions() -> tuple[str, str]:
     """Return the versions of OSI and of protobuf."""
-    described = optional("osi3.osi_version_pb2")
-    version = described.DESCRIPTOR.GetOptions().Extensions[described.current_interface_version]
+    version = _osi_version()
     osi = f"{version.version_major}.{version.version_minor}.{version.version_patch}"
     return osi, str(optional("google.protobuf").__version__)
 
@@ -378,8 +380,7 @@ def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
     header.tracking_id.value = uuid.UUID(entity.id).int & (1 << 63) - 1
     header.existence_probability = entity.existence_probability
     header.age = seconds(entity.updated_ns - entity.created_ns)
-    predicted = entity.status == "hidden" or not one.measured
-    known = "PREDICTED" if predicted else "MEASURED"
+    known = "PREDICTED" if entity.status == "hidden" or not one.measured else "MEASURED"
     header.measurement_state = getattr(header, f"MEASUREMENT_STATE_{known}")
     (x, y), (vx, vy) = one.position_m.tolist(), relative_mps.tolist()
     x_std, y_std = (one.covariance.diagonal() ** 0.5).tolist()
@@ -521,16 +522,14 @@ class LiveSender:
 
     def __init__(self, target: tuple[str, int], connection: socket.socket) -> None:
         self._target, self._connection = target, connection
-        self._waiting, self.dropped = deque[bytes](), 0
+        self._waiting, self.dropped = deque[bytes](maxlen=MOST_WAITING), 0
         self._changed, self._stopped = threading.Condition(), threading.Event()
         self._thread = threading.Thread(target=self._send, daemon=True)
 
     def put(self, message: bytes) -> None:
         """Hand a message over; the oldest one makes room."""
         with self._changed:
-            if len(self._waiting) == MOST_WAITING:
-                self._waiting.popleft()
-                self.dropped += 1
+            self.dropped += len(self._waiting) == MOST_WAITING
             self._waiting.append(message)
             self._changed.notify()
 

@@ -230,14 +230,12 @@ _HEIGHT_M = {"occluder": 0.0, "searched": 0.02, "cue": 0.04, "entity": 0.06}
 _STEP_RAD = math.radians(5.0)
 _CAR = Xyz(4.5, 1.8, 1.5)
 # The palette of the figures, by meaning; grey is what hides. Decisions are lighter: viewers are dark.
-_GREY, _HIDDEN, _IN_VIEW, _SEARCHED, _DECISION, _HEARD = (
-    (0.5, 0.5, 0.5),
-    (0.835, 0.369, 0.0),
-    (0.0, 0.447, 0.698),
-    (0.0, 0.62, 0.451),
-    (0.5, 0.42, 0.9),
-    (0.8, 0.475, 0.655),
-)
+_GREY = (0.5, 0.5, 0.5)
+_HIDDEN = (0.835, 0.369, 0.0)
+_IN_VIEW = (0.0, 0.447, 0.698)
+_SEARCHED = (0.0, 0.62, 0.451)
+_DECISION = (0.5, 0.42, 0.9)
+_HEARD = (0.8, 0.475, 0.655)
 
 
 def scene_update(state: WorldState) -> SceneUpdate:
@@ -312,7 +310,7 @@ def _ego() -> SceneArrow:
 def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:
     """Draw the edge as a line and what lies behind it as a sector."""
     near, far = (_at(occluder.edge_azimuth_rad, radius_m) for radius_m in (4.0, SECTOR_M))
-    edge = SceneLine(0, (near, far), _ink(_GREY))
+    edge = SceneLine(0, (near, far), Rgba(*_GREY, 1.0))
     behind = _sector(hidden_sector(occluder), SECTOR_M, Rgba(*_GREY, 0.12), "occluder")
     pairs = _pairs(direction=occluder.direction, assumed=occluder.assumed)
     return _item(state, f"occluder {occluder.id}", metadata=pairs, lines=(edge,), triangles=(behind,))
@@ -342,8 +340,7 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
 
 def _entity(state: WorldState, entity: Entity) -> SceneItem:
     """Draw where it is in nine of ten cases, and where it will be; a box only where a position is known."""
-    hidden = entity.status == "hidden"
-    color = _HIDDEN if hidden else _IN_VIEW
+    color = _HIDDEN if entity.status == "hidden" else _IN_VIEW
     density = entity.existence_probability
     sector_rad = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
     shapes = (_sector(sector_rad, SECTOR_M, Rgba(*color, 0.05 + 0.3 * density), "entity"),)
@@ -400,11 +397,7 @@ def _at(azimuth_rad: float, radius_m: float, height_m: float = 0.0) -> Xyz:
 
 
 def _text(azimuth_rad: float, radius_m: float, text: str, color: tuple[float, float, float]) -> SceneText:
-    return SceneText(Placed(_at(azimuth_rad, radius_m, 1.0)), text, _ink(color))
-
-
-def _ink(color: tuple[float, float, float]) -> Rgba:
-    return Rgba(*color, 1.0)
+    return SceneText(Placed(_at(azimuth_rad, radius_m, 1.0)), text, Rgba(*color, 1.0))
 
 
 def _pairs(**values: object) -> tuple[ScenePair, ...]:

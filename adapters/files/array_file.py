@@ -26,8 +26,8 @@ from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 from .file_io import read_bytes, write_text
 
 Axes = Literal["acoular", "base_link"]
-# The coordinates of a microphone as a file has them, each with its axis.
-Row: TypeAlias = list[tuple[str, object]]
+# The coordinates x, y and z of a microphone as a file has them.
+Row: TypeAlias = Sequence[object]
 
 MAX_BYTES = 1 << 20
 # No vehicle carries a wider array, or one with its microphones farther apart or closer together: such a file
@@ -195,7 +195,7 @@ def _xml_rows(path: Path, data: bytes) -> list[Row]:
         raise InputFileError(path, problem) from error
     except (SafeElementTree.ParseError, ValueError, LookupError) as error:
         raise InputFileError(path, f"expected array XML, it does not parse: {error}") from error
-    return [[(axis, element.get(axis)) for axis in "xyz"] for element in root.findall("pos")]
+    return [[element.get(axis) for axis in "xyz"] for element in root.findall("pos")]
 
 
 def _csv_rows(path: Path, data: bytes) -> list[Row]:
@@ -211,8 +211,7 @@ def _csv_rows(path: Path, data: bytes) -> list[Row]:
         raise InputFileError(path, f"expected microphones as XML, CSV or JSON: {error}") from error
     cells = [[cell.strip() for cell in row] for row in rows]
     columns, has_header = _csv_columns(path, cells[0] if cells else [])
-    places = [*zip("xyz", columns, strict=True)]
-    return [[(a, row[c] if c < len(row) else None) for a, c in places] for row in cells[has_header:]]
+    return [[row[c] if c < len(row) else None for c in columns] for row in cells[has_header:]]
 
 
 def _csv_columns(path: Path, first: list[str]) -> tuple[list[int], bool]:
@@ -240,14 +239,14 @@ def _json_rows(path: Path, data: bytes) -> tuple[list[Row], str, tuple[int, ...]
         raise InputFileError(path, "expected a list of positions [x, y, z], or one as positions_m")
     channels = held.get("channels", [])
     numbers = tuple(channels) if isinstance(channels, list) else (channels,)
-    return [[*zip("xyz", row, strict=True)] for row in rows], held.get("axes", "base_link"), numbers
+    return rows, held.get("axes", "base_link"), numbers
 
 
 def _numbers(path: Path, rows: list[Row]) -> list[list[float]]:
     """Return the coordinates of each microphone; refuse what is no finite number."""
     found: list[list[float]] = [[] for _ in rows]
     for number, row in enumerate(rows, start=1):
-        for axis, value in row:
+        for axis, value in zip("xyz", row, strict=True):
             if (read := _number(value)) is None:
                 problem = f"microphone {number}: expected a finite number as {axis}, got {value!r:.40}"
                 raise InputFileError(path, problem)

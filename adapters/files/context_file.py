@@ -50,16 +50,14 @@ class _ContextFile:
         known = usual.occluders
         if self.arms is not None:
             known = tuple(arm.occluder(-1 if order.get(arm.direction) else 1) for arm in self.arms)
-        half_rad = usual.view_half_angle_rad
-        if self.view_half_angle_deg is not None:
-            half_rad = math.radians(self.view_half_angle_deg)
+        half_deg = self.view_half_angle_deg
         return Context(
             rates=self.rates or usual.rates,
             occluders=tuple(sorted(known, key=lambda one: order.get(one.direction, len(order)))),
             priors=self.priors,
             ego_speed_mps=self.ego_speed_mps,
             site=self.site,
-            view_half_angle_rad=half_rad,
+            view_half_angle_rad=usual.view_half_angle_rad if half_deg is None else math.radians(half_deg),
         )
 
 

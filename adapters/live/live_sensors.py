@@ -11,6 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Generic, Self, TypeAlias, TypeVar
 
 from worldstate.adapters.camera.camera_channel import ImageHealth
@@ -94,6 +95,8 @@ class DatagramSocket(ReaderThread, Generic[T]):
         Datagrams that could not be read, came late, again, or from a stranger.
     problem : str
         What was wrong with the last of them.
+    port : int
+        That is listened at, where 0 was given the one that was free.
 
     Raises
     ------
@@ -115,17 +118,12 @@ class DatagramSocket(ReaderThread, Generic[T]):
         self._pinned: tuple[float, Sender] | None = None
         self._last: dict[str, int] = {}  # The number taken last, by host; by a key there is one
         super().__init__(self._socket.close)
-        self.refused, self.problem = 0, ""
+        self.port, self.refused, self.problem = int(self._socket.getsockname()[1]), 0, ""
 
     @property
     def dropped(self) -> int:
         """Datagrams that were not taken in time."""
         return self._datagrams.dropped
-
-    @property
-    def port(self) -> int:
-        """The port that is listened at, where 0 was given the one that was free."""
-        return int(self._socket.getsockname()[1])
 
     def deliver(self, take: Callable[[int, T], None]) -> int:
         """Pass on what waits, each with the time of its capture on the stream's clock, nanoseconds.
@@ -206,9 +204,7 @@ class DetectionSocket(DatagramSocket[DetectionFrame]):
     """
 
     def __init__(self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None) -> None:
-        super().__init__(
-            address, stamp_ns, lambda record: frame_of(record, "datagram"), "--detections", trust
-        )
+        super().__init__(address, stamp_ns, partial(frame_of, where="datagram"), "--detections", trust)
 
 
 class OdometrySocket(DatagramSocket[OdometryRecord]):
@@ -220,9 +216,7 @@ class OdometrySocket(DatagramSocket[OdometryRecord]):
     """
 
     def __init__(self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None) -> None:
-        def read(record: object) -> OdometryRecord:
-            return decode(OdometryRecord, record, "datagram")
-
+        read = partial(decode, OdometryRecord, where="datagram")
         super().__init__(address, stamp_ns, read, "--odometry", trust)
 
 

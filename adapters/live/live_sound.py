@@ -52,8 +52,7 @@ class BoundedChannel(Generic[T]):
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = int(in_range("capacity", capacity, 1, 1 << 20))
-        self._items: deque[T] = deque()
+        self._items: deque[T] = deque(maxlen=int(in_range("capacity", capacity, 1, 1 << 20)))
         self._changed = threading.Condition()
         self._closed = False
         self._error: BaseException | None = None
@@ -64,9 +63,7 @@ class BoundedChannel(Generic[T]):
         with self._changed:
             if self._closed:
                 return
-            if len(self._items) == self._capacity:
-                self._items.popleft()
-                self.dropped += 1
+            self.dropped += len(self._items) == self._items.maxlen
             self._items.append(item)
             self._changed.notify()
 
@@ -170,11 +167,9 @@ class SoundFeed(Protocol):
 
     def start(self, into: BoundedChannel[SoundBlock], /) -> None:
         """Begin to put blocks into the channel."""
-        ...
 
     def stop(self) -> None:
         """Put nothing more, and close what was opened."""
-        ...
 
 
 class LiveSound(Audio):

@@ -23,21 +23,8 @@ from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.measurement.odometry import Odometry
 
-from .message_types import (
-    ARRAY,
-    AUDIO,
-    AUDIO_FRAME,
-    DETECTIONS,
-    ODOMETRY,
-    PCM,
-    PCM_INFO,
-    RAW_AUDIO,
-    STAMPED_PCM,
-    TRANSFORMS,
-    instant_of,
-    stamp_of,
-    typestore,
-)
+from . import message_types as types
+from .message_types import instant_of, stamp_of, typestore
 
 METADATA_NAME, STORAGE_SUFFIXES = "metadata.yaml", (".mcap", ".db3")
 # Half a second of a thousand microphones; an image of detections is far below it.
@@ -77,19 +64,12 @@ class BagReader:
         found = {one.topic: one.msgtype for one in self.reader.connections}
         fit = sorted(topic for topic, kind in found.items() if kind in kinds)
         if given is not None and given not in fit:
-            problem = f"expected {_either(kinds)} on {given} ({option}), got {self._told()}"
+            problem = f"expected {' or '.join(kinds)} on {given} ({option}), got {self.told()}"
             raise InputFileError(self.path, problem)
         if given is None and len(fit) > 1:
-            problem = f"expected {option} with one of {', '.join(fit)}, which all hold {_either(kinds)}"
+            problem = f"expected {option} with one of {', '.join(fit)}, which all hold {' or '.join(kinds)}"
             raise InputFileError(self.path, problem)
         return given or next(iter(fit), None)
-
-    def needed_topic(self, option: str, given: str | None, *kinds: str) -> str:
-        """Return the topic; refuse a bag without one."""
-        topic = self.topic(option, given, *kinds)
-        if topic is None:
-            raise InputFileError(self.path, f"expected a topic of {_either(kinds)}, got {self._told()}")
-        return topic
 
     def kind_of(self, topic: str) -> str:
         """Return the type of a topic's messages."""
@@ -105,7 +85,8 @@ class BagReader:
                     raise InputFileError(self.path, f"{problem}, got one of {len(data)}")
                 yield recorded_ns, self.reader.deserialize(data, connection.msgtype)
 
-    def _told(self) -> str:
+    def told(self) -> str:
+        """Return the topics and their types, for messages."""
         found = sorted(f"{one.topic} ({one.msgtype})" for one in self.reader.connections)
         return ", ".join(found) or "no topic at all"
 
@@ -164,18 +145,14 @@ def refused_as_bag(path: Path) -> Iterator[None]:
         raise InputFileError(path, f"expected a bag of ROS 2 that can be read ({said:.200})") from error
 
 
-def _either(kinds: tuple[str, ...]) -> str:
-    return " or ".join(kinds)
-
-
 _LOG = logging.getLogger(__name__)
 
-AUDIO_KINDS = AUDIO, STAMPED_PCM, PCM, AUDIO_FRAME, RAW_AUDIO
+AUDIO_KINDS = types.AUDIO, types.STAMPED_PCM, types.PCM, types.AUDIO_FRAME, types.RAW_AUDIO
 # Formats by the message that names them; a compressed one has lost the phase between microphones.
 ENCODINGS: dict[str, dict[str, sound_file.Encoding]] = {
-    PCM_INFO: {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"},
-    AUDIO_FRAME: {"signed_16": "s16", "signed_24": "s24", "signed_32": "s32", "float": "f32"},
-    RAW_AUDIO: {"pcm-s16": "s16"},
+    types.PCM_INFO: {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"},
+    types.AUDIO_FRAME: {"signed_16": "s16", "signed_24": "s24", "signed_32": "s32", "float": "f32"},
+    types.RAW_AUDIO: {"pcm-s16": "s16"},
 }
 MAX_RATE_HZ = 10_000_000
 # Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
@@ -256,20 +233,12 @@ class BagAudio(sound_file.Audio):
         """Do nothing: the bag is open while its blocks are read."""
 
 
-def first_stamp(bag: BagReader, topic: str) -> int:
-    """Return the time of a topic's first sample, ns."""
-    block = next(audio_blocks(bag, topic), None)
-    if block is None:
-        raise InputFileError(bag.path, f"expected samples on {topic}, it holds no message")
-    return block.stamp_ns
-
-
 def audio_blocks(bag: BagReader, topic: str) -> Iterator[AudioBlock]:
-    """Yield what each message of a topic holds, checked against the first."""
+    """Yield what each message of a topic holds, checked against the first; refuse a topic without any."""
     kind, first, taken = bag.kind_of(topic), None, 0
-    info = _pcm_info(bag, topic) if kind in (STAMPED_PCM, PCM) else None
+    info = _pcm_info(bag, topic) if kind in (types.STAMPED_PCM, types.PCM) else None
     for recorded_ns, message in bag.messages(topic):
-        if kind == AUDIO:
+        if kind == types.AUDIO:
             block = _own_block(bag.path, message)
         else:
             block = _pcm_block(info or _described(bag, topic, kind, message), message, recorded_ns)
@@ -281,6 +250,8 @@ def audio_blocks(bag: BagReader, topic: str) -> Iterator[AudioBlock]:
         sound_file.check_finite(bag.path, block.samples, taken)
         taken += len(block.samples)
         yield block
+    if first is None:
+        raise InputFileError(bag.path, f"expected samples on {topic}, it holds no message")
 
 
 def _own_block(path: Path, message: Any) -> AudioBlock:
@@ -300,21 +271,21 @@ def _own_block(path: Path, message: Any) -> AudioBlock:
 
 def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
     """Return how the bytes of audio_common are to be read, as its AudioInfo says."""
-    where = bag.topic("the topic of AudioInfo", None, PCM_INFO)
+    where = bag.topic("the topic of AudioInfo", None, types.PCM_INFO)
     said = None if where is None else next(bag.messages(where), None)
     if said is None:
-        problem = f"expected {PCM_INFO} beside {topic}: rate, channels and format of its bytes"
+        problem = f"expected {types.PCM_INFO} beside {topic}: rate, channels and format of its bytes"
         raise InputFileError(bag.path, problem)
     info = said[1]
     if info.coding_format.lower() not in ("wave", "raw", ""):
         problem = f"{where}: expected uncompressed samples (wave), got {info.coding_format!r:.20}"
         raise InputFileError(bag.path, problem)
-    return _pcm(bag, str(where), PCM_INFO, info.sample_format, info.sample_rate, info.channels)
+    return _pcm(bag, str(where), types.PCM_INFO, info.sample_format, info.sample_rate, info.channels)
 
 
 def _described(bag: BagReader, topic: str, kind: str, message: Any) -> sound_file.RawPcm:
     """Return how the bytes of a message that describes itself are to be read."""
-    if kind == AUDIO_FRAME:
+    if kind == types.AUDIO_FRAME:
         return _pcm(bag, topic, kind, message.format, message.sampling_frequency, message.channel_count)
     return _pcm(bag, topic, kind, message.format, message.sample_rate, message.number_of_channels)
 
@@ -384,18 +355,7 @@ def _first_second(blocks: Iterator[AudioBlock], sound: BagSound) -> list[AudioBl
         parts.append(block)
         if sum(part.duration_s for part in parts) >= 1.0:
             break
-    if not parts:
-        raise InputFileError(sound.path, f"expected samples on {sound.topic}, it holds no message")
     return parts
-
-
-@dataclass(frozen=True, slots=True)
-class BagTopics:
-    """Topics to read, each None for the only one of its type."""
-
-    audio: str | None = None
-    detections: str | None = None
-    odometry: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,21 +374,22 @@ def read_sound(path: Path, topic: str | None = None) -> tuple[BagSound, Micropho
         return sound_of_bag(bag, topic), _array(bag)
 
 
-def read_bag(path: Path, topics: BagTopics | None = None) -> BagInput:
-    """Read a bag but for its samples, which are read when they are listened to.
+def read_bag(
+    path: Path, *, audio: str | None = None, detections: str | None = None, odometry: str | None = None
+) -> BagInput:
+    """Read a bag but for its samples, of the topics named or else the only ones of their types.
 
     Raises
     ------
     InputFileError
         If it is damaged, has no sound, several topics would do, or a message holds what cannot be.
     """
-    chosen = topics or BagTopics()
     with open_bag(path) as bag, refused_as_file(path):
-        sound = sound_of_bag(bag, chosen.audio)
-        seen = bag.topic("--topic detections=", chosen.detections, DETECTIONS)
-        driven = bag.topic("--topic odometry=", chosen.odometry, ODOMETRY)
-        detections = None if seen is None else _detections(bag, seen)
-        return BagInput(sound, _array(bag), detections, None if driven is None else _ego(bag, driven))
+        sound = sound_of_bag(bag, audio)
+        seen = bag.topic("--topic detections=", detections, types.DETECTIONS)
+        driven = bag.topic("--topic odometry=", odometry, types.ODOMETRY)
+        boxes = None if seen is None else _detections(bag, seen)
+        return BagInput(sound, _array(bag), boxes, None if driven is None else _ego(bag, driven))
 
 
 def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneArray:
@@ -438,7 +399,7 @@ def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneAr
     sound, it is turned and moved by them.
     """
     if array is None:
-        raise InputFileError(sound.path, f"expected --array, or a message of {ARRAY} in the bag")
+        raise InputFileError(sound.path, f"expected --array, or a message of {types.ARRAY} in the bag")
     if array.name not in named_arrays():
         return array
     with open_bag(sound.path) as bag, refused_as_file(sound.path):
@@ -471,7 +432,7 @@ def _in_base_link(bag: BagReader, sound: BagSound, points_m: FloatArray) -> Floa
 def _static_transforms(bag: BagReader) -> dict[str, tuple[str, Any]]:
     """Return the parent of every frame and the transform to it, of several the last."""
     found: dict[str, tuple[str, Any]] = {}
-    if not bag.count(STATIC_TOPIC) or bag.kind_of(STATIC_TOPIC) != TRANSFORMS:
+    if not bag.count(STATIC_TOPIC) or bag.kind_of(STATIC_TOPIC) != types.TRANSFORMS:
         return found
     for _, message in _few(bag, STATIC_TOPIC):
         for one in message.transforms:
@@ -503,12 +464,14 @@ def _in_parent(path: Path, transform: Any, points_m: FloatArray) -> FloatArray:
 
 def sound_of_bag(bag: BagReader, topic: str | None) -> BagSound:
     """Return the sound of a bag; refuse one without."""
-    heard = bag.needed_topic("--topic audio=", topic, *AUDIO_KINDS)
-    return BagSound(bag.path, heard, first_stamp(bag, heard))
+    heard = bag.topic("--topic audio=", topic, *AUDIO_KINDS)
+    if heard is None:
+        raise InputFileError(bag.path, f"expected a topic of {' or '.join(AUDIO_KINDS)}, got {bag.told()}")
+    return BagSound(bag.path, heard, next(audio_blocks(bag, heard)).stamp_ns)
 
 
 def _array(bag: BagReader) -> MicrophoneArray | None:
-    topic = bag.topic("one topic of an array, or --array,", None, ARRAY)
+    topic = bag.topic("one topic of an array, or --array,", None, types.ARRAY)
     said = None if topic is None else next(bag.messages(topic), None)
     if said is None:
         return None

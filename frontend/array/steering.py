@@ -69,8 +69,7 @@ class Steering:
         .. math:: Q_k = \sum_t (B_k^T x_{t,k}) (B_k^T x_{t,k})^H
         """
         by_bin = spectra.transpose(1, 0, 2)
-        projected = by_bin if self.basis is None else by_bin @ self.basis
-        return cross_spectra(projected)
+        return cross_spectra(by_bin if self.basis is None else by_bin @ self.basis)
 
     def compress(self, matrices: Complex64Array) -> Complex64Array:
         r"""Write R as :math:`Q_k = B_k^T R_k \overline{B_k}` in the basis: (bins, M, M) -> (bins, r, r)."""

@@ -310,8 +310,8 @@ def _std_rad(spectrum: FloatArray, best: Peak, azimuths_rad: FloatArray) -> floa
     excess = np.maximum(spectrum / share - 1.0 / (best.prominence - 1.0), 0.0)
     density = np.exp((excess - excess[peak]) * (ratio / _TEMPERATURE))
     density /= density.sum()
-    first, last = _lobe(excess, peak)
-    density[first : last + 1] = 0.0
+    # Within the peak's own lobe nothing is another direction.
+    density[peak - _width(excess[peak::-1]) : peak + _width(excess[peak:]) + 1] = 0.0
     others = float(density @ np.square(wrap_angle(azimuths_rad - best.azimuth_rad)))
     moved = _DISPLACEMENT * _top_width(excess, peak) * float(azimuths_rad[1] - azimuths_rad[0]) / ratio
     return math.hypot(_LEAST_STD_RAD, moved, math.sqrt(others))
@@ -358,11 +358,6 @@ class BearingScatter:
         self._past.append(bearing)
         added = math.sqrt(self._sum / self._weight) if self._weight else 0.0
         return replace(bearing, std_rad=min(math.hypot(bearing.std_rad, added), self._most_rad))
-
-
-def _lobe(excess: FloatArray, peak: int) -> tuple[int, int]:
-    """Return the first and last index of the lobe around a peak: up to where it rises again or is zero."""
-    return peak - _width(excess[peak::-1]), peak + _width(excess[peak:])
 
 
 def _width(side: FloatArray) -> int:

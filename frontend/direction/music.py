@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.frontend.spectra.stft import power
 from worldstate.ground import InvalidArgumentError
 from worldstate.ground.checks import finite_array, finite_complex
 from worldstate.ground.typing import ComplexArray, FloatArray, RealArray
@@ -95,16 +96,12 @@ def music_spectrum(subspace: Subspace, steering: ArrayLike) -> FloatArray:
     """
     E = subspace.vectors
     A = finite_complex("steering", steering, (E.shape[0], E.shape[1], None))
-    norm = _power(A, axis=1)
-    outside = norm - _power(E.conj().transpose(0, 2, 1) @ A, axis=1)
+    norm = power(A).sum(axis=1)
+    outside = norm - power(E.conj().transpose(0, 2, 1) @ A).sum(axis=1)
     # Round-off may leave a tiny or negative remainder where the steering vector lies in the subspace.
     floor = np.finfo(outside.dtype).eps * norm
     score = 1.0 / np.maximum(outside, floor).astype(np.float64)
     return np.asarray(score.mean(axis=0))
-
-
-def _power(values: ComplexArray, axis: int) -> RealArray:
-    return np.asarray((values.real**2 + values.imag**2).sum(axis=axis))
 
 
 def _leading(R: ComplexArray, count: int) -> Subspace:

@@ -160,15 +160,12 @@ class EgoNoise:
 
     def _update_share(self) -> None:
         """Update the share of ego-noise; if it has changed much, all bins are updated at once."""
-        self.ego_share = self._share_used()
+        # Of the covariance that is used: 0 for a street, 1 for ego-noise.
+        self.ego_share = _use_of(*self._split.powers(self._covariance.total))
         is_another = abs(self.ego_share - self._aim) > _ANOTHER_SHARE
         if is_another or self.learned_frames > _ANOTHER_LENGTH * self._aim_frames:
             self._aim, self._aim_frames = self.ego_share, self.learned_frames
             self._urgent = self._stale = len(self._roots)
-
-    def _share_used(self) -> float:
-        """Share of the covariance that is used: 0 for a street, 1 for ego-noise."""
-        return _use_of(*self._split.powers(self._covariance.total))
 
     def _recent_share(self, total: Complex64Array) -> float:
         """Share of ego-noise in the hops accepted for learning of late."""
@@ -228,7 +225,7 @@ class NoiseCovariance:
 
     def __init__(self, n_bins: int, n_microphones: int, forgetting_frames: float) -> None:
         self.n_frames = 0.0
-        self._sum = np.zeros((n_bins, n_microphones, n_microphones), np.complex64)
+        self.total = np.zeros((n_bins, n_microphones, n_microphones), np.complex64)  # The weighted sum S
         self._forgetting = forgetting_frames
 
     def learn(self, total: Complex64Array, n_frames: int, weight: float) -> None:
@@ -238,18 +235,13 @@ class NoiseCovariance:
         """
         kept = math.exp(-weight * n_frames / self._forgetting)
         total *= np.float32(weight)
-        self._sum *= np.float32(kept)
-        self._sum += total
+        self.total *= np.float32(kept)
+        self.total += total
         self.n_frames = kept * self.n_frames + weight * n_frames
 
     def mean(self, bin_index: int) -> Complex64Array:
         """Return the covariance S / n of one bin; the mean of its diagonal is one."""
-        return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
-
-    @property
-    def total(self) -> Complex64Array:
-        """The weighted sum S, (bins, M, M)."""
-        return self._sum
+        return np.asarray(self.total[bin_index] / np.float32(max(self.n_frames, 1e-30)))
 
 
 class NoiseLevel:

@@ -4,7 +4,6 @@ from collections import deque
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray
@@ -203,27 +202,8 @@ class ChannelActivity:
         return dead + faults_where(Fault.INTERMITTENT, self._intermittent, self._share)
 
 
-# Time constant, hops: three seconds.
+# Time constant of the means of span and sample, hops: three seconds.
 _HOPS = 30
-
-
-class RunningMean:
-    """Exponential mean over hops, an ordinary mean until its time constant has passed."""
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self.mean = np.zeros(shape)
-        self.count = np.zeros(shape[1], np.int64)
-
-    def add(self, values: ArrayLike, good: BoolArray) -> None:
-        r"""Take the values of a hop, shape (statistics, M), and the usable channels, shape (M,).
-
-        .. math:: \mu_{sm} \leftarrow \mu_{sm} + g_m \frac{x_{sm} - \mu_{sm}}{\min(n_m, 30)}
-        """
-        self.count += good
-        weight = good / np.clip(self.count, 1, _HOPS)
-        self.mean += weight * (np.asarray(values) - self.mean)
-
-
 # Mean square of the band, relative to the median channel, below which a channel is silent: -30 dB, far below
 # the few dB by which usable microphones differ.
 _SILENT = 1e-3
@@ -251,7 +231,7 @@ class ChannelMonitor:
     def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         n = array.n_microphones
         self._activity = ChannelActivity(n)
-        self._means = RunningMean((2, n))
+        self._means, self._n_good = np.zeros((2, n)), np.zeros(n, np.int64)
         self._levels = ChannelLevels(n)
         self._single_channel: list[ChannelFault] = []
         self._n_hops = 0
@@ -310,13 +290,17 @@ class ChannelMonitor:
         if not alive.any():
             return self._activity.all_silent()
         bad = silent.copy()
-        mean_span = self._means.mean[0]
+        mean_span = self._means[0]
         known = alive & (mean_span > 0.0)
         if known.any():
             growth = np.divide(span, mean_span, out=np.zeros(len(span)), where=known)
             bad |= growth > _CRACKLE * np.median(growth[known])
         share = np.full(len(samples), 1.0 / len(samples), np.float32)
-        self._means.add(np.stack([span, share @ samples]), ~bad)
+        # Exponential means over the good hops, ordinary ones until the time constant has passed:
+        # mu <- mu + (x - mu) / min(n, 30).
+        self._n_good += ~bad
+        weight = ~bad / np.clip(self._n_good, 1, _HOPS)
+        self._means += weight * (np.stack([span, share @ samples]) - self._means)
         return self._activity.push(bad)
 
     def _report(self, bad: BoolArray) -> ArrayHealth:
@@ -336,9 +320,9 @@ class ChannelMonitor:
         """Faults seen on a channel by itself: clipping, offset, level, gusts."""
         usable = ~self._activity.suspects
         clipped = self._clipping.clipped_share()
-        span, mean = self._means.mean
+        span, mean = self._means
         offset = np.abs(mean) / np.maximum(span, np.finfo(np.float32).tiny)
-        settled = self._means.count >= _SETTLED_HOPS
+        settled = self._n_good >= _SETTLED_HOPS
         return [
             *faults_where(Fault.CLIPPED, clipped > _CLIPPED_SHARE, clipped),
             *faults_where(Fault.OFFSET, usable & settled & (offset > _OFFSET), offset),

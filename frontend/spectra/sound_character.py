@@ -59,7 +59,10 @@ class SoundCharacter:
         ends = np.round(np.arange(1 - _FRAMES, 1) * rate / (HOPS_A_SECOND * _FRAMES)).astype(int)
         self._sound: FloatArray = np.zeros(max(long, short - ends[0]))
         self._frames = len(self._sound) + ends[:, None] + np.arange(-short, 0)
-        self._bands = _Bands(short, rate)
+        self._window = np.hanning(short + 1)[:-1] / np.sqrt(short)
+        self._size = next_fast_len(short, real=True)
+        # A mean: at another rate three bins or four lie within the same band.
+        self._means = np.ascontiguousarray(_means(EDGES_HZ, np.fft.rfftfreq(self._size, 1.0 / rate)).T)
         self._lines = _Lines(long, rate)
         self._levels: FloatArray = np.zeros((_MEMORY, len(EDGES_HZ) - 1))
         self._n_hops = 0
@@ -69,7 +72,8 @@ class SoundCharacter:
         new = self._decimator.push(samples)
         self._sound = np.concatenate([self._sound, new])[len(new) :]
         self._levels[:-_FRAMES] = self._levels[_FRAMES:]
-        self._levels[-_FRAMES:] = self._bands.levels(self._sound[self._frames])
+        powers = power(rfft(self._sound[self._frames] * self._window, self._size))
+        self._levels[-_FRAMES:] = np.log(powers @ self._means + _LEAST)
         self._lines.push(self._sound)
         self._n_hops += 1
 
@@ -80,21 +84,6 @@ class SoundCharacter:
         bands = self._levels[-_SECOND:].mean(axis=0)
         texture = (_modulation(self._levels), _swings(self._levels), self._lines.read())
         return np.concatenate([*texture, bands - bands.mean()])
-
-
-class _Bands:
-    """Log-levels of the bands of short frames."""
-
-    def __init__(self, length: int, rate_hz: float) -> None:
-        self._window = np.hanning(length + 1)[:-1] / np.sqrt(length)
-        self._size = next_fast_len(length, real=True)
-        hz = np.fft.rfftfreq(self._size, 1.0 / rate_hz)
-        # A mean: at another rate three bins or four lie within the same band.
-        self._means = np.ascontiguousarray(_means(EDGES_HZ, hz).T)
-
-    def levels(self, frames: FloatArray) -> FloatArray:
-        """Log-levels, shape (frames, bands)."""
-        return np.asarray(np.log(power(rfft(frames * self._window, self._size)) @ self._means + _LEAST))
 
 
 class _Lines:

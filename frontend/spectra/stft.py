@@ -30,8 +30,7 @@ def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Compl
 
     Source: C. Knapp and G. C. Carter, IEEE Trans. ASSP 24, 1976.
     """
-    squared = power(spectra) if powers is None else powers
-    weights = np.maximum(squared, _POWER_FLOOR)
+    weights = np.maximum(power(spectra) if powers is None else powers, _POWER_FLOOR)
     np.sqrt(weights, out=weights)
     np.reciprocal(weights, out=weights)
     return spectra * weights

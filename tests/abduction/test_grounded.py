@@ -52,7 +52,7 @@ def test_the_integral_over_speed_is_that_of_adaptive_quadrature(spacing_hz):
     mass = norm.cdf(30.0, 8.0, 3.0) - norm.cdf(-5.0, 8.0, 3.0)
     oracle = quad(integrand, -5.0, 30.0, limit=400, points=[0.0, 2.0, 5.0, 10.0])[0] / mass
     background = BACKGROUNDS["line_spacing_hz"]
-    relative = math.log(oracle) - norm.logpdf(spacing_hz, background.mean, background.std)
+    relative = math.log(oracle) - norm.logpdf(spacing_hz, background.value, background.std)
     answer = ground(SCORES, seen(line_spacing_hz=(spacing_hz, 2.0)), [vehicle])
     assert answer.evidence.hidden[0] - SCORES.hidden[0] == pytest.approx(relative, abs=0.01)
     assert answer.evidence.visible - SCORES.visible == pytest.approx(relative, abs=0.01)

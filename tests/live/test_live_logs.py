@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.export.log_messages import growing_mcap, state_messages
+from worldstate.adapters.export.log_messages import mcap_file, state_messages
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.file_io import GrowingFile, line_writer
 from worldstate.adapters.state_log import read_log
@@ -207,7 +207,7 @@ def test_an_mcap_that_was_cut_short_reads_up_to_there(street, tmp_path, share):
 
 def test_a_damaged_mcap_is_read_or_refused(tmp_path):
     path, rng = tmp_path / "a.mcap", random.Random(0)
-    with growing_mcap(path) as write:
+    with mcap_file(path, GrowingFile) as write:
         for number in range(30):
             for message in state_messages(WorldState(0, number * 100_000_000)):
                 write(message)

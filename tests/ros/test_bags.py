@@ -26,7 +26,7 @@ from worldstate.adapters.export.other_stacks import autoware_objects
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.odometry_file import OdometryLog
-from worldstate.adapters.ros.bag_input import BagTopics, needed_array, read_bag
+from worldstate.adapters.ros.bag_input import needed_array, read_bag
 from worldstate.adapters.ros.bag_writer import bag_writer, state_bag
 from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
 from worldstate.cli.main import main
@@ -642,7 +642,7 @@ def test_a_damaged_bag_is_refused_by_name(tmp_path, storage):
                 spoiled[place] = rng.integers(256)
         damaged.write_bytes(spoiled)
         try:
-            with open_sound(read_bag(damaged, BagTopics()).sound, strict=False) as audio:
+            with open_sound(read_bag(damaged).sound, strict=False) as audio:
                 list(audio.blocks())
         except InputFileError as error:
             refused += 1

@@ -18,6 +18,7 @@ from .inputs import describe
 
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_messages import LogMessage, LogSink
+    from worldstate.adapters.files.file_io import FileOpener
     from worldstate.state import WorldState
 
     Stack = AbstractContextManager[Callable[[WorldState], object]]
@@ -131,13 +132,17 @@ def most_bytes(arguments: argparse.Namespace) -> int | None:
 def _viewer(
     name: str, target: str, live: bool, arguments: argparse.Namespace
 ) -> "AbstractContextManager[LogSink]":
-    from worldstate.adapters.export.log_messages import growing_mcap, mcap_file, rerun_file
+    from worldstate.adapters.export.log_messages import mcap_file, rerun_file
 
     if name == "foxglove":
         return _websocket(target, not live, arguments.origin)
-    if name == "mcap" and live:
-        return growing_mcap(Path(target), most_bytes(arguments))
-    return mcap_file(Path(target)) if name == "mcap" else rerun_file(Path(target))
+    return rerun_file(Path(target)) if name == "rerun" else mcap_file(Path(target), _opener(live, arguments))
+
+
+def _opener(live: bool, arguments: argparse.Namespace) -> "FileOpener":
+    from worldstate.adapters.files.file_io import GrowingFile, whole_file
+
+    return partial(GrowingFile, most_bytes=most_bytes(arguments)) if live else whole_file
 
 
 @contextmanager
@@ -153,12 +158,10 @@ def _websocket(port: str, paced: bool, origins: list[str]) -> "Iterator[LogSink]
 
 def _stack(name: str, target: str, crossing_m: float, live: bool, arguments: argparse.Namespace) -> "Stack":
     from worldstate.adapters.export import other_stacks
-    from worldstate.adapters.files.file_io import GrowingFile, whole_file
     from worldstate.adapters.own_parts import ExporterPart, load_part, own_exporter
     from worldstate.adapters.ros.bag_writer import state_bag
 
-    opener = partial(GrowingFile, most_bytes=most_bytes(arguments)) if live else whole_file
-    comes = live and arguments.odometry is not None
+    opener, comes = _opener(live, arguments), live and arguments.odometry is not None
     own: dict[str, ExporterPart] = {
         "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m, opener),
         "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m, opener, comes=comes),

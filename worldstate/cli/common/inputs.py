@@ -15,7 +15,6 @@ from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio, Encoding, SoundInput
-    from worldstate.adapters.ros.bag_input import BagTopics
 
 _EXAMPLE = "  arecord -D hw:1 -t raw -f S32_LE -r 48000 -c 8 | {} pcm:48000:8:s32"
 _RAW = "pcm:"
@@ -83,15 +82,14 @@ def add_search_options(parser: argparse.ArgumentParser) -> None:
     add("--azimuth-span", type=float, default=180.0, metavar="DEG", help=span)
 
 
-def topics_of(arguments: argparse.Namespace) -> "BagTopics":
-    """Return the topics that were asked for."""
+def topics_of(arguments: argparse.Namespace) -> dict[str, str]:
+    """Return the topics that were asked for, by what they hold."""
     from worldstate.adapters.own_parts import part_and_target
-    from worldstate.adapters.ros.bag_input import BagTopics
 
     named = dict(part_and_target("--topic", text) for text in arguments.topic)
     if not named.keys() <= {*_TOPICS}:
         raise InvalidArgumentError(f"--topic: expected {', '.join(_TOPICS)}, got {', '.join(named)}")
-    return BagTopics(**named)
+    return named
 
 
 def sound_of(arguments: argparse.Namespace) -> "SoundInput":
@@ -101,7 +99,7 @@ def sound_of(arguments: argparse.Namespace) -> "SoundInput":
 
     bag = bag_of(arguments)
     if bag is not None:
-        return read_sound(bag, topics_of(arguments).audio)[0]
+        return read_sound(bag, topics_of(arguments).get("audio"))[0]
     names = [str(path) for path in arguments.input]
     raw = next((name for name in names if name == "-" or name.startswith(_RAW)), None)
     return as_sound(tuple(arguments.input)) if raw is None else _raw_samples(raw, alone=len(names) == 1)
@@ -162,7 +160,7 @@ def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, fronte
 
     bag = bag_of(arguments)
     if bag is not None:
-        heard, own = read_sound(bag, topics_of(arguments).audio)
+        heard, own = read_sound(bag, topics_of(arguments).get("audio"))
         return heard, needed_array(heard, given_array(arguments) or own)
     sound = sound_of(arguments)
     array = choose_array(path_of(sound), given_array(arguments))

@@ -192,7 +192,7 @@ def with_bag(
 
     if not isinstance(sound, BagSound):
         return given.car.array, seen, None
-    held = read_bag(sound.path, topics_of(given.arguments))
+    held = read_bag(sound.path, **topics_of(given.arguments))
     array = needed_array(sound, given.car.array or held.array)
     return array, held.detections if seen is None else seen, held.ego
 
