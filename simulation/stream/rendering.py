@@ -26,7 +26,7 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.rays import add_traced_background
 from worldstate.simulation.sound.receiver import Receiver, standing_m
-from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.static_field import HeardStreet, StaticSources
 
 from .arrivals import STANDING, Event, SoundEvent, VehicleEvent
 from .settings import StreamSettings
@@ -145,15 +145,16 @@ def event_sound(
     receiver = microphones.receiver(np.arange(blocks + 1) * knot_s, own)
     sound = np.zeros((len(microphones.positions_m), receiver.samples), np.float32)
     static = StaticSources(sound, rate)
+    street = HeardStreet(static, site, preset, receiver)
     if isinstance(event, SoundEvent):
-        add_sound(static, event.sound, site, preset, receiver, rng)
+        add_sound(street, event.sound, rng)
     else:
         time, manoeuvre = np.arange(-before, blocks + 1) * knot_s, event.manoeuvre
         # The clock of what is rendered begins with it, that of the vehicle may have begun before.
         path = replace(manoeuvre.motion.trajectory(time + late_s, manoeuvre.heard), time_s=time)
-        add_vehicle(static, site, preset, path, receiver, rng)
+        add_vehicle(street, path, rng)
         if event.signal:
-            add_signal(static, event.signal, path, site, preset, receiver, rng)
+            add_signal(street, event.signal, path, rng)
     static.render()
     sound *= _envelope(event, site, receiver, late_s)
     return EventSound(round(begin_s * rate), sound)
