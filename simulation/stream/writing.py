@@ -25,7 +25,7 @@ from worldstate.simulation.dataset.recording import (
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 
 from .arrivals import SoundEvent, draw_events, draw_sounds
-from .rendering import Block, StreamScene, draw_microphones, render_blocks, stream_ambience
+from .rendering import Block, StreamScene, draw_microphones, render_blocks
 from .settings import StreamSettings
 from .truth import (
     EVENTS_NAME,
@@ -63,14 +63,10 @@ class DrawnStream:
 
 def draw_stream(settings: StreamSettings, array: MicrophoneArray) -> DrawnStream:
     """Draw vehicles, other sounds, background and microphones of a stream, each from its own generator."""
-    arrivals, drawn = settings.generator(ARRIVALS), settings
-    events = draw_events(drawn.site, drawn.traffic, drawn.preset, drawn.duration_s, arrivals, drawn.ego)
+    events = draw_events(settings, settings.generator(ARRIVALS))
+    microphones = draw_microphones(settings, array, settings.generator(CHANNELS))
     return DrawnStream(
-        StreamScene(
-            settings,
-            stream_ambience(settings, settings.generator(LEVEL)),
-            draw_microphones(settings, array, settings.generator(CHANNELS)),
-        ),
+        StreamScene.drawn(settings, microphones, settings.generator(LEVEL)),
         array,
         tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events)),
         tuple(draw_sounds(settings, array.n_microphones, settings.generator(SOUNDS))),

@@ -34,7 +34,7 @@ from worldstate.simulation.stream.close_sounds import (
     idling_vehicle,
     recorded,
 )
-from worldstate.simulation.stream.rendering import Microphones, ambience_piece, event_sound, stream_ambience
+from worldstate.simulation.stream.rendering import Microphones, StreamScene, ambience_piece, event_sound
 from worldstate.simulation.stream.settings import StreamSettings
 
 from .heard_stream import HeardStream, junction_named
@@ -201,8 +201,9 @@ def event_and_ambience(
     alone = Microphones(position_m[None], np.zeros(1), np.ones(1), settings.sample_rate_hz)
     with one_blas_thread():
         sound = event_sound(event, settings.site, settings.preset, alone, rng).pressure_pa
-        here, samples = stream_ambience(settings, rng), sound.shape[1] + round(lead_s * alone.sample_rate_hz)
-        ambience = ambience_piece(settings, here, alone, samples, rng, begins=True)[0, :samples]
+        scene = StreamScene.drawn(settings, alone, rng)
+        samples = sound.shape[1] + round(lead_s * alone.sample_rate_hz)
+        ambience = ambience_piece(scene, samples, rng, begins=True)[0, :samples]
         if not settings.ego.stands:
             # Driving all the time: what stands is learned from the end of the drives.
             speed = np.full(samples, rng.uniform(*EGO_SPEEDS_MPS))
