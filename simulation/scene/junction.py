@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import in_range, one_of
+from worldstate.ground.checks import check_ranges, in_range, one_of
 
 from .occluders import OccludingBody, box
 
@@ -97,22 +97,15 @@ class Site:
 
     def __post_init__(self) -> None:
         _check_name(self.name)
-        in_range("corner_left_m", self.corner_left_m, 1.0, 30.0)
-        in_range("corner_right_m", self.corner_right_m, 1.0, 30.0)
-        in_range("corner_ahead_m", self.corner_ahead_m, 1.0, 50.0)
-        in_range("side_wall_left_m", self.side_wall_left_m, 1.0, 60.0)
-        in_range("side_wall_right_m", self.side_wall_right_m, 1.0, 60.0)
-        in_range("street_width_m", self.street_width_m, 3.0, 40.0)
-        in_range("verge_m", self.verge_m, 0.0, 40.0)
-        in_range("surface_db", self.surface_db, -12.0, 12.0)
+        check_ranges(self, corner_left_m=(1.0, 30.0), corner_right_m=(1.0, 30.0), corner_ahead_m=(1.0, 50.0))
+        check_ranges(self, side_wall_left_m=(1.0, 60.0), side_wall_right_m=(1.0, 60.0))
+        check_ranges(self, street_width_m=(3.0, 40.0), verge_m=(0.0, 40.0), surface_db=(-12.0, 12.0))
         for factor in self.roughness:
             in_range("roughness", factor, 0.0, 6.0)
         for share in self.side_shares:
             in_range("side_shares", share, 0.0, 1.0)
-        in_range("side_reflection", self.side_reflection, 0.0, 0.98)
-        in_range("facade_reflection", self.facade_reflection, 0.0, 0.98)
-        in_range("side_order", self.side_order, 0, 8)
-        in_range("facade_order", self.facade_order, 0, 8)
+        check_ranges(self, side_reflection=(0.0, 0.98), facade_reflection=(0.0, 0.98))
+        check_ranges(self, side_order=(0, 8), facade_order=(0, 8))
         if len(self.occluders) > MAX_OCCLUDERS:
             raise InvalidArgumentError(f"occluders: expected at most {MAX_OCCLUDERS}")
         if self.opposite_wall_m is not None:

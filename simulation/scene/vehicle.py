@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.ground.checks import in_range
+from worldstate.ground.checks import check_ranges
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .kinds import LIGHT, SILENT_DB, TYRE_M, VehicleKind
@@ -105,8 +105,7 @@ class EgoMotion:
     stop_s: float = 0.0
 
     def __post_init__(self) -> None:
-        in_range("speed_mps", self.speed_mps, 0.0, 20.0)
-        in_range("stop_s", self.stop_s, 0.0, 120.0)
+        check_ranges(self, speed_mps=(0.0, 20.0), stop_s=(0.0, 120.0))
 
     @property
     def stands(self) -> bool:
