@@ -49,13 +49,7 @@ from worldstate.simulation.scene.settings import (
 )
 from worldstate.simulation.scene.vehicle import LENGTH_M, WIDTH_M
 
-from .recording import (
-    SimulatedRecording,
-    put_in_place,
-    refuse_foreign,
-    simulate_recording,
-    sound_writer,
-)
+from .recording import SimulatedRecording, put_in_place, refuse_foreign, simulate_recording, sound_writer
 
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000

@@ -11,12 +11,7 @@ from worldstate.simulation.scene.driving import entry_y_m
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind
 from worldstate.simulation.scene.presets import Preset
-from worldstate.simulation.scene.settings import (
-    BRAKING_MPS2,
-    BRAKING_SHARE,
-    SPEEDS_MPS,
-    speeds_mps,
-)
+from worldstate.simulation.scene.settings import BRAKING_MPS2, BRAKING_SHARE, SPEEDS_MPS, speeds_mps
 from worldstate.simulation.scene.vehicle import (
     POWER_TO_1M_DB,
     TURN_RADIUS_M,

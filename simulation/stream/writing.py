@@ -16,12 +16,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.camera.simulated_detector import to_json
-from worldstate.simulation.dataset.recording import (
-    FULL_SCALE_PA,
-    put_in_place,
-    refuse_foreign,
-    sound_writer,
-)
+from worldstate.simulation.dataset.recording import FULL_SCALE_PA, put_in_place, refuse_foreign, sound_writer
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 
 from .arrivals import SoundEvent, draw_events, draw_sounds
