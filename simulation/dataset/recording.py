@@ -231,7 +231,7 @@ def simulate_recording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
         t0_frame=_t0_frame(len(frames), sights if settings.approach != "none" else []),
-        detections=_detections(settings, seen, len(frames), camera, to_camera),
+        detections=_detections(settings, seen, len(frames), to_camera),
         truth=describe(settings, frames, seen, sights),
         array=array,
     )
@@ -309,15 +309,11 @@ def _t0_frame(frames: int, sights: list[BoolArray]) -> int:
 
 
 def _detections(
-    settings: SimulationSettings,
-    seen: list[Trajectory],
-    frames: int,
-    camera: PinholeCamera,
-    rng: np.random.Generator,
+    settings: SimulationSettings, seen: list[Trajectory], frames: int, rng: np.random.Generator
 ) -> tuple[Frame, ...]:
     if not settings.ego.stands:
         return ()
-    boxes: list[Frame] = [()] * frames
+    camera, boxes = PinholeCamera.ovad(), list[Frame]([()] * frames)
     if settings.parked_car:
         boxes = park(settings.site, camera, frames, rng)
     for path in seen:

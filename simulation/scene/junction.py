@@ -397,15 +397,8 @@ def parked_van() -> Place:
     return _open("SV1", (*ways, TURNS_OFF_AHEAD, CROSSES_BEHIND), box(1.5, 6.5, 2.0, 4.0))
 
 
-PLACES = {
-    "lead-vehicle": lead_vehicle,
-    "bridge-pier": bridge_pier,
-    "merge": merge,
-    "open-road": open_road,
-    "wide-crossing": wide_crossing,
-    "one-corner": one_corner,
-    "parked-van": parked_van,
-}
+_PLACES = lead_vehicle, bridge_pier, merge, open_road, wide_crossing, one_corner, parked_van
+PLACES = {one.__name__.replace("_", "-"): one for one in _PLACES}
 
 
 def place(name: str) -> Place:

@@ -1,6 +1,6 @@
 """A continuous stream: all about it is drawn before any of it is rendered, and written while it is."""
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -190,13 +190,11 @@ def write_stream(
     refuse_foreign(target)
     folder.mkdir(parents=True, exist_ok=True)
     stream = draw_stream(settings, ovad_array() if array is None else array)
-    heard = Spectrogram(settings.sample_rate_hz)
     # Beside the target, on the same disk, so that the whole stream takes its name in one step.
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as hidden:
         temporary = Path(hidden) / target.name
         temporary.mkdir()
-        with closing(stream.blocks(jobs)) as blocks:
-            loudness = _write_sound(temporary / AUDIO_NAME, stream, blocks, heard, progress)
+        heard, loudness = _write_sound(temporary / AUDIO_NAME, stream, jobs, progress)
         write_array_xml(temporary / ARRAY_NAME, stream.array)
         _write_beside(temporary, stream, loudness)
         put_in_place(target, temporary)
@@ -204,24 +202,23 @@ def write_stream(
 
 
 def _write_sound(
-    path: Path,
-    stream: DrawnStream,
-    blocks: Iterator[Block],
-    heard: Spectrogram,
-    progress: Callable[[float], None] | None,
-) -> dict[int, FloatArray]:
-    """Write the blocks as they come; return the loudness of all events."""
+    path: Path, stream: DrawnStream, jobs: int, progress: Callable[[float], None] | None
+) -> tuple[Spectrogram, dict[int, FloatArray]]:
+    """Write the blocks as they come; return what one channel hears, and the loudness of all events."""
     microphones, settings = stream.scene.microphones, stream.scene.settings
     channels, rate = len(microphones.positions_m), settings.sample_rate_hz
-    loudness: dict[int, FloatArray] = {}
-    with sound_writer(path, settings.samples, channels, rate) as file:
+    heard, loudness = Spectrogram(rate), dict[int, FloatArray]()
+    with (
+        sound_writer(path, settings.samples, channels, rate) as file,
+        closing(stream.blocks(jobs)) as blocks,
+    ):
         for block in blocks:
             file.write(stream.recorded(block))
             heard.add(block.pressure_pa[stream.array.middle])
             loudness |= block.loudness_db
             if progress is not None:
                 progress(block.pressure_pa.shape[1] / rate)
-    return loudness
+    return heard, loudness
 
 
 def _write_beside(folder: Path, stream: DrawnStream, loudness: dict[int, FloatArray]) -> None:

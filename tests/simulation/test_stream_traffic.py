@@ -23,7 +23,7 @@ from worldstate.simulation.stream.arrivals import (
     draw_events,
     draw_sounds,
 )
-from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, drive_along, emerges
+from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, emerges
 from worldstate.simulation.stream.settings import HAZARDS, StreamSettings, Traffic, traffic_named
 from worldstate.simulation.stream.truth import (
     CLUTTER_IMAGES,
@@ -149,7 +149,8 @@ def test_who_stops_brakes_stands_and_goes_on_as_mechanics_says(
     cruise: float, stop: float, stands_s: float
 ) -> None:
     route = along([[6.0, 0.0], [6.0, -1.0]])
-    motion = drive_along(route, (0.0, 90.0), cruise, [SpeedLimit(stop, 0.0, stands_s)], LIGHT, -1)
+    driver = Driver(site("SB1"), LIGHT, "left", cruise, 0.0, 90.0)
+    motion = driver.motion(route, (0.0, 90.0), [SpeedLimit(stop, 0.0, stands_s)])
     brake, away = cruise**2 / (2 * 2.0), cruise**2 / (2 * 1.5)
     before = (stop - brake) / cruise + cruise / 2.0 if brake < stop else None
     if before is not None:

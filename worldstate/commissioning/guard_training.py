@@ -169,7 +169,9 @@ def _vehicle(
 def _rows_of_sound(
     settings: StreamSettings, kind: str, position_m: FloatArray, rng: np.random.Generator
 ) -> SoundRows:
-    sound, ambience = _rendered(settings, kind, position_m, rng)
+    empty = SimulationSettings(settings.site, "none", duration_s=SOUND_S)
+    drawn = replace(with_sounds(empty, [kind], 1, rng).sounds[0], start_s=SOUND_MARGIN_S, duration_s=SOUND_S)
+    sound, ambience = event_and_ambience(settings, SoundEvent(drawn, 0.0), position_m, rng)
     loud, calm = (loudness(part, settings.sample_rate_hz) for part in (sound, ambience))
     louder_half = np.sort(loud)[len(loud) // 2 :].mean() + np.finfo(float).tiny
     gain = np.sqrt(10.0 ** (rng.uniform(*SNR_DB) / 10.0) * calm.mean() / louder_half)
@@ -179,15 +181,6 @@ def _rows_of_sound(
     audible = ratio[usable] >= 10.0 ** (AUDIBLE_DB / 10.0)
     names = (np.full(int(audible.sum()), name) for name in (kind, settings.site.name))
     return SoundRows(measures[audible, : len(MEASURES)], *names)
-
-
-def _rendered(
-    settings: StreamSettings, kind: str, position_m: FloatArray, rng: np.random.Generator
-) -> tuple[Float32Array, Float32Array]:
-    """Return a sound alone and the ambience alone, shape (samples,), of full scale 1."""
-    empty = SimulationSettings(settings.site, "none", duration_s=SOUND_S)
-    drawn = replace(with_sounds(empty, [kind], 1, rng).sounds[0], start_s=SOUND_MARGIN_S, duration_s=SOUND_S)
-    return event_and_ambience(settings, SoundEvent(drawn, 0.0), position_m, rng)
 
 
 def event_and_ambience(
