@@ -24,7 +24,7 @@ from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.receiver import Receiver, standing_m
-from worldstate.simulation.sound.static_field import HeardStreet, StaticSources
+from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 SCHEMA = "worldstate.simulation.truth"
 SCHEMA_VERSION = "1.2.0"
@@ -244,7 +244,7 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     sound = np.zeros((len(receiver.positions_m), receiver.samples), np.float32)
     static = StaticSources(sound, settings.sample_rate_hz)
     paths = trajectories(settings, _knots(settings))
-    street = HeardStreet(static, settings.site, settings.preset, receiver)
+    street = StreetSound(static, settings.site, settings.preset, receiver)
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
         add_vehicle(street, path, draws)
     # Generators of their own, and only where something sounds: the rest stays what it is without.
@@ -257,7 +257,7 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
 
 
 def _add_sounds(
-    street: HeardStreet, settings: SimulationSettings, paths: list[Trajectory], rng: np.random.Generator
+    street: StreetSound, settings: SimulationSettings, paths: list[Trajectory], rng: np.random.Generator
 ) -> None:
     """Add what vehicles warn with, and what else sounds."""
     for path, vehicle in zip(paths, settings.traffic, strict=True):

@@ -16,7 +16,7 @@ from worldstate.simulation.sound.propagation import ANY_ORDER, add_sources
 from worldstate.simulation.sound.rays import TracedSource, add_traced
 from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.scatter import add_scattered, scattering
-from worldstate.simulation.sound.static_field import HeardStreet, add_late_sound
+from worldstate.simulation.sound.static_field import StreetSound, add_late_sound
 
 from .emitter import emitted
 from .weather import add_gusts, add_rain
@@ -27,7 +27,7 @@ POINT_REFLECTIONS = 3
 BASS_BELOW_HZ = 177.0  # between the octaves of 125 and 250 Hz
 
 
-def add_vehicle(street: HeardStreet, path: Trajectory, rng: np.random.Generator) -> None:
+def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator) -> None:
     """Add one vehicle, whose motion is given at the emission knots, to all microphones."""
     static, site, preset, rate = street.static, street.site, street.preset, street.receiver.sample_rate_hz
     level = preset.vehicle_level_db + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
@@ -49,7 +49,7 @@ def add_vehicle(street: HeardStreet, path: Trajectory, rng: np.random.Generator)
     add_late_sound(street, whole, path.behind(0.0), path.time_s, rng)
 
 
-def _around(street: HeardStreet) -> Surroundings:
+def _around(street: StreetSound) -> Surroundings:
     preset = street.preset
     return Surroundings(street.site, street.receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
 
@@ -90,7 +90,7 @@ class SoundTrack:
     facing_rad: FloatArray
 
 
-def add_sound(street: HeardStreet, sound: SoundSettings, rng: np.random.Generator) -> None:
+def add_sound(street: StreetSound, sound: SoundSettings, rng: np.random.Generator) -> None:
     """Add one sound that is no vehicle's to all microphones."""
     if sound.kind in WEATHER:
         WEATHER[sound.kind](street.static, sound, street.receiver, rng)
@@ -107,7 +107,7 @@ def add_sound(street: HeardStreet, sound: SoundSettings, rng: np.random.Generato
     _add_from(street, signal, track, sound.what, rng)
 
 
-def add_signal(street: HeardStreet, signal: str, path: Trajectory, rng: np.random.Generator) -> None:
+def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.random.Generator) -> None:
     """Add what a vehicle warns with, from its front or its rear, all along its path."""
     kind = sound_kind(signal)
     samples = (len(path.time_s) - 1) * KNOT_SAMPLES
@@ -120,7 +120,7 @@ def add_signal(street: HeardStreet, signal: str, path: Trajectory, rng: np.rando
 
 
 def _add_from(
-    street: HeardStreet, signal: Float32Array, track: SoundTrack, kind: SoundKind, rng: np.random.Generator
+    street: StreetSound, signal: Float32Array, track: SoundTrack, kind: SoundKind, rng: np.random.Generator
 ) -> None:
     """Add a sound by every way; walls and the late field take its mean over all directions."""
     static, site, receiver = street.static, street.site, street.receiver

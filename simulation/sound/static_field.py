@@ -146,7 +146,7 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeardStreet:
+class StreetSound:
     """What the sounds of a street are added to, and what shapes them on their way there."""
 
     static: StaticSources
@@ -155,7 +155,7 @@ class HeardStreet:
     receiver: Receiver
 
 
-def _add_late_field(street: HeardStreet, dry: Float32Array, rng: np.random.Generator) -> None:
+def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Generator) -> None:
     """Add a diffuse tail of a dry signal: its energy without its direction.
 
     Every direction has a tail of its own. One common tail on all microphones would be a source at broadside.
@@ -184,7 +184,7 @@ def _add_late_field(street: HeardStreet, dry: Float32Array, rng: np.random.Gener
 
 
 def add_late_sound(
-    street: HeardStreet,
+    street: StreetSound,
     signal: Float32Array,
     place_m: tuple[FloatArray, FloatArray],
     time_s: FloatArray,
@@ -204,7 +204,7 @@ def late_level_db(site: Site, preset: Preset) -> float:
     return preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
 
 
-def _late_gain(street: HeardStreet, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray) -> Float32Array:
+def _late_gain(street: StreetSound, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray) -> Float32Array:
     """How strongly a source feeds the late field: less the farther it, or the ego, is from the mouth."""
     away = np.hypot(x_m - street.site.corner_ahead_m, y_m) - street.receiver.ego.x_m(time_s)
     level = 10.0 ** (late_level_db(street.site, street.preset) / 20.0)

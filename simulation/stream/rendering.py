@@ -26,7 +26,7 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.rays import add_traced_background
 from worldstate.simulation.sound.receiver import Receiver, standing_m
-from worldstate.simulation.sound.static_field import HeardStreet, StaticSources
+from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 from .arrivals import STANDING, Event, SoundEvent, VehicleEvent
 from .settings import StreamSettings
@@ -164,7 +164,7 @@ def event_sound(
     receiver = microphones.receiver(np.arange(blocks + 1) * knot_s, own)
     sound = np.zeros((len(microphones.positions_m), receiver.samples), np.float32)
     static = StaticSources(sound, rate)
-    street = HeardStreet(static, site, preset, receiver)
+    street = StreetSound(static, site, preset, receiver)
     if isinstance(event, SoundEvent):
         add_sound(street, event.sound, rng)
     else:
