@@ -129,9 +129,8 @@ def project(
     # A corner hides more of the near face than of the far one.
     right, left = site.sights_m(x, camera.position_m[:2])
     y = np.clip(np.array(ends_y)[:, None], np.minimum(right, left), left)
-    corners = (
-        np.stack([*map(np.ravel, np.broadcast_arrays(x, y, z[:, None, None]))], axis=1) - camera.position_m
-    )
+    places = np.broadcast_arrays(x, y, z[:, None, None])
+    corners = np.stack([*map(np.ravel, places)], axis=1) - camera.position_m
     pitch = camera.pitch_rad
     depth = corners[:, 0] * math.cos(pitch) + corners[:, 2] * math.sin(pitch)
     up = corners[:, 2] * math.cos(pitch) - corners[:, 0] * math.sin(pitch)

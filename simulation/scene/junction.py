@@ -447,18 +447,5 @@ def _mirrored(route_m: Points) -> Points:
 
 
 def _open(name: str, ways: tuple[Way, ...], *occluders: OccludingBody) -> Place:
-    site = Site(
-        name=name,
-        corner_left_m=OPEN_M,
-        corner_right_m=OPEN_M,
-        corner_ahead_m=1.0,
-        opposite_wall_m=None,
-        side_wall_left_m=OPEN_M,
-        side_wall_right_m=OPEN_M,
-        street_width_m=12.0,
-        side_order=0,
-        facade_order=0,
-        occluders=occluders,
-        in_the_open=True,
-    )
-    return Place(site, ways)
+    plan = Site(name, OPEN_M, OPEN_M, 1.0, None, OPEN_M, OPEN_M, 12.0, side_order=0, facade_order=0)
+    return Place(replace(plan, occluders=occluders, in_the_open=True), ways)

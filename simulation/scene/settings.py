@@ -186,9 +186,8 @@ class SoundSettings:
             (x, y), (ahead_x, ahead_y) = self.at(time_s - 0.5), self.at(time_s + 0.5)
             return np.arctan2(ahead_y - y, ahead_x - x)
         back_x, back_y = (-value for value in self.place_m)
-        return np.full_like(
-            time_s, np.arctan2(back_y, back_x) if self.facing_rad is None else self.facing_rad
-        )
+        faces_rad = np.arctan2(back_y, back_x) if self.facing_rad is None else self.facing_rad
+        return np.full_like(time_s, faces_rad)
 
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order

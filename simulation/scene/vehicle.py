@@ -350,12 +350,8 @@ class _Drawing:
         signal = np.zeros(len(self.time), np.float32)
         for order, band in enumerate(octave.tolist(), start=1):
             phase = 2.0 * np.pi * np.mod(order * cycles + self.rng.random(), 1.0)
-            # Above half the rate a line would come back folded, as a wrong one.
-            signal += (
-                levels[band]
-                * np.cos(phase.astype(np.float32))
-                * (order * firing_hz < 0.5 * self.sample_rate_hz)
-            )
+            heard = order * firing_hz < 0.5 * self.sample_rate_hz  # above, a line would come back folded
+            signal += levels[band] * np.cos(phase.astype(np.float32)) * heard
         return signal
 
     def _at_samples(self, knots: FloatArray) -> Float32Array:

@@ -109,9 +109,8 @@ def _opposite_wall(site: Site, wall_m: float, rng: np.random.Generator) -> Patch
     y = _spread(OPPOSITE_REACH * right, OPPOSITE_REACH * left, rng, OPPOSITE_PATCH_M)
     positions = np.column_stack([np.full_like(y, wall_m), y, rng.uniform(*HEIGHTS_M, len(y))])
     normals = np.tile([-1.0, 0.0], (len(y), 1))
-    return Patches(
-        positions, normals, _strengths(len(y), site.facade_reflection, rng, OPPOSITE_PATCH_M), True
-    )
+    strengths = _strengths(len(y), site.facade_reflection, rng, OPPOSITE_PATCH_M)
+    return Patches(positions, normals, strengths, True)
 
 
 def _spread(low: float, high: float, rng: np.random.Generator, patch_m: float = PATCH_M) -> FloatArray:

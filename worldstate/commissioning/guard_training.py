@@ -214,9 +214,8 @@ def characters(sound: AnyArray, sample_rate_hz: float) -> tuple[FloatArray, Bool
         character.push(hop)
         read.append(character.read())
     usable = np.array([not isinstance(one, NotUsable) for one in read])
-    return np.array([one for one in read if not isinstance(one, NotUsable)]).reshape(
-        -1, len(MEASURES) + len(BANDS)
-    ), usable
+    heard = np.array([one for one in read if not isinstance(one, NotUsable)])
+    return heard.reshape(-1, len(MEASURES) + len(BANDS)), usable
 
 
 def heard_characters(stream: HeardStream) -> tuple[FloatArray, BoolArray]:
