@@ -40,7 +40,7 @@ def in_processes(
     others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(min(jobs, len(items)), context, _begin) as pool:
         try:
-            with _without_interrupts():
+            with _handled(signal.SIG_IGN, signal.SIGINT):  # The one that started processes ends them
                 waiting = deque(pool.submit(_work_or_leave, work, item) for item in items)
             while waiting:
                 yield waiting.popleft().result()
@@ -85,34 +85,27 @@ def _work_or_leave(work: Callable[[Item], Result], item: Item) -> Result:
 
 
 @contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C: the one that started them ends them."""
+def _handled(handler: Callable[[int, object], object] | signal.Handlers, *numbers: int) -> Iterator[None]:
+    """Handle signals by a function while the block runs; outside the main thread as before."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, handler) or signal.SIG_DFL for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 @contextmanager
 def deferred_signals() -> Iterator[None]:
     """Hold SIGINT and SIGTERM back until files that belong together are all written."""
     # A blocked signal would reach another thread of the process; its handler runs in the main one anyway.
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     arrived: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, _: arrived.append(number)) or signal.SIG_DFL
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
     try:
-        yield
+        with _handled(lambda number, _: arrived.append(number), signal.SIGINT, signal.SIGTERM):
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
         for late in arrived:
             signal.raise_signal(late)

@@ -1,13 +1,14 @@
 """What the camera's detector reports: boxes that begin at line of sight, with its small imperfections."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.simulation.scene.driving import camera_sees
 from worldstate.simulation.scene.junction import Site
@@ -86,11 +87,14 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
     ]
 
 
-def lost(frames: Sequence[Frame], missed: FloatArray, rng: np.random.Generator) -> list[Frame]:
-    """Lose a share of the boxes of every frame.
-
-    Shapes: missed (frames,).
-    """
+def through_rain(
+    frames: Sequence[Frame], showers: Iterable[tuple[float, float, float]], rng: np.random.Generator
+) -> list[Frame]:
+    """Lose the boxes that drops on the lens take in showers, given by begin, end and share."""
+    missed, time = np.zeros(len(frames)), np.arange(len(frames)) / FRAME_RATE_HZ
+    for begin_s, end_s, share in showers:
+        # A lens dries when the rain is over; how long that takes is not modelled.
+        missed = np.maximum(missed, share * ((time >= begin_s) & (time < end_s)))
     return [
         tuple(box for box in frame if rng.random() >= share)
         for frame, share in zip(frames, missed, strict=True)
@@ -125,9 +129,8 @@ def project(
     # A corner hides more of the near face than of the far one.
     right, left = site.sights_m(x, camera.position_m[:2])
     y = np.clip(np.array(ends_y)[:, None], np.minimum(right, left), left)
-    corners = (
-        np.stack([*map(np.ravel, np.broadcast_arrays(x, y, z[:, None, None]))], axis=1) - camera.position_m
-    )
+    places = np.broadcast_arrays(x, y, z[:, None, None])
+    corners = np.stack([*map(np.ravel, places)], axis=1) - camera.position_m
     pitch = camera.pitch_rad
     depth = corners[:, 0] * math.cos(pitch) + corners[:, 2] * math.sin(pitch)
     up = corners[:, 2] * math.cos(pitch) - corners[:, 0] * math.sin(pitch)

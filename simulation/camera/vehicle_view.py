@@ -74,15 +74,6 @@ class Car:
         z = ROAD_Z_M + np.array([0.0, HEIGHT_M])
         return np.array(np.meshgrid(x, y, z)).reshape(3, -1).T
 
-    def own_eye(self, eye_m: tuple[float, float, float]) -> FloatArray:
-        """From `base_link` to the car's own coordinates, shape (3,)."""
-        x, y, z = eye_m
-        return np.array([x - self.lane_x_m, (self.front_y_m - y) * self.heading, z - ROAD_Z_M])
-
-    def own_rays(self, rays: Float32Array) -> Float32Array:
-        """Turn directions in `base_link` into the car's own, shape (..., 3)."""
-        return rays * np.array([1.0, -self.heading, 1.0], np.float32)
-
 
 def add_car(street: StreetView, car: Car, image: Float32Array) -> None:
     """Draw a car into an image (height, width, 3) wherever nothing of the street stands before it."""
@@ -106,8 +97,10 @@ def _painted(street: StreetView, car: Car, patch: Patch) -> Float32Array:
     """Colours of the rays of a patch, shape (rows, columns, 3)."""
     colours = street.image[patch.slices].astype(np.float32)
     depth = street.depth[patch.slices].copy()
-    eye = car.own_eye(street.view.camera.position_m)
-    rays = car.own_rays(street.view.rays(patch))
+    # From `base_link` to the car's own coordinates: the eye, shape (3,), and the rays from it.
+    x, y, z = street.view.camera.position_m
+    eye = np.array([x - car.lane_x_m, (car.front_y_m - y) * car.heading, z - ROAD_Z_M])
+    rays = street.view.rays(patch) * np.array([1.0, -car.heading, 1.0], np.float32)
     _cast_shadow(colours, depth, rays, eye)
     for faces, paint in ((_BODY, _paint_body), (_CABIN, _paint_cabin)):
         normals = np.array([normal for normal, _ in faces.values()])

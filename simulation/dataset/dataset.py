@@ -28,6 +28,7 @@ from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.file_io import atomic_path, read_json, write_json, write_text
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
+from worldstate.ground.checks import check_ranges
 from worldstate.ground.extras import check_extra, optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
@@ -48,13 +49,7 @@ from worldstate.simulation.scene.settings import (
 )
 from worldstate.simulation.scene.vehicle import LENGTH_M, WIDTH_M
 
-from .recording import (
-    SimulatedRecording,
-    put_in_place,
-    refuse_foreign,
-    simulate_recording,
-    sound_writer,
-)
+from .recording import SimulatedRecording, put_in_place, refuse_foreign, simulate_recording, sound_writer
 
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
@@ -132,12 +127,10 @@ class DatasetSettings:
     sounds_folder: str = ""
 
     def __post_init__(self) -> None:
-        in_range("n_static", self.n_static, 0, MAX_RECORDINGS)
-        in_range("n_dynamic", self.n_dynamic, 0, MAX_RECORDINGS)
+        check_ranges(self, n_static=(0, MAX_RECORDINGS), n_dynamic=(0, MAX_RECORDINGS))
         in_range("n_static + n_dynamic", self.n_static + self.n_dynamic, 1, MAX_RECORDINGS)
-        in_range("seed", self.seed, 0, 2**63)
-        in_range("duration_s", self.duration_s, 0.5, 60.0)
-        in_range("video_width_px", self.video_width_px, 64, PinholeCamera.ovad().width_px)
+        widest_px = PinholeCamera.ovad().width_px
+        check_ranges(self, seed=(0, 2**63), duration_s=(0.5, 60.0), video_width_px=(64, widest_px))
         vehicle_kind(self.kind)
         if self.bandwidth_hz is not None:
             in_range("bandwidth_hz", self.bandwidth_hz, *BANDWIDTHS_HZ)

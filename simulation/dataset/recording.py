@@ -15,13 +15,7 @@ from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
-from worldstate.simulation.camera.simulated_detector import (
-    Frame,
-    detect,
-    line_of_sight,
-    lost,
-    park,
-)
+from worldstate.simulation.camera.simulated_detector import Frame, detect, line_of_sight, park, through_rain
 from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, add_vehicle
 from worldstate.simulation.scene.driving import comes_into_view_s, trajectories
 from worldstate.simulation.scene.settings import SimulationSettings, SoundSettings
@@ -30,7 +24,7 @@ from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.receiver import Receiver, standing_m
-from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 SCHEMA = "worldstate.simulation.truth"
 SCHEMA_VERSION = "1.2.0"
@@ -237,9 +231,7 @@ def simulate_recording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
         t0_frame=_t0_frame(len(frames), sights if settings.approach != "none" else []),
-        detections=_through_rain(
-            _detections(settings, seen, len(frames), camera, to_camera), settings, to_camera
-        ),
+        detections=_detections(settings, seen, len(frames), to_camera),
         truth=describe(settings, frames, seen, sights),
         array=array,
     )
@@ -252,10 +244,11 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     sound = np.zeros((len(receiver.positions_m), receiver.samples), np.float32)
     static = StaticSources(sound, settings.sample_rate_hz)
     paths = trajectories(settings, _knots(settings))
+    street = StreetSound(static, settings.site, settings.preset, receiver)
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
-        add_vehicle(static, settings.site, settings.preset, path, receiver, draws)
+        add_vehicle(street, path, draws)
     # Generators of their own, and only where something sounds: the rest stays what it is without.
-    _add_sounds(static, settings, paths, receiver, rng)
+    _add_sounds(street, settings, paths, rng)
     static.render()
     add_background(sound, receiver, settings.site, settings.preset, to_street)
     if not settings.ego.stands:
@@ -264,19 +257,14 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
 
 
 def _add_sounds(
-    static: StaticSources,
-    settings: SimulationSettings,
-    paths: list[Trajectory],
-    receiver: Receiver,
-    rng: np.random.Generator,
+    street: StreetSound, settings: SimulationSettings, paths: list[Trajectory], rng: np.random.Generator
 ) -> None:
     """Add what vehicles warn with, and what else sounds."""
-    site, preset = settings.site, settings.preset
     for path, vehicle in zip(paths, settings.traffic, strict=True):
         if vehicle.signal:
-            add_signal(static, vehicle.signal, path, site, preset, receiver, rng.spawn(1)[0])
+            add_signal(street, vehicle.signal, path, rng.spawn(1)[0])
     for sound in settings.sounds:
-        add_sound(static, sound, site, preset, receiver, rng.spawn(1)[0])
+        add_sound(street, sound, rng.spawn(1)[0])
 
 
 def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Receiver:
@@ -321,30 +309,15 @@ def _t0_frame(frames: int, sights: list[BoolArray]) -> int:
 
 
 def _detections(
-    settings: SimulationSettings,
-    seen: list[Trajectory],
-    frames: int,
-    camera: PinholeCamera,
-    rng: np.random.Generator,
+    settings: SimulationSettings, seen: list[Trajectory], frames: int, rng: np.random.Generator
 ) -> tuple[Frame, ...]:
     if not settings.ego.stands:
         return ()
-    boxes: list[Frame] = [()] * frames
+    camera, boxes = PinholeCamera.ovad(), list[Frame]([()] * frames)
     if settings.parked_car:
         boxes = park(settings.site, camera, frames, rng)
     for path in seen:
         passing = detect(path, settings.site, camera, rng)
         boxes = [standing + moving for standing, moving in zip(boxes, passing, strict=True)]
-    return tuple(boxes)
-
-
-def _through_rain(
-    detections: tuple[Frame, ...], settings: SimulationSettings, rng: np.random.Generator
-) -> tuple[Frame, ...]:
-    """Lose the detections that drops on the lens take while it rains."""
-    missed = np.zeros(len(detections))
-    time = np.arange(len(detections)) / FRAME_RATE_HZ
-    for sound in settings.sounds:
-        raining = (time >= sound.start_s) & (time < sound.end_s)
-        missed = np.maximum(missed, sound.lens_missed * raining)
-    return tuple(lost(detections, missed, rng)) if missed.any() else detections
+    showers = ((sound.start_s, sound.end_s, sound.lens_missed) for sound in settings.sounds)
+    return tuple(through_rain(boxes, showers, rng))

@@ -22,28 +22,16 @@ from .signals import gate
 
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]
 
+# By the names of `SOUNDS`.
 SYNTHESES: dict[str, Synthesis] = {
-    "voice": syntheses.voice,
-    "children": syntheses.children,
-    "steps": syntheses.steps,
-    "bell": syntheses.bell,
-    "saw": syntheses.saw,
-    "drill": syntheses.drill,
-    "music": syntheses.music,
-    "tune": syntheses.tune,
-    "drums": syntheses.drums,
-    "dog": syntheses.dog,
-    "birds": syntheses.birds,
-    "shots": syntheses.shots,
-    "tone": syntheses.tone,
-    "siren": syntheses.siren,
-    "wail": syntheses.wail,
-    "sweeps": syntheses.sweeps,
-    "turns": syntheses.turns,
-    "horn": syntheses.horn,
-    "horns": syntheses.horns,
-    "beeper": syntheses.beeper,
-    "bicycle-bell": syntheses.bicycle_bell,
+    one.__name__.replace("_", "-"): one
+    for one in (
+        *(syntheses.voice, syntheses.children, syntheses.steps, syntheses.bell, syntheses.saw),
+        *(syntheses.drill, syntheses.music, syntheses.tune, syntheses.drums, syntheses.dog),
+        *(syntheses.birds, syntheses.shots, syntheses.tone, syntheses.siren, syntheses.wail),
+        *(syntheses.sweeps, syntheses.turns, syntheses.horn, syntheses.horns, syntheses.beeper),
+        syntheses.bicycle_bell,
+    )
 }
 # Everything is drawn at a whole multiple of the rate asked, of at least this, and then band-limited: partials
 # above a low Nyquist frequency are left out, not folded, and the level is that of the whole sound.

@@ -16,7 +16,7 @@ from worldstate.simulation.sound.propagation import ANY_ORDER, add_sources
 from worldstate.simulation.sound.rays import TracedSource, add_traced
 from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.scatter import add_scattered, scattering
-from worldstate.simulation.sound.static_field import StaticSources, add_late_sound
+from worldstate.simulation.sound.static_field import StreetSound, add_late_sound
 
 from .emitter import emitted
 from .weather import add_gusts, add_rain
@@ -27,16 +27,9 @@ POINT_REFLECTIONS = 3
 BASS_BELOW_HZ = 177.0  # between the octaves of 125 and 250 Hz
 
 
-def add_vehicle(
-    static: StaticSources,
-    site: Site,
-    preset: Preset,
-    path: Trajectory,
-    receiver: Receiver,
-    rng: np.random.Generator,
-) -> None:
+def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator) -> None:
     """Add one vehicle, whose motion is given at the emission knots, to all microphones."""
-    rate = receiver.sample_rate_hz
+    static, site, preset, rate = street.static, street.site, street.preset, street.receiver.sample_rate_hz
     level = preset.vehicle_level_db + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
     # What the road adds is heard of the tyres alone.
     engine_db = preset.engine_spread_db * rng.standard_normal() - site.surface_db + engine_bass_db(preset)
@@ -45,20 +38,20 @@ def add_vehicle(
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
     if site.is_traced:
-        add_traced(
-            static,
-            TracedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M),
-            site,
-            receiver,
-            rng,
-        )
+        source = TracedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M)
+        add_traced(street, source, rng)
         return
-    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
+    around = _around(street)
     far = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
     add_sources(static, sources, around, ANY_ORDER[:POINT_REFLECTIONS])
     add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
     add_scattered(static, far, around)
-    add_late_sound(static, whole, path.behind(0.0), path.time_s, site, preset, receiver, rng)
+    add_late_sound(street, whole, path.behind(0.0), path.time_s, rng)
+
+
+def _around(street: StreetSound) -> Surroundings:
+    preset = street.preset
+    return Surroundings(street.site, street.receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
 
 
 def engine_bass_db(preset: Preset) -> FloatArray:
@@ -84,6 +77,7 @@ SILENT_BLOCKS = 8
 GROUND_GAIN = np.sqrt(2.0)
 # What stands in neither street is heard over the roofs: two storeys high, as near to the array as this.
 ROOF_HEIGHT_M, ROOF_AWAY_M = 7.0, 4.0
+WEATHER = {"rain": add_rain, "gusts": add_gusts}  # Heard at the microphones, from no place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,42 +90,24 @@ class SoundTrack:
     facing_rad: FloatArray
 
 
-def add_sound(
-    static: StaticSources,
-    sound: SoundSettings,
-    site: Site,
-    preset: Preset,
-    receiver: Receiver,
-    rng: np.random.Generator,
-) -> None:
+def add_sound(street: StreetSound, sound: SoundSettings, rng: np.random.Generator) -> None:
     """Add one sound that is no vehicle's to all microphones."""
-    if sound.kind == "rain":
-        add_rain(static, sound, receiver, rng)
+    if sound.kind in WEATHER:
+        WEATHER[sound.kind](street.static, sound, street.receiver, rng)
         return
-    if sound.kind == "gusts":
-        add_gusts(static, sound, receiver, rng)
-        return
-    rate = receiver.sample_rate_hz
+    rate, folder = street.receiver.sample_rate_hz, street.preset.sounds_folder
     samples = round(sound.duration_s * rate)
     blocks = -(-samples // KNOT_SAMPLES) + 2 * SILENT_BLOCKS
     before = SILENT_BLOCKS * KNOT_SAMPLES
     signal = np.zeros(blocks * KNOT_SAMPLES, np.float32)
     level = np.float32(10.0 ** (sound.level_offset_db / 20.0))
-    signal[before : before + samples] = level * emitted(sound.what, samples, rate, rng, preset.sounds_folder)
+    signal[before : before + samples] = level * emitted(sound.what, samples, rate, rng, folder)
     time = sound.start_s + (np.arange(blocks + 1) - SILENT_BLOCKS) * KNOT_SAMPLES / rate
     track = SoundTrack(time, *sound.at(time), sound.facing(time))
-    _add_from(static, signal, track, sound.what, site, preset, receiver, rng)
+    _add_from(street, signal, track, sound.what, rng)
 
 
-def add_signal(
-    static: StaticSources,
-    signal: str,
-    path: Trajectory,
-    site: Site,
-    preset: Preset,
-    receiver: Receiver,
-    rng: np.random.Generator,
-) -> None:
+def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.random.Generator) -> None:
     """Add what a vehicle warns with, from its front or its rear, all along its path."""
     kind = sound_kind(signal)
     samples = (len(path.time_s) - 1) * KNOT_SAMPLES
@@ -139,37 +115,31 @@ def add_signal(
     heading = np.arctan2(kind.faces * (front_y - rear_y), kind.faces * (front_x - rear_x))
     place = (front_x, front_y) if kind.faces > 0.0 else (rear_x, rear_y)
     track = SoundTrack(path.time_s, *place, heading)
-    pressure = emitted(kind, samples, receiver.sample_rate_hz, rng, preset.sounds_folder)
-    _add_from(static, pressure, track, kind, site, preset, receiver, rng)
+    pressure = emitted(kind, samples, street.receiver.sample_rate_hz, rng, street.preset.sounds_folder)
+    _add_from(street, pressure, track, kind, rng)
 
 
 def _add_from(
-    static: StaticSources,
-    signal: Float32Array,
-    track: SoundTrack,
-    kind: SoundKind,
-    site: Site,
-    preset: Preset,
-    receiver: Receiver,
-    rng: np.random.Generator,
+    street: StreetSound, signal: Float32Array, track: SoundTrack, kind: SoundKind, rng: np.random.Generator
 ) -> None:
     """Add a sound by every way; walls and the late field take its mean over all directions."""
+    static, site, receiver = street.static, street.site, street.receiver
     rate, ego_x = receiver.sample_rate_hz, receiver.ego.x_m(track.time_s)
     angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad
     towards = _gained(signal, directivity(kind, angle), rate) * GROUND_GAIN
     if site.is_traced:
         source = TracedSource(towards, track.time_s, track.x_m, track.y_m, kind.height_m)
-        add_traced(static, source, site, receiver, rng)
+        add_traced(street, source, rng)
         return
-    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
+    around = _around(street)
     if not in_the_streets(site, track).all():
-        over = _gained(towards, over_roofs(track, kind.height_m, receiver, preset.screen_cap_db), rate)
+        over = _gained(towards, over_roofs(track, kind.height_m, receiver, around.cap_db), rate)
         add_sources(static, [_source(over, track, kind, rate)], replace(around, site=in_the_open(site)))
         return
     add_sources(static, [_source(towards, track, kind, rate)], around)
     mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN
     add_scattered(static, _source(mean, track, kind, rate), around)
-    add_late_sound(static, mean, (track.x_m, track.y_m), track.time_s, site, preset, receiver, rng)
+    add_late_sound(street, mean, (track.x_m, track.y_m), track.time_s, rng)
 
 
 def directivity(kind: SoundKind, angle_rad: FloatArray) -> FloatArray:

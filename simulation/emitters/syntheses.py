@@ -264,12 +264,9 @@ def tune(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
             length_s = note_s * rng.choice((0.5, 1.0, 1.0, 2.0))
             time = _times(out, at, length_s, rate_hz)
             pitch = tonic * 2.0 ** (rng.choice(SCALE) / 12.0)
-            wave = harmonics(
-                pitch * (1.0 + VIBRATO * np.sin(2.0 * np.pi * VIBRATO_HZ * time)), overtones, rate_hz
-            )
-            _add(
-                out, at, rate_hz, rng.uniform(0.5, 1.0) * wave * np.exp(-time / decay_s) * _edges(time, 0.01)
-            )
+            vibrato = 1.0 + VIBRATO * np.sin(2.0 * np.pi * VIBRATO_HZ * time)
+            wave = rng.uniform(0.5, 1.0) * harmonics(pitch * vibrato, overtones, rate_hz)
+            _add(out, at, rate_hz, wave * np.exp(-time / decay_s) * _edges(time, 0.01))
             at += length_s
     return out
 
@@ -450,22 +447,14 @@ def horn(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 # take turns, or of one or two that are held (spans assumed, wider than any regulation).
 SWEEP_LOW_HZ, SWEEP_RATIO, SWEEPS_HZ = (350.0, 900.0), (1.3, 2.6), (0.1, 8.0)
 TURN_LOW_HZ, TURN_RATIO, TURN_S, TURN_GLIDE_S = (350.0, 800.0), (1.15, 1.6), (0.25, 1.0), 0.02
-HELD_HZ, SECOND_RATIO, SECOND_SHARE, HELD_S, HELD_PAUSE_S = (
-    (250.0, 650.0),
-    (1.15, 1.35),
-    0.7,
-    (0.4, 8.0),
-    (0.1, 2.0),
-)
+HELD_HZ, HELD_S, HELD_PAUSE_S = (250.0, 650.0), (0.4, 8.0), (0.1, 2.0)
+SECOND_RATIO, SECOND_SHARE = (1.15, 1.35), 0.7
 
 
 def sweeps(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     """Draw a siren that rises and falls at any pace, round or straight, shape (samples,)."""
-    low, ratio, pace_hz = (
-        rng.uniform(*SWEEP_LOW_HZ),
-        rng.uniform(*SWEEP_RATIO),
-        np.exp(rng.uniform(*np.log(SWEEPS_HZ))),
-    )
+    low, ratio = rng.uniform(*SWEEP_LOW_HZ), rng.uniform(*SWEEP_RATIO)
+    pace_hz = np.exp(rng.uniform(*np.log(SWEEPS_HZ)))
     cycles = rng.random() + pace_hz * np.arange(samples) / rate_hz
     is_round = rng.random() < 0.5
     height = 0.5 - 0.5 * np.cos(2.0 * np.pi * cycles) if is_round else 2.0 * np.abs(np.mod(cycles, 1.0) - 0.5)

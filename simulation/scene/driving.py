@@ -42,17 +42,10 @@ def camera_sees(
     right_edge, left_edge = image_edges_rad(camera)
     direction = np.arctan2(y_m - eye[1], x_m - eye[0])
     pictured = (direction > right_edge) & (direction < left_edge)
-    return np.asarray(
-        pictured & _past_corners(site, x_m, y_m, eye) & ~hidden_by(site.occluders, x_m, y_m, eye)
-    )
-
-
-def _past_corners(
-    site: Site, x_m: FloatArray, y_m: FloatArray, eye_m: tuple[float | FloatArray, float]
-) -> BoolArray:
-    """Tell when no corner stands before a point; in the open, and this side of the corners, none does."""
-    right, left = site.sights_m(x_m, eye_m)
-    return np.asarray(site.is_open | (x_m <= site.corner_ahead_m) | ((y_m > right) & (y_m < left)))
+    right, left = site.sights_m(x_m, eye)
+    # In the open, and this side of the corners, none stands before a point.
+    past_corners = site.is_open | (x_m <= site.corner_ahead_m) | ((y_m > right) & (y_m < left))
+    return np.asarray(pictured & past_corners & ~hidden_by(site.occluders, x_m, y_m, eye))
 
 
 SEARCH_STEP_M = 0.1

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import in_range, one_of
+from worldstate.ground.checks import check_ranges, in_range, one_of
 
 from .occluders import OccludingBody, box
 
@@ -97,22 +97,15 @@ class Site:
 
     def __post_init__(self) -> None:
         _check_name(self.name)
-        in_range("corner_left_m", self.corner_left_m, 1.0, 30.0)
-        in_range("corner_right_m", self.corner_right_m, 1.0, 30.0)
-        in_range("corner_ahead_m", self.corner_ahead_m, 1.0, 50.0)
-        in_range("side_wall_left_m", self.side_wall_left_m, 1.0, 60.0)
-        in_range("side_wall_right_m", self.side_wall_right_m, 1.0, 60.0)
-        in_range("street_width_m", self.street_width_m, 3.0, 40.0)
-        in_range("verge_m", self.verge_m, 0.0, 40.0)
-        in_range("surface_db", self.surface_db, -12.0, 12.0)
+        check_ranges(self, corner_left_m=(1.0, 30.0), corner_right_m=(1.0, 30.0), corner_ahead_m=(1.0, 50.0))
+        check_ranges(self, side_wall_left_m=(1.0, 60.0), side_wall_right_m=(1.0, 60.0))
+        check_ranges(self, street_width_m=(3.0, 40.0), verge_m=(0.0, 40.0), surface_db=(-12.0, 12.0))
         for factor in self.roughness:
             in_range("roughness", factor, 0.0, 6.0)
         for share in self.side_shares:
             in_range("side_shares", share, 0.0, 1.0)
-        in_range("side_reflection", self.side_reflection, 0.0, 0.98)
-        in_range("facade_reflection", self.facade_reflection, 0.0, 0.98)
-        in_range("side_order", self.side_order, 0, 8)
-        in_range("facade_order", self.facade_order, 0, 8)
+        check_ranges(self, side_reflection=(0.0, 0.98), facade_reflection=(0.0, 0.98))
+        check_ranges(self, side_order=(0, 8), facade_order=(0, 8))
         if len(self.occluders) > MAX_OCCLUDERS:
             raise InvalidArgumentError(f"occluders: expected at most {MAX_OCCLUDERS}")
         if self.opposite_wall_m is not None:
@@ -404,15 +397,8 @@ def parked_van() -> Place:
     return _open("SV1", (*ways, TURNS_OFF_AHEAD, CROSSES_BEHIND), box(1.5, 6.5, 2.0, 4.0))
 
 
-PLACES = {
-    "lead-vehicle": lead_vehicle,
-    "bridge-pier": bridge_pier,
-    "merge": merge,
-    "open-road": open_road,
-    "wide-crossing": wide_crossing,
-    "one-corner": one_corner,
-    "parked-van": parked_van,
-}
+_PLACES = lead_vehicle, bridge_pier, merge, open_road, wide_crossing, one_corner, parked_van
+PLACES = {one.__name__.replace("_", "-"): one for one in _PLACES}
 
 
 def place(name: str) -> Place:
@@ -461,18 +447,5 @@ def _mirrored(route_m: Points) -> Points:
 
 
 def _open(name: str, ways: tuple[Way, ...], *occluders: OccludingBody) -> Place:
-    site = Site(
-        name=name,
-        corner_left_m=OPEN_M,
-        corner_right_m=OPEN_M,
-        corner_ahead_m=1.0,
-        opposite_wall_m=None,
-        side_wall_left_m=OPEN_M,
-        side_wall_right_m=OPEN_M,
-        street_width_m=12.0,
-        side_order=0,
-        facade_order=0,
-        occluders=occluders,
-        in_the_open=True,
-    )
-    return Place(site, ways)
+    plan = Site(name, OPEN_M, OPEN_M, 1.0, None, OPEN_M, OPEN_M, 12.0, side_order=0, facade_order=0)
+    return Place(replace(plan, occluders=occluders, in_the_open=True), ways)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from worldstate.ground import FloatArray, InvalidArgumentError
-from worldstate.ground.checks import finite_array, in_range, one_of
+from worldstate.ground.checks import check_ranges, finite_array, in_range, one_of
 
 from .junction import MOVING_SITES, Site, Way, place_of, site
 from .kinds import FLAT, Octaves, VehicleKind, vehicle_kind
@@ -146,15 +146,12 @@ class SoundSettings:
 
     def __post_init__(self) -> None:
         kind = sound_kind(self.kind)
-        in_range("start_s", self.start_s, -60.0, 120.0)
-        in_range("duration_s", self.duration_s, 0.05, 120.0)
+        check_ranges(self, start_s=(-60.0, 120.0), duration_s=(0.05, 120.0))
         points = finite_array("place_m and route_m", (self.place_m, *self.route_m), (None, 2))
         in_range("place_m and route_m: farthest", np.abs(points).max(), 0.0, FARTHEST_M)
         if self.route_m and np.hypot(*np.diff(points, axis=0).T).min() < 0.1:
             raise InvalidArgumentError("route_m: expected points apart from each other and from place_m")
-        in_range("speed_mps", self.speed_mps, 0.1, 30.0)
-        in_range("level_offset_db", self.level_offset_db, -60.0, 30.0)
-        in_range("lens_missed", self.lens_missed, 0.0, 1.0)
+        check_ranges(self, speed_mps=(0.1, 30.0), level_offset_db=(-60.0, 30.0), lens_missed=(0.0, 1.0))
         if kind.name == "gusts" and not 1 <= len(self.channels) <= MAX_CHANNELS:
             raise InvalidArgumentError(
                 f"channels: expected 1 to {MAX_CHANNELS} of gusts, got {self.channels}"
@@ -189,9 +186,8 @@ class SoundSettings:
             (x, y), (ahead_x, ahead_y) = self.at(time_s - 0.5), self.at(time_s + 0.5)
             return np.arctan2(ahead_y - y, ahead_x - x)
         back_x, back_y = (-value for value in self.place_m)
-        return np.full_like(
-            time_s, np.arctan2(back_y, back_x) if self.facing_rad is None else self.facing_rad
-        )
+        faces_rad = np.arctan2(back_y, back_x) if self.facing_rad is None else self.facing_rad
+        return np.full_like(time_s, faces_rad)
 
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
@@ -267,9 +263,7 @@ class VehicleSettings:
         one_of("signal", self.signal, ("", *SIGNALS))
         one_of("manoeuvre", self.manoeuvre, MANOEUVRES)
         vehicle_kind(self.kind)
-        in_range("entry_s", self.entry_s, -60.0, 120.0)
-        in_range("speed_mps", self.speed_mps, 1.0, 30.0)
-        in_range("braking_mps2", self.braking_mps2, 0.0, 8.0)
+        check_ranges(self, entry_s=(-60.0, 120.0), speed_mps=(1.0, 30.0), braking_mps2=(0.0, 8.0))
         if self.route_m:
             _check_route(self.route_m)
 
@@ -344,11 +338,9 @@ class SimulationSettings:
 
     def __post_init__(self) -> None:
         one_of("approach", self.approach, APPROACHES)
-        in_range("duration_s", self.duration_s, 0.5, 60.0)
-        in_range("entry_s", self.entry_s, 0.0, self.duration_s if self.approach != "none" else 60.0)
-        in_range("speed_mps", self.speed_mps, 1.0, 30.0)
-        in_range("braking_mps2", self.braking_mps2, 0.0, 8.0)
-        in_range("sample_rate_hz", self.sample_rate_hz, 2_000.0, 96_000.0)
+        latest_s = self.duration_s if self.approach != "none" else 60.0
+        check_ranges(self, duration_s=(0.5, 60.0), entry_s=(0.0, latest_s), speed_mps=(1.0, 30.0))
+        check_ranges(self, braking_mps2=(0.0, 8.0), sample_rate_hz=(2_000.0, 96_000.0))
         in_range("others: number of vehicles", len(self.others), 0, MAX_OTHERS)
         in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
         self.traffic  # noqa: B018  (building the first vehicle checks what is left)

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.ground.checks import in_range
+from worldstate.ground.checks import check_ranges
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .kinds import LIGHT, SILENT_DB, TYRE_M, VehicleKind
@@ -105,8 +105,7 @@ class EgoMotion:
     stop_s: float = 0.0
 
     def __post_init__(self) -> None:
-        in_range("speed_mps", self.speed_mps, 0.0, 20.0)
-        in_range("stop_s", self.stop_s, 0.0, 120.0)
+        check_ranges(self, speed_mps=(0.0, 20.0), stop_s=(0.0, 120.0))
 
     @property
     def stands(self) -> bool:
@@ -351,12 +350,8 @@ class _Drawing:
         signal = np.zeros(len(self.time), np.float32)
         for order, band in enumerate(octave.tolist(), start=1):
             phase = 2.0 * np.pi * np.mod(order * cycles + self.rng.random(), 1.0)
-            # Above half the rate a line would come back folded, as a wrong one.
-            signal += (
-                levels[band]
-                * np.cos(phase.astype(np.float32))
-                * (order * firing_hz < 0.5 * self.sample_rate_hz)
-            )
+            heard = order * firing_hz < 0.5 * self.sample_rate_hz  # above, a line would come back folded
+            signal += levels[band] * np.cos(phase.astype(np.float32)) * heard
         return signal
 
     def _at_samples(self, knots: FloatArray) -> Float32Array:

@@ -15,13 +15,7 @@ from scipy.fft import irfft, next_fast_len, rfftfreq
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, level_curve
-from worldstate.simulation.scene.presets import (
-    OPENINGS,
-    Ambience,
-    Preset,
-    recording_ambience,
-    site_ambience,
-)
+from worldstate.simulation.scene.presets import OPENINGS, Ambience, Preset, recording_ambience, site_ambience
 
 from .paths import trace_paths
 from .receiver import Receiver

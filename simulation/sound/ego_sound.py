@@ -196,7 +196,7 @@ def _add_sources(
 ) -> None:
     roof = _roof_edge(float(positions[:, 2].min()) - ROOF_BELOW_ARRAY_M)
     levels, static = _levels_db(speed[::KNOT], *offsets_db), StaticSources(out, rate)
-    for place, level_db, lines in zip(_places(), levels, _line_shares(), strict=True):
+    for place, level_db, lines in zip(_PLACES_M, levels, _LINE_SHARES, strict=True):
         bands = split_octaves(_emission(firing, lines, rate, rng), rate)
         bands *= _at_samples(_pressure_pa(level_db), len(speed))
         for image, reflection in ((1.0, 1.0), (-1.0, ROAD_REFLECTION)):
@@ -207,13 +207,9 @@ def _add_sources(
     static.render()
 
 
-def _places() -> FloatArray:
-    return np.concatenate([TYRES_M, ENGINE_M[None], EXHAUST_M[None], PILLARS_M])
-
-
-def _line_shares() -> tuple[float, ...]:
-    """Share of every source's power that is harmonics of the firing frequency."""
-    return (0.0,) * 4 + (HARMONIC_SHARE, HARMONIC_SHARE) + (0.0,) * 2
+_PLACES_M = np.concatenate([TYRES_M, ENGINE_M[None], EXHAUST_M[None], PILLARS_M])
+# Of every source's power in harmonics of the firing frequency.
+_LINE_SHARES = (0.0,) * 4 + (HARMONIC_SHARE, HARMONIC_SHARE) + (0.0,) * 2
 
 
 def _levels_db(speed: FloatArray, engine_db: float, tyre_db: float) -> list[FloatArray]:

@@ -76,10 +76,8 @@ def screened_legs(
         for index, (x, y) in enumerate(occluder.corners_m):
             here = blocked * ((worst == body) & (chosen == index))
             if here.any():
-                before = np.hypot(x_m - x, y_m - y)
-                legs.append(
-                    ScreenedLeg(before, np.full_like(y_m, x), np.full_like(y_m, y), gain * here[:, None])
-                )
+                corner = np.full_like(y_m, x), np.full_like(y_m, y)
+                legs.append(ScreenedLeg(np.hypot(x_m - x, y_m - y), *corner, gain * here[:, None]))
     return legs
 
 
@@ -144,9 +142,8 @@ def _beside(
         # The near facade comes first, and there a source in the own street stands behind it.
         return replace(path, gain=path.gain * (1.0 - share)[:, None])
     across = source.y_m - float(image.mirror(np.zeros(1))[0])
-    straight = np.sqrt(
-        (source.x_m - heard_x_m) ** 2 + across**2 + around.receiver.above(source.height_m) ** 2
-    )
+    above = around.receiver.above(source.height_m)
+    straight = np.sqrt((source.x_m - heard_x_m) ** 2 + across**2 + above**2)
     walls = side_walls(around.site, image, heard_x_m, (source.x_m, source.y_m))
     whole = image.gain * walls[:, None] * specular**image.order
     return replace(

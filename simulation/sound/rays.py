@@ -28,7 +28,7 @@ from .background import BlockGrid, WaveField, far_passages_s, own_noise_density
 from .delay import Emission, SampledSignal
 from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS
 from .receiver import Receiver, add_along, add_to_all
-from .static_field import StaticSources, plane_wave_delays, unit_vectors
+from .static_field import StreetSound, plane_wave_delays, unit_vectors
 
 RAYS, BOUNCES, STEP_M = 100_000, 40, 1.0
 CELL_M, PLAN_M = 2.0, ((-40.0, 40.0), (-90.0, 90.0))  # x and y of the plan that is kept
@@ -329,10 +329,9 @@ class TracedSource:
     height_m: float
 
 
-def add_traced(
-    static: StaticSources, source: TracedSource, site: Site, receiver: Receiver, rng: np.random.Generator
-) -> None:
+def add_traced(street: StreetSound, source: TracedSource, rng: np.random.Generator) -> None:
     """Add a moving or standing source by all that rays found, round both corners, over roofs, straight."""
+    static, site, receiver = street.static, street.site, street.receiver
     emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
     lit, length = _lit(site, source), _way_m(site, source)
     ways = [*_echoes(source, site, receiver, rng), *_edges(source, site, receiver, lit)]

@@ -13,6 +13,7 @@ mean one that is drawn once for a site: its face.
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -108,9 +109,8 @@ def _opposite_wall(site: Site, wall_m: float, rng: np.random.Generator) -> Patch
     y = _spread(OPPOSITE_REACH * right, OPPOSITE_REACH * left, rng, OPPOSITE_PATCH_M)
     positions = np.column_stack([np.full_like(y, wall_m), y, rng.uniform(*HEIGHTS_M, len(y))])
     normals = np.tile([-1.0, 0.0], (len(y), 1))
-    return Patches(
-        positions, normals, _strengths(len(y), site.facade_reflection, rng, OPPOSITE_PATCH_M), True
-    )
+    strengths = _strengths(len(y), site.facade_reflection, rng, OPPOSITE_PATCH_M)
+    return Patches(positions, normals, strengths, True)
 
 
 def _spread(low: float, high: float, rng: np.random.Generator, patch_m: float = PATCH_M) -> FloatArray:
@@ -126,14 +126,9 @@ def _strengths(
     return np.asarray(reflection * np.sqrt(weights * patch_m * WALL_HEIGHT_M / np.pi))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstLeg:
-    """From the source to one patch, at a series of emission times."""
-
-    length_m: FloatArray  # shape (T,): Way to the patch
-    # shape (T, 8): Amplitude factor per octave without spherical spreading; the last leg's angle is not in
-    # it.
-    gain: FloatArray
+# Way to a patch at a series of emission times, shape (T,), and amplitude factor per octave without spherical
+# spreading, shape (T, 8); the last leg's angle is not in it.
+FirstLeg: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 def first_legs(group: Patches, index: int, source: MovingSource, around: Surroundings) -> list[FirstLeg]:
@@ -149,7 +144,7 @@ def _open_leg(group: Patches, index: int, source: MovingSource) -> FirstLeg:
     away = np.stack([source.ahead_m - x, source.y_m - y], axis=1)
     length = np.sqrt((away**2).sum(axis=1) + (z - source.height_m) ** 2)
     cosine = np.abs(away @ group.normals[index]) / np.maximum(length, NEAREST_M)
-    return FirstLeg(length, (group.strengths_m[index] * np.sqrt(cosine))[:, None] * np.ones(len(OCTAVES_HZ)))
+    return length, (group.strengths_m[index] * np.sqrt(cosine))[:, None] * np.ones(len(OCTAVES_HZ))
 
 
 def _mouth_leg(
@@ -162,7 +157,7 @@ def _mouth_leg(
     length = passage.lit * passage.straight_m + (1.0 - passage.lit) * passage.bent_m
     walls = image.gain * near_facade(site, image, source.y_m, passage.aim_y_m)
     gain = group.strengths_m[index] * np.sqrt(cosine) * walls
-    return FirstLeg(length, gain[:, None] * passage.screen_gain(around.cap_db))
+    return length, gain[:, None] * passage.screen_gain(around.cap_db)
 
 
 def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -206,8 +201,8 @@ def add_scattered(static: StaticSources, source: MovingSource, around: Surroundi
     for group in patches(around.site):
         arrived = np.zeros((len(group.strengths_m), around.receiver.samples), np.float32)
         for index, signal in enumerate(arrived):
-            for leg in first_legs(group, index, source, around):
-                sent = replace(leg, gain=leg.gain * np.sqrt(around.scattered(group.beyond_mouth)))
+            for length_m, gain in first_legs(group, index, source, around):
+                sent = length_m, gain * np.sqrt(around.scattered(group.beyond_mouth))
                 _add_leg(signal, source.emission, sent, around, group.positions_m[index])
         every += _shown(group, arrived, around)
     _add_shown(static, every, around.receiver)
@@ -217,12 +212,13 @@ def _add_leg(
     out: Float32Array, emission: Emission, leg: FirstLeg, around: Surroundings, patch_m: FloatArray
 ) -> None:
     """Add what one patch sends on, as late as the array's centre hears it."""
-    made = emission.table(leg.gain)
+    length_m, gain = leg
+    made = emission.table(gain)
     if made is None:
         return
     table, span = made
     receiver = around.receiver
-    knots, first = emission.knots_s[span], leg.length_m[span]
+    knots, first = emission.knots_s[span], length_m[span]
     total, _ = receiver.arrivals(knots, lambda x: first + distance_m(patch_m, x, receiver.centre_m))
     emit = emission_times(receiver.knots_s, knots, total)
     length = np.interp(np.nan_to_num(emit), knots, first)

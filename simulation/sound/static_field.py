@@ -145,23 +145,27 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
     return unit_vectors(azimuth, elevation), shares
 
 
-def add_late_field(
-    static: StaticSources,
-    dry: Float32Array,
-    decay_s: float,
-    positions_m: FloatArray,
-    rng: np.random.Generator,
-    field: tuple[FloatArray, FloatArray],
-) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class StreetSound:
+    """What the sounds of a street are added to, and what shapes them on their way there."""
+
+    static: StaticSources
+    site: Site
+    preset: Preset
+    receiver: Receiver
+
+
+def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Generator) -> None:
     """Add a diffuse tail of a dry signal: its energy without its direction.
 
     Every direction has a tail of its own. One common tail on all microphones would be a source at broadside.
 
-    Shapes: dry (pre + samples,), positions_m (M, 3), field (ndarray, ndarray).
+    Shapes: dry (pre + samples,).
     """
-    directions, shares = field
+    static, positions_m = street.static, street.receiver.positions_m
+    directions, shares = street_field(street.site, street.preset.late_lobe_share)
     samples = static.out.shape[1]
-    tail = max(int(TAIL_DECAYS * decay_s * static.sample_rate_hz), 1)
+    tail = max(int(TAIL_DECAYS * street.preset.late_decay_s * static.sample_rate_hz), 1)
     n = next_fast_len(len(dry) + tail, real=True)
     spectrum = rfft(dry, n)
     envelope = 10.0 ** (-3.0 * np.arange(tail) / tail * TAIL_DECAYS)
@@ -180,24 +184,19 @@ def add_late_field(
 
 
 def add_late_sound(
-    static: StaticSources,
+    street: StreetSound,
     signal: Float32Array,
     place_m: tuple[FloatArray, FloatArray],
     time_s: FloatArray,
-    site: Site,
-    preset: Preset,
-    receiver: Receiver,
     rng: np.random.Generator,
 ) -> None:
     """Add the late sound of a source; its signal lasts from the first of its emission knots to the last.
 
     Shapes: signal (n,), place_m (x (T,), y (T,)), time_s (T,).
     """
-    if site.is_open:
-        return  # nothing stands there that could send late sound
-    dry = _until_the_end(signal * _late_gain(site, preset, *place_m, time_s, receiver), time_s[0], receiver)
-    field = street_field(site, preset.late_lobe_share)
-    add_late_field(static, dry, preset.late_decay_s, receiver.positions_m, rng, field)
+    if not street.site.is_open:  # nothing stands there that could send late sound
+        fed = signal * _late_gain(street, *place_m, time_s)
+        _add_late_field(street, _until_the_end(fed, time_s[0], street.receiver), rng)
 
 
 def late_level_db(site: Site, preset: Preset) -> float:
@@ -205,12 +204,11 @@ def late_level_db(site: Site, preset: Preset) -> float:
     return preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
 
 
-def _late_gain(
-    site: Site, preset: Preset, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray, receiver: Receiver
-) -> Float32Array:
+def _late_gain(street: StreetSound, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray) -> Float32Array:
     """How strongly a source feeds the late field: less the farther it, or the ego, is from the mouth."""
-    away = np.hypot(x_m - site.corner_ahead_m, y_m) - receiver.ego.x_m(time_s)
-    gain = 10.0 ** (late_level_db(site, preset) / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
+    away = np.hypot(x_m - street.site.corner_ahead_m, y_m) - street.receiver.ego.x_m(time_s)
+    level = 10.0 ** (late_level_db(street.site, street.preset) / 20.0)
+    gain = level * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
     knots = np.arange(len(gain)) * KNOT_SAMPLES
     samples = np.arange((len(gain) - 1) * KNOT_SAMPLES)
     return np.asarray(np.interp(samples, knots, gain), np.float32)

@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
-from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind
-from worldstate.simulation.scene.presets import Preset
 from worldstate.simulation.scene.settings import (
     EGO_STOPS_AFTER_S,
     SimulationSettings,
@@ -58,19 +56,13 @@ class SoundEvent:
 Event = VehicleEvent | SoundEvent
 
 
-def draw_events(
-    site: Site,
-    traffic: Traffic,
-    preset: Preset,
-    duration_s: float,
-    rng: np.random.Generator,
-    ego: EgoMotion = STANDING,
-) -> list[VehicleEvent]:
+def draw_events(settings: StreamSettings, rng: np.random.Generator) -> list[VehicleEvent]:
     """Draw all vehicles of a stream, in the order in which they come into earshot."""
+    traffic, duration_s = settings.traffic, settings.duration_s
     # A generator a flow: another rate of one of them leaves the others as they are.
     flows = dict(zip(MANOEUVRES, rng.spawn(len(MANOEUVRES)), strict=True))
-    turns = _turns(traffic, duration_s, rng, ego) if traffic.evenly else {}
-    around_s = 0.0 if ego.stands else AROUND_DRIVE_S
+    turns = _turns(settings, rng) if traffic.evenly else {}
+    around_s = 0.0 if settings.ego.stands else AROUND_DRIVE_S
     events: list[VehicleEvent] = []
     for flow, own in flows.items():
         times_s = turns.get(flow)
@@ -79,40 +71,39 @@ def draw_events(
             number = own.poisson(traffic.per_hour.get(flow, 0.0) * drawn_s / 3600.0)
             times_s = np.sort(own.uniform(0.0, drawn_s, number)) - around_s
         for arrival_s, one in zip(times_s, own.spawn(len(times_s)), strict=True):
-            events += _arrival(flow, float(arrival_s), site, traffic, preset, one)
+            events += _arrival(flow, float(arrival_s), settings, one)
     inside = [event for event in events if event.start_s < duration_s and event.end_s > 0.0]
     return sorted(inside, key=lambda event: event.start_s)
 
 
-def _turns(
-    traffic: Traffic, duration_s: float, rng: np.random.Generator, ego: EgoMotion
-) -> dict[str, FloatArray]:
+def _turns(settings: StreamSettings, rng: np.random.Generator) -> dict[str, FloatArray]:
     """Deal equal stretches of time to the hazards, and draw the middle half of each to arrive in.
 
     A drive has one of them, shortly before the ego stops, as recordings have.
     """
+    per_hour, ego = settings.traffic.per_hour, settings.ego
     if not ego.stands:
-        rates = np.array([traffic.per_hour.get(flow, 0.0) for flow in HAZARDS])
+        rates = np.array([per_hour.get(flow, 0.0) for flow in HAZARDS])
         chosen = rng.choice(HAZARDS, p=rates / rates.sum())
         arrives_s = np.array([ego.stop_s - rng.uniform(*EGO_STOPS_AFTER_S)])
         return {flow: arrives_s[: int(flow == chosen)] for flow in HAZARDS}
-    counts = {flow: round(traffic.per_hour.get(flow, 0.0) * duration_s / 3600.0) for flow in HAZARDS}
+    counts = {flow: round(per_hour.get(flow, 0.0) * settings.duration_s / 3600.0) for flow in HAZARDS}
     order = rng.permutation(np.repeat(list(counts), list(counts.values())))
     middle = np.arange(len(order)) + rng.uniform(0.25, 0.75, len(order))
-    return {flow: middle[order == flow] * duration_s / max(len(order), 1) for flow in counts}
+    return {flow: middle[order == flow] * settings.duration_s / max(len(order), 1) for flow in counts}
 
 
 def _arrival(
-    flow: str, arrival_s: float, site: Site, traffic: Traffic, preset: Preset, rng: np.random.Generator
+    flow: str, arrival_s: float, settings: StreamSettings, rng: np.random.Generator
 ) -> Iterator[VehicleEvent]:
-    arms = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
+    traffic, arms = settings.traffic, {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
     if flow == "queue":
         arms[flow] = ((LEFT,), (RIGHT,))[rng.integers(2)]
     for arm in arms.get(flow, (None,)):
         kind = _kind(traffic, rng)
         # A bicycle two streets away is not heard.
         heard = vehicle_kind("light") if flow == "far" and kind.name == "bicycle" else kind
-        driver = draw_driver(site, heard, preset, rng, arm)
+        driver = draw_driver(settings.site, heard, settings.preset, rng, arm)
         signal = _signal(traffic, heard, rng)
         if signal:
             driver = replace(driver, reach_m=EARSHOT_M[1])  # louder than its tyres

@@ -68,9 +68,8 @@ def close_vehicle(
     time = np.arange(0.0, seconds, 0.1) - passes_s
     moves = np.maximum(speed + rng.choice(ACCELERATIONS_MPS2) * time, 1.0)
     sound = _in_the_open(kind, moves, passes_s, preset, site, rate_hz, rng)
-    return _with_tones(
-        _fluctuating(sound, rate_hz, rng), "tram" if kind.name == "tram" else "passes", rate_hz, rng
-    )
+    tones = "tram" if kind.name == "tram" else "passes"
+    return _with_tones(_fluctuating(sound, rate_hz, rng), tones, rate_hz, rng)
 
 
 def idling_vehicle(
@@ -106,17 +105,17 @@ def recorded(
     sound: FloatArray, rate_hz: float, rng: np.random.Generator, *, calm: bool = False
 ) -> Float32Array:
     """Add noise of a drawn colour and hear both by a recorder of a drawn frequency response, shape (n,)."""
-    noise = _coloured(rng.standard_normal(len(sound)), rate_hz, rng.uniform(*_NOISE_SLOPES_DB), rng)
+    hz, white = _frequencies(len(sound), rate_hz), rng.standard_normal(len(sound))
+    colour_db = rng.uniform(*_NOISE_SLOPES_DB) * np.log2(np.maximum(hz, 40.0) / 500.0)
+    noise = _filtered(white, colour_db + _wavy_db(hz, _RECORDER_DB, rng))
     noise *= 10.0 ** (rng.uniform(*_SWELL_DB) * drift(len(sound), rate_hz, 1.0, rng) / 20.0)
     band = scipy.signal.butter(4, BAND_HZ, "bandpass", fs=rate_hz, output="sos")
     loud, beside = (np.square(scipy.signal.sosfilt(band, one)) for one in (sound, noise))
     # Over its louder third: a pause is none.
     parts = np.sort([part.mean() for part in np.array_split(loud, max(len(loud) // round(0.1 * rate_hz), 1))])
     ratio_db = rng.uniform(*(_CALM_DB if calm else _SNR_DB))
-    gain = np.sqrt((parts[-len(parts) // 3 :].mean() + np.finfo(float).tiny) / beside.mean()) * 10.0 ** (
-        -ratio_db / 20
-    )
-    hz = _frequencies(len(sound), rate_hz)
+    louder = parts[-len(parts) // 3 :].mean() + np.finfo(float).tiny
+    gain = np.sqrt(louder / beside.mean()) * 10.0 ** (-ratio_db / 20)
     response_db = np.clip(_wavy_db(hz, _RECORDER_DB, rng), -_MOST_DB, _MOST_DB)
     response_db += rng.uniform(-_TILT_DB, _TILT_DB) * np.log2(hz / 500.0)
     response_db -= 10.0 * np.log10(1.0 + (rng.uniform(*_CUTS_HZ) / hz) ** 4)
@@ -146,11 +145,8 @@ def _in_the_open(
     alone = Microphones(np.array([[0.0, 0.0, height]]), np.zeros(1), np.ones(1), rate_hz)
     street = replace(site, in_the_open=True, opposite_wall_m=None)
     # The preset takes bass from engines, which streets do not have and close passes do.
-    sound = (
-        event_sound(event, street, replace(preset, engine_bass_db=0.0), alone, rng)
-        .pressure_pa[0]
-        .astype(np.float64)
-    )
+    heard = event_sound(event, street, replace(preset, engine_bass_db=0.0), alone, rng)
+    sound = heard.pressure_pa[0].astype(np.float64)
     first, length = round(FADE_S * rate_hz), round(0.1 * len(speeds_mps) * rate_hz)
     return _filtered(sound[first : first + length], _wavy_db(_frequencies(length, rate_hz), _VEHICLE_DB, rng))
 
@@ -180,13 +176,6 @@ def _with_tones(sound: FloatArray, of: str, rate_hz: float, rng: np.random.Gener
         wave = np.sin(phase) + rng.choice((0.0, 0.3)) * np.sin(2.0 * phase)
         tones += rng.uniform(0.3, 1.0) * 10.0 ** (drift(len(sound), rate_hz, 0.3, rng) / 10.0) * wave
     return np.asarray(sound + rng.uniform(*_TONE_GAIN) * level * tones)
-
-
-def _coloured(sound: FloatArray, rate_hz: float, slope_db: float, rng: np.random.Generator) -> FloatArray:
-    hz = _frequencies(len(sound), rate_hz)
-    return _filtered(
-        sound, slope_db * np.log2(np.maximum(hz, 40.0) / 500.0) + _wavy_db(hz, _RECORDER_DB, rng)
-    )
 
 
 def _wavy_db(hz: FloatArray, spread_db: float, rng: np.random.Generator) -> FloatArray:

@@ -11,12 +11,7 @@ from worldstate.simulation.scene.driving import entry_y_m
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind
 from worldstate.simulation.scene.presets import Preset
-from worldstate.simulation.scene.settings import (
-    BRAKING_MPS2,
-    BRAKING_SHARE,
-    SPEEDS_MPS,
-    speeds_mps,
-)
+from worldstate.simulation.scene.settings import BRAKING_MPS2, BRAKING_SHARE, SPEEDS_MPS, speeds_mps
 from worldstate.simulation.scene.vehicle import (
     POWER_TO_1M_DB,
     TURN_RADIUS_M,
@@ -70,36 +65,6 @@ class Motion:
         speed = np.interp(time_s, self.time_s, self.speed_mps)
         lane = float(x[0]) if len(x) else 0.0
         return Trajectory(time_s, y, speed, lane, self.heading, self.kind, route, driven)
-
-
-def drive_along(
-    route: Route,
-    span_m: tuple[float, float],
-    cruise_mps: float,
-    limits: Sequence[SpeedLimit],
-    kind: VehicleKind,
-    heading: int,
-) -> Motion:
-    r"""Drive from one distance to another as fast as the limits allow.
-
-    .. math:: v(s) = \min\Big(v_0, \sqrt{v_i^2 + 2 b_i (s_i - s)}\ (s < s_i),
-              \sqrt{v_i^2 + 2 a (s - s_i)}\ (s > s_i)\Big)
-    """
-    stops = sorted((one for one in limits if one.stands_s > 0.0), key=lambda one: one.at_m)
-    edges = [span_m[0], *(one.at_m for one in stops), span_m[1]]
-    # A stop is in the grid twice: between both nothing is driven and time goes by.
-    pieces = [_grid(low, high) for low, high in pairwise(edges)]
-    driven = np.concatenate(pieces)
-    speed = np.full_like(driven, cruise_mps)
-    for one in limits:
-        before = one.at_m - driven
-        room = np.where(before > 0.0, 2.0 * one.braking_mps2 * before, -2.0 * ACCELERATION_MPS2 * before)
-        speed = np.minimum(speed, np.sqrt(one.speed_mps**2 + room))
-    # At constant acceleration a step takes its length over the mean of both speeds, exactly.
-    step, twice = np.diff(driven), speed[1:] + speed[:-1]
-    took = 2.0 * step / np.maximum(twice, 1e-6)
-    took[np.cumsum([len(piece) for piece in pieces[:-1]], dtype=int) - 1] = [one.stands_s for one in stops]
-    return Motion(route, np.r_[0.0, np.cumsum(took)], driven, speed, kind, heading)
 
 
 def _grid(low_m: float, high_m: float) -> FloatArray:
@@ -167,6 +132,32 @@ class Driver:
         """Where on its lane it comes into the camera's line of sight."""
         return entry_y_m(self.site, self.lane_m(), self.arm)
 
+    def motion(
+        self, route: Route, span_m: tuple[float, float], limits: Sequence[SpeedLimit], into: bool = False
+    ) -> Motion:
+        r"""Drive from one distance to another as fast as the limits allow; `into` the arm or out of it.
+
+        .. math:: v(s) = \min\Big(v_0, \sqrt{v_i^2 + 2 b_i (s_i - s)}\ (s < s_i),
+                  \sqrt{v_i^2 + 2 a (s - s_i)}\ (s > s_i)\Big)
+        """
+        stops = sorted((one for one in limits if one.stands_s > 0.0), key=lambda one: one.at_m)
+        edges = [span_m[0], *(one.at_m for one in stops), span_m[1]]
+        # A stop is in the grid twice: between both nothing is driven and time goes by.
+        pieces = [_grid(low, high) for low, high in pairwise(edges)]
+        driven = np.concatenate(pieces)
+        speed = np.full_like(driven, self.speed_mps)
+        for one in limits:
+            before = one.at_m - driven
+            room = np.where(before > 0.0, 2.0 * one.braking_mps2 * before, -2.0 * ACCELERATION_MPS2 * before)
+            speed = np.minimum(speed, np.sqrt(one.speed_mps**2 + room))
+        # At constant acceleration a step takes its length over the mean of both speeds, exactly.
+        step, twice = np.diff(driven), speed[1:] + speed[:-1]
+        took = 2.0 * step / np.maximum(twice, 1e-6)
+        ends = np.cumsum([len(piece) for piece in pieces[:-1]], dtype=int)
+        took[ends - 1] = [one.stands_s for one in stops]
+        heading = int(self.side) if into else -int(self.side)
+        return Motion(route, np.r_[0.0, np.cumsum(took)], driven, speed, self.kind, heading)
+
 
 def draw_driver(
     site: Site, kind: VehicleKind, preset: Preset, rng: np.random.Generator, arm: str | None = None
@@ -217,7 +208,7 @@ def stands(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     stop = SpeedLimit(-rng.uniform(1.0, 8.0), 0.0, rng.uniform(8.0, 40.0))
     limits = [stop, SpeedLimit(0.0, TURN_MPS), SpeedLimit(0.5 * np.pi * TURN_RADIUS_M, TURN_MPS)]
     span = float(away.motion.driven_m[0]), float(away.motion.driven_m[-1])
-    motion = _drive(driver, away.motion.route, span, limits)
+    motion = driver.motion(away.motion.route, span, limits)
     return replace(away, motion=motion, arrives_s=motion.reaches_s(stop.at_m))
 
 
@@ -227,7 +218,7 @@ def drives_off(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     lane = driver.lane_m(into=True)
     limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 6.0))]
     route = along([[lane, y], [lane, y + driver.side]])
-    motion = _drive(driver, route, (0.0, max(driver.reach_m - abs(y), SHORTEST_M)), limits, into=True)
+    motion = driver.motion(route, (0.0, max(driver.reach_m - abs(y), SHORTEST_M)), limits, into=True)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
 
 
@@ -251,7 +242,7 @@ def parks(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     stop_y = driver.entry_y_m() + driver.side * before
     route = along([[lane, stop_y + driver.side], [lane, stop_y]], 1.0)
     limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 5.0))]
-    motion = _drive(driver, route, (-driver.reach_from(before), 0.0), limits)
+    motion = driver.motion(route, (-driver.reach_from(before), 0.0), limits)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(-0.1))
 
 
@@ -278,7 +269,7 @@ def from_ahead(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
         return _turn_into(driver, (lane + TURN_RADIUS_M, 1.2), (-1.0, 0.0))
     route = along([[lane, -driver.side], [lane, 0.0]])
     limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 4.0))]
-    motion = _drive(driver, route, (0.0, driver.reach_m), limits, into=True)
+    motion = driver.motion(route, (0.0, driver.reach_m), limits, into=True)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
 
 
@@ -303,7 +294,7 @@ def _through(driver: Driver, limits: list[SpeedLimit]) -> Manoeuvre:
     """Drive along the crossing street; the arrival is the line of sight."""
     lane, entry = driver.lane_m(), driver.entry_y_m()
     route = along([[lane, entry], [lane, entry - driver.side]])
-    motion = _drive(driver, route, (-driver.reach_m, 2.0 * abs(entry) + driver.reach_m), limits)
+    motion = driver.motion(route, (-driver.reach_m, 2.0 * abs(entry) + driver.reach_m), limits)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
 
 
@@ -315,22 +306,15 @@ def _turn_into(driver: Driver, turn_m: tuple[float, float], towards: tuple[float
     points = np.concatenate([[before], corner, after])
     length = 0.5 * np.pi * TURN_RADIUS_M
     limits = [SpeedLimit(0.0, TURN_MPS), SpeedLimit(length, TURN_MPS)]
-    motion = _drive(driver, along(points, 1.0), (-driver.reach_m, length + driver.reach_m), limits, into=True)
+    motion = driver.motion(along(points, 1.0), (-driver.reach_m, length + driver.reach_m), limits, into=True)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
 
 
 def _beside(driver: Driver, route: Route, span_m: tuple[float, float], limits: list[SpeedLimit]) -> Manoeuvre:
     """Drive where only the mouth of another street lets the sound out."""
     near, far = driver.site.lanes_m
-    motion = _drive(driver, route, span_m, limits)
+    motion = driver.motion(route, span_m, limits)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0), confined(route, near, far))
-
-
-def _drive(
-    driver: Driver, route: Route, span_m: tuple[float, float], limits: list[SpeedLimit], into: bool = False
-) -> Motion:
-    heading = int(driver.side) if into else -int(driver.side)
-    return drive_along(route, span_m, driver.speed_mps, limits, driver.kind, heading)
 
 
 def _arc(start_m: tuple[float, float], towards: tuple[float, float], then: tuple[float, float]) -> FloatArray:

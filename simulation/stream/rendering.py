@@ -26,7 +26,7 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.rays import add_traced_background
 from worldstate.simulation.sound.receiver import Receiver, standing_m
-from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 from .arrivals import STANDING, Event, SoundEvent, VehicleEvent
 from .settings import StreamSettings
@@ -61,28 +61,47 @@ def draw_microphones(
 OVERLAP_S = 8.0
 
 
-def stream_ambience(settings: StreamSettings, rng: np.random.Generator) -> Ambience:
-    """Draw what a stream makes of its site's ambience, which stays the same through the stream."""
-    return recording_ambience(site_ambience(settings.site, settings.preset), settings.preset, rng)
+@dataclass(frozen=True, slots=True, eq=False)
+class StreamScene:
+    """What stays the same through a stream."""
+
+    settings: StreamSettings
+    ambience: Ambience
+    microphones: Microphones
+
+    @classmethod
+    def drawn(
+        cls, settings: StreamSettings, microphones: Microphones, rng: np.random.Generator
+    ) -> "StreamScene":
+        """Draw what a stream makes of its site's ambience, which stays the same through the stream."""
+        usual = site_ambience(settings.site, settings.preset)
+        return cls(settings, recording_ambience(usual, settings.preset, rng), microphones)
+
+    @property
+    def piece(self) -> int:
+        """Samples in a piece; not shorter than two overlaps, so that only neighbours meet; a drive is one."""
+        if not self.settings.ego.stands:
+            return self.settings.samples
+        rate = self.settings.sample_rate_hz
+        return max(min(round(PIECE_S * rate), PIECE_SAMPLES), 2 * overlap_samples(self.settings))
+
+    @property
+    def within_s(self) -> tuple[float, float]:
+        """What is rendered of the events: all, of a drive what is heard in it, often a third."""
+        return ALWAYS_S if self.settings.ego.stands else (0.0, self.settings.duration_s)
 
 
 def ambience_piece(
-    settings: StreamSettings,
-    here: Ambience,
-    microphones: Microphones,
-    samples: int,
-    rng: np.random.Generator,
-    *,
-    begins: bool,
+    scene: StreamScene, samples: int, rng: np.random.Generator, *, begins: bool
 ) -> Float32Array:
     """Render background, shape (M, samples + overlap), faded at both ends; not where the stream begins."""
     # Neighbouring pieces know nothing of each other: where the squares of their fades add up to one, the
     # power stays the same. A fade of amplitudes would leave a dip of 3 dB in the middle.
-    overlap = overlap_samples(settings)
-    sound = np.zeros((len(microphones.positions_m), samples + overlap), np.float32)
-    receiver = microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz)
+    settings, overlap = scene.settings, overlap_samples(scene.settings)
+    sound = np.zeros((len(scene.microphones.positions_m), samples + overlap), np.float32)
+    receiver = scene.microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz)
     add = add_traced_background if settings.site.is_traced else add_background
-    add(sound, receiver, settings.site, settings.preset, rng, here)
+    add(sound, receiver, settings.site, settings.preset, rng, scene.ambience)
     rise = np.sin(0.5 * np.pi * (np.arange(overlap) + 0.5) / overlap).astype(np.float32)
     if not begins:
         sound[:, :overlap] *= rise
@@ -145,15 +164,16 @@ def event_sound(
     receiver = microphones.receiver(np.arange(blocks + 1) * knot_s, own)
     sound = np.zeros((len(microphones.positions_m), receiver.samples), np.float32)
     static = StaticSources(sound, rate)
+    street = StreetSound(static, site, preset, receiver)
     if isinstance(event, SoundEvent):
-        add_sound(static, event.sound, site, preset, receiver, rng)
+        add_sound(street, event.sound, rng)
     else:
         time, manoeuvre = np.arange(-before, blocks + 1) * knot_s, event.manoeuvre
         # The clock of what is rendered begins with it, that of the vehicle may have begun before.
         path = replace(manoeuvre.motion.trajectory(time + late_s, manoeuvre.heard), time_s=time)
-        add_vehicle(static, site, preset, path, receiver, rng)
+        add_vehicle(street, path, rng)
         if event.signal:
-            add_signal(static, event.signal, path, site, preset, receiver, rng)
+            add_signal(street, event.signal, path, rng)
     static.render()
     sound *= _envelope(event, site, receiver, late_s)
     return EventSound(round(begin_s * rate), sound)
@@ -199,28 +219,6 @@ def loudness_db(
 # What one process renders at a time: 40 MB of sound for 56 channels at 6 kHz, 80 MB at the full rate.
 PIECE_S, PIECE_SAMPLES = 30.0, 360_000
 AMBIENCE, EVENT, EGO_NOISE = 3, 4, 8  # purposes of generators
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StreamScene:
-    """What stays the same through a stream."""
-
-    settings: StreamSettings
-    ambience: Ambience
-    microphones: Microphones
-
-    @property
-    def piece(self) -> int:
-        """Samples in a piece; not shorter than two overlaps, so that only neighbours meet; a drive is one."""
-        if not self.settings.ego.stands:
-            return self.settings.samples
-        rate = self.settings.sample_rate_hz
-        return max(min(round(PIECE_S * rate), PIECE_SAMPLES), 2 * overlap_samples(self.settings))
-
-    @property
-    def within_s(self) -> tuple[float, float]:
-        """What is rendered of the events: all, of a drive what is heard in it, often a third."""
-        return ALWAYS_S if self.settings.ego.stands else (0.0, self.settings.duration_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,9 +296,7 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
 
 def _add_ambience(sound: Float32Array, scene: StreamScene, number: int) -> None:
     rng = scene.settings.generator(AMBIENCE, number)
-    piece = ambience_piece(
-        scene.settings, scene.ambience, scene.microphones, scene.piece, rng, begins=number == 0
-    )
+    piece = ambience_piece(scene, scene.piece, rng, begins=number == 0)
     sound[:, : piece.shape[1]] += piece
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from worldstate.ground.checks import in_range, one_of
+from worldstate.ground.checks import check_ranges, in_range, one_of
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.scene.junction import Site, ego_moves
 from worldstate.simulation.scene.kinds import KINDS
@@ -180,9 +180,7 @@ class StreamSettings:
 
     def __post_init__(self) -> None:
         longest = MAX_DRIVE_MINUTES if ego_moves(self.site.name) else MAX_MINUTES
-        in_range("minutes", self.minutes, 0.05, longest)
-        in_range("seed", self.seed, 0, 2**63)
-        in_range("sample_rate_hz", self.sample_rate_hz, 2_000.0, 96_000.0)
+        check_ranges(self, minutes=(0.05, longest), seed=(0, 2**63), sample_rate_hz=(2_000.0, 96_000.0))
         if self.site.is_open:
             raise InvalidArgumentError(
                 f"site: expected a junction, got {self.site.name}: no arms to come out of"

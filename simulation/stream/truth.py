@@ -18,8 +18,8 @@ from worldstate.simulation.camera.simulated_detector import (
     SimulatedDetection,
     detect,
     line_of_sight,
-    lost,
     park,
+    through_rain,
 )
 from worldstate.simulation.dataset.recording import SCHEMA, SCHEMA_VERSION
 from worldstate.simulation.scene.junction import Site
@@ -62,7 +62,8 @@ def detected_frames(
     for event, draws in zip(events, to_vehicles.spawn(len(events)), strict=True):
         _add_boxes(frames, event, settings.site, draws)
     _add_clutter(frames, to_clutter)
-    return lost(frames, _soiled(sounds, count), to_rain)
+    showers = ((one.start_s + one.sound.start_s, one.end_s, one.sound.lens_missed) for one in sounds)
+    return through_rain(frames, showers, to_rain)
 
 
 def _add_boxes(frames: list[Frame], event: VehicleEvent, site: Site, rng: np.random.Generator) -> None:
@@ -74,16 +75,6 @@ def _add_boxes(frames: list[Frame], event: VehicleEvent, site: Site, rng: np.ran
     boxes = detect(path.at(path.time_s[ahead]), site, PinholeCamera.ovad(), rng)
     for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
         frames[number] += seen
-
-
-def _soiled(sounds: Sequence[SoundEvent], count: int) -> FloatArray:
-    """Share of the boxes that drops on the lens take, shape (count,)."""
-    missed, time = np.zeros(count), np.arange(count) / FRAME_RATE_HZ
-    for one in sounds:
-        # A lens dries when the rain is over; how long that takes is not modelled.
-        raining = (time >= one.start_s + one.sound.start_s) & (time < one.end_s)
-        missed = np.maximum(missed, one.sound.lens_missed * raining)
-    return missed
 
 
 def _add_clutter(frames: list[Frame], rng: np.random.Generator) -> None:

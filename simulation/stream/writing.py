@@ -1,6 +1,6 @@
 """A continuous stream: all about it is drawn before any of it is rendered, and written while it is."""
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,16 +16,11 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.camera.simulated_detector import to_json
-from worldstate.simulation.dataset.recording import (
-    FULL_SCALE_PA,
-    put_in_place,
-    refuse_foreign,
-    sound_writer,
-)
+from worldstate.simulation.dataset.recording import FULL_SCALE_PA, put_in_place, refuse_foreign, sound_writer
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 
 from .arrivals import SoundEvent, draw_events, draw_sounds
-from .rendering import Block, StreamScene, draw_microphones, render_blocks, stream_ambience
+from .rendering import Block, StreamScene, draw_microphones, render_blocks
 from .settings import StreamSettings
 from .truth import (
     EVENTS_NAME,
@@ -63,14 +58,10 @@ class DrawnStream:
 
 def draw_stream(settings: StreamSettings, array: MicrophoneArray) -> DrawnStream:
     """Draw vehicles, other sounds, background and microphones of a stream, each from its own generator."""
-    arrivals, drawn = settings.generator(ARRIVALS), settings
-    events = draw_events(drawn.site, drawn.traffic, drawn.preset, drawn.duration_s, arrivals, drawn.ego)
+    events = draw_events(settings, settings.generator(ARRIVALS))
+    microphones = draw_microphones(settings, array, settings.generator(CHANNELS))
     return DrawnStream(
-        StreamScene(
-            settings,
-            stream_ambience(settings, settings.generator(LEVEL)),
-            draw_microphones(settings, array, settings.generator(CHANNELS)),
-        ),
+        StreamScene.drawn(settings, microphones, settings.generator(LEVEL)),
         array,
         tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events)),
         tuple(draw_sounds(settings, array.n_microphones, settings.generator(SOUNDS))),
@@ -199,13 +190,11 @@ def write_stream(
     refuse_foreign(target)
     folder.mkdir(parents=True, exist_ok=True)
     stream = draw_stream(settings, ovad_array() if array is None else array)
-    heard = Spectrogram(settings.sample_rate_hz)
     # Beside the target, on the same disk, so that the whole stream takes its name in one step.
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as hidden:
         temporary = Path(hidden) / target.name
         temporary.mkdir()
-        with closing(stream.blocks(jobs)) as blocks:
-            loudness = _write_sound(temporary / AUDIO_NAME, stream, blocks, heard, progress)
+        heard, loudness = _write_sound(temporary / AUDIO_NAME, stream, jobs, progress)
         write_array_xml(temporary / ARRAY_NAME, stream.array)
         _write_beside(temporary, stream, loudness)
         put_in_place(target, temporary)
@@ -213,24 +202,23 @@ def write_stream(
 
 
 def _write_sound(
-    path: Path,
-    stream: DrawnStream,
-    blocks: Iterator[Block],
-    heard: Spectrogram,
-    progress: Callable[[float], None] | None,
-) -> dict[int, FloatArray]:
-    """Write the blocks as they come; return the loudness of all events."""
+    path: Path, stream: DrawnStream, jobs: int, progress: Callable[[float], None] | None
+) -> tuple[Spectrogram, dict[int, FloatArray]]:
+    """Write the blocks as they come; return what one channel hears, and the loudness of all events."""
     microphones, settings = stream.scene.microphones, stream.scene.settings
     channels, rate = len(microphones.positions_m), settings.sample_rate_hz
-    loudness: dict[int, FloatArray] = {}
-    with sound_writer(path, settings.samples, channels, rate) as file:
+    heard, loudness = Spectrogram(rate), dict[int, FloatArray]()
+    with (
+        sound_writer(path, settings.samples, channels, rate) as file,
+        closing(stream.blocks(jobs)) as blocks,
+    ):
         for block in blocks:
             file.write(stream.recorded(block))
             heard.add(block.pressure_pa[stream.array.middle])
             loudness |= block.loudness_db
             if progress is not None:
                 progress(block.pressure_pa.shape[1] / rate)
-    return loudness
+    return heard, loudness
 
 
 def _write_beside(folder: Path, stream: DrawnStream, loudness: dict[int, FloatArray]) -> None:

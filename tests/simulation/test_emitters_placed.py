@@ -34,7 +34,7 @@ from worldstate.simulation.scene.settings import SIGNALS, sound_kind, with_sound
 from worldstate.simulation.scene.vehicle import drive
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.receiver import Receiver
-from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 FS = 8_000.0
 OPEN = Site("Open1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, in_the_open=True)
@@ -65,7 +65,7 @@ def heard(sound, positions_m=ONE, plan=OPEN, seed=1, seconds=1.0, fs=FS):
     receiver = listener(positions_m, seconds, fs)
     out = np.zeros((len(positions_m), receiver.samples), np.float32)
     static = StaticSources(out, fs)
-    add_sound(static, sound, plan, QUIET, receiver, np.random.default_rng(seed))
+    add_sound(StreetSound(static, plan, QUIET, receiver), sound, np.random.default_rng(seed))
     static.render()
     return out
 
@@ -186,7 +186,7 @@ def test_a_signal_of_a_vehicle_moves_with_it():
     )
     out = np.zeros((1, receiver.samples), np.float32)
     static = StaticSources(out, FS)
-    add_signal(static, "beeper", path, OPEN, QUIET, receiver, np.random.default_rng(2))
+    add_signal(StreetSound(static, OPEN, QUIET, receiver), "beeper", path, np.random.default_rng(2))
     static.render()
     frequencies, times, spectra = stft(out[0], FS, nperseg=2048, nfft=16384, noverlap=1024)
     band = (frequencies > 900) & (frequencies < 1300)

@@ -20,7 +20,12 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes, ego_noise
 from worldstate.simulation.sound.receiver import Receiver
-from worldstate.simulation.sound.static_field import StaticSources, plane_wave_delays, unit_vectors
+from worldstate.simulation.sound.static_field import (
+    StaticSources,
+    StreetSound,
+    plane_wave_delays,
+    unit_vectors,
+)
 
 FS = 8000.0
 
@@ -169,7 +174,7 @@ def passing(surface_db: float, bass_db: float) -> np.ndarray:
     heard_pa = StaticSources(np.zeros((1, 125 * KNOT_SAMPLES), np.float32), FS)
     receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), knots)
     path = drive(time, entry_s=1.0, entry_y_m=2.0, lane_x_m=8.0, speed_mps=6.0)
-    add_vehicle(heard_pa, plan, levels, path, receiver, np.random.default_rng(1))
+    add_vehicle(StreetSound(heard_pa, plan, levels, receiver), path, np.random.default_rng(1))
     heard_pa.render()
     f, power = scipy.signal.welch(heard_pa.out[0], FS, nperseg=1024)
     bands = [power[(f > 0.71 * middle) & (f < 1.41 * middle)].sum() for middle in (125.0, 1000.0)]

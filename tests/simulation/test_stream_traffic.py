@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.commissioning.stream_figure import FLOWS
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation import preset, site
+from worldstate.simulation import site
 from worldstate.simulation.scene.junction import place
 from worldstate.simulation.scene.kinds import LIGHT, vehicle_kind
 from worldstate.simulation.scene.settings import SoundSettings
@@ -23,7 +23,7 @@ from worldstate.simulation.stream.arrivals import (
     draw_events,
     draw_sounds,
 )
-from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, drive_along, emerges
+from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, emerges
 from worldstate.simulation.stream.settings import HAZARDS, StreamSettings, Traffic, traffic_named
 from worldstate.simulation.stream.truth import (
     CLUTTER_IMAGES,
@@ -38,14 +38,16 @@ NEVER_SEEN = {"turns_away", "parks", "far"}
 
 
 def events_of(name: str, where: str, seed: int, duration_s: float = 3600.0) -> list[VehicleEvent]:
-    return draw_events(site(where), traffic_named(name), preset(), duration_s, np.random.default_rng(seed))
+    settings = StreamSettings(site(where), duration_s / 60.0, traffic=traffic_named(name))
+    return draw_events(settings, np.random.default_rng(seed))
 
 
 def test_counts_of_every_flow_are_poisson_over_seeds() -> None:
     rates = {"left": 120.0, "far": 300.0, "turns_away": 60.0}
-    traffic, seeds, hours = Traffic("test", rates), 40, 0.05
+    seeds, hours = 40, 0.05
+    settings = StreamSettings(site("SB1"), 60.0 * hours, traffic=Traffic("test", rates))
     counts = [
-        Counter(e.flow for e in draw_events(site("SB1"), traffic, preset(), 3600.0 * hours, rng))
+        Counter(e.flow for e in draw_events(settings, rng))
         for rng in map(np.random.default_rng, range(seeds))
     ]
     for flow, rate in rates.items():
@@ -147,7 +149,8 @@ def test_who_stops_brakes_stands_and_goes_on_as_mechanics_says(
     cruise: float, stop: float, stands_s: float
 ) -> None:
     route = along([[6.0, 0.0], [6.0, -1.0]])
-    motion = drive_along(route, (0.0, 90.0), cruise, [SpeedLimit(stop, 0.0, stands_s)], LIGHT, -1)
+    driver = Driver(site("SB1"), LIGHT, "left", cruise, 0.0, 90.0)
+    motion = driver.motion(route, (0.0, 90.0), [SpeedLimit(stop, 0.0, stands_s)])
     brake, away = cruise**2 / (2 * 2.0), cruise**2 / (2 * 1.5)
     before = (stop - brake) / cruise + cruise / 2.0 if brake < stop else None
     if before is not None:
@@ -163,7 +166,7 @@ def test_who_stops_brakes_stands_and_goes_on_as_mechanics_says(
 
 def test_boxes_follow_what_is_in_view_with_misses_and_clutter() -> None:
     settings = StreamSettings(site("SB1"), 10.0, traffic=Traffic("test", {"left": 240.0}, kinds={"light": 1}))
-    events = draw_events(settings.site, settings.traffic, preset(), 600.0, np.random.default_rng(2))
+    events = draw_events(settings, np.random.default_rng(2))
     frames = detected_frames(settings, events, [], np.random.default_rng(1))
     alone = detected_frames(settings, [], [], np.random.default_rng(1))
     assert len(frames) == len(alone) == 6000
@@ -212,9 +215,7 @@ def test_streams_refuse_what_they_cannot_be() -> None:
 def test_signals_are_the_vehicles_own_and_bells_those_of_riders() -> None:
     shares = {"siren": 0.3, "bicycle-bell": 0.5}
     settings = StreamSettings(site("SB1"), 120.0, traffic=replace(traffic_named("busy"), signals=shares))
-    events = draw_events(
-        settings.site, settings.traffic, settings.preset, settings.duration_s, np.random.default_rng(4)
-    )
+    events = draw_events(settings, np.random.default_rng(4))
     leaders = [event for event in events if event.flow not in ("follows", "far")]
     riders = {
         rides: [one for one in leaders if (one.manoeuvre.motion.kind.name in ("bicycle", "scooter")) == rides]

@@ -10,14 +10,9 @@ example: worldstate demo --out out/demo --seed 7
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from worldstate import adapters, simulation
 from worldstate.cli.common import listening, output, progress
-
-if TYPE_CHECKING:
-    import numpy as np
-
 
 # Louder than a car, so that the first recording that a newcomer sees is not a marginal one.
 VAN_OVER_CAR_DB = 6.0
@@ -39,21 +34,17 @@ def simulate_approach(root: Path, seed: int) -> Path:
     from worldstate.simulation.dataset.dataset import write_log
 
     rng = np.random.default_rng(seed)
-    settings = _delivery_van(rng)
+    # An easy approach: a van, louder than a car, at 20 to 29 km/h without braking.
+    site, side = str(rng.choice(simulation.SITES)), str(rng.choice(("left", "right")))
+    drawn = simulation.draw_settings(site, side, rng)
+    louder = replace(drawn.preset, vehicle_level_db=drawn.preset.vehicle_level_db + VAN_OVER_CAR_DB)
+    settings = replace(drawn, speed_mps=rng.uniform(5.5, 8.0), braking_mps2=0.0, preset=louder)
     root.mkdir(parents=True, exist_ok=True)
     with progress.progress_bar(f"simulating {settings.duration_s:g} s at {settings.site.name}", None):
         recording = simulation.simulate_recording(settings, rng)
         row = simulation.write_recording(root, recording)
     write_log(root, [row])
     return root / row.folder
-
-
-def _delivery_van(rng: "np.random.Generator") -> "simulation.SimulationSettings":
-    """Return an easy approach: a van, louder than a car, at 20 to 29 km/h without braking."""
-    site, side = str(rng.choice(simulation.SITES)), str(rng.choice(("left", "right")))
-    drawn = simulation.draw_settings(site, side, rng)
-    louder = replace(drawn.preset, vehicle_level_db=drawn.preset.vehicle_level_db + VAN_OVER_CAR_DB)
-    return replace(drawn, speed_mps=rng.uniform(5.5, 8.0), braking_mps2=0.0, preset=louder)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:

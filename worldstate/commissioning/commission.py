@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -334,20 +334,10 @@ def _examined(model: Model, heard: HeardStream) -> ExaminedStream:
 
 
 def exam_of_mountings(
-    array: MicrophoneArray,
-    model: Model,
-    settings: CommissionSettings,
-    folder: Path,
-    *,
-    jobs: int = 1,
-    on_step: Callable[[], None] = lambda: None,
-) -> dict[str, list[ExaminedStream]]:
-    """Let a model hear one junction of the exam as it would believe each wrong mounting of its array."""
+    array: MicrophoneArray, model: Model, settings: CommissionSettings, folder: Path, jobs: int = 1
+) -> Iterator[dict[str, ExaminedStream]]:
+    """Let a model hear each stream of a junction as it would believe every wrong mounting of its array."""
     mounted = mountings(array, np.random.default_rng(settings.seed))
-    examined: dict[str, list[ExaminedStream]] = {name: [] for name in mounted}
     hear = partial(_heard, array, list(mounted.values()), folder)
     for heard in in_processes(hear, mounting_streams(settings), jobs):
-        for name, one in zip(mounted, heard, strict=True):
-            examined[name].append(_examined(model, one))
-        on_step()
-    return examined
+        yield {name: _examined(model, one) for name, one in zip(mounted, heard, strict=True)}

@@ -34,7 +34,7 @@ from worldstate.simulation.stream.close_sounds import (
     idling_vehicle,
     recorded,
 )
-from worldstate.simulation.stream.rendering import Microphones, ambience_piece, event_sound, stream_ambience
+from worldstate.simulation.stream.rendering import Microphones, StreamScene, ambience_piece, event_sound
 from worldstate.simulation.stream.settings import StreamSettings
 
 from .heard_stream import HeardStream, junction_named
@@ -169,7 +169,9 @@ def _vehicle(
 def _rows_of_sound(
     settings: StreamSettings, kind: str, position_m: FloatArray, rng: np.random.Generator
 ) -> SoundRows:
-    sound, ambience = _rendered(settings, kind, position_m, rng)
+    empty = SimulationSettings(settings.site, "none", duration_s=SOUND_S)
+    drawn = replace(with_sounds(empty, [kind], 1, rng).sounds[0], start_s=SOUND_MARGIN_S, duration_s=SOUND_S)
+    sound, ambience = event_and_ambience(settings, SoundEvent(drawn, 0.0), position_m, rng)
     loud, calm = (loudness(part, settings.sample_rate_hz) for part in (sound, ambience))
     louder_half = np.sort(loud)[len(loud) // 2 :].mean() + np.finfo(float).tiny
     gain = np.sqrt(10.0 ** (rng.uniform(*SNR_DB) / 10.0) * calm.mean() / louder_half)
@@ -179,15 +181,6 @@ def _rows_of_sound(
     audible = ratio[usable] >= 10.0 ** (AUDIBLE_DB / 10.0)
     names = (np.full(int(audible.sum()), name) for name in (kind, settings.site.name))
     return SoundRows(measures[audible, : len(MEASURES)], *names)
-
-
-def _rendered(
-    settings: StreamSettings, kind: str, position_m: FloatArray, rng: np.random.Generator
-) -> tuple[Float32Array, Float32Array]:
-    """Return a sound alone and the ambience alone, shape (samples,), of full scale 1."""
-    empty = SimulationSettings(settings.site, "none", duration_s=SOUND_S)
-    drawn = replace(with_sounds(empty, [kind], 1, rng).sounds[0], start_s=SOUND_MARGIN_S, duration_s=SOUND_S)
-    return event_and_ambience(settings, SoundEvent(drawn, 0.0), position_m, rng)
 
 
 def event_and_ambience(
@@ -201,8 +194,9 @@ def event_and_ambience(
     alone = Microphones(position_m[None], np.zeros(1), np.ones(1), settings.sample_rate_hz)
     with one_blas_thread():
         sound = event_sound(event, settings.site, settings.preset, alone, rng).pressure_pa
-        here, samples = stream_ambience(settings, rng), sound.shape[1] + round(lead_s * alone.sample_rate_hz)
-        ambience = ambience_piece(settings, here, alone, samples, rng, begins=True)[0, :samples]
+        scene = StreamScene.drawn(settings, alone, rng)
+        samples = sound.shape[1] + round(lead_s * alone.sample_rate_hz)
+        ambience = ambience_piece(scene, samples, rng, begins=True)[0, :samples]
         if not settings.ego.stands:
             # Driving all the time: what stands is learned from the end of the drives.
             speed = np.full(samples, rng.uniform(*EGO_SPEEDS_MPS))
@@ -220,9 +214,8 @@ def characters(sound: AnyArray, sample_rate_hz: float) -> tuple[FloatArray, Bool
         character.push(hop)
         read.append(character.read())
     usable = np.array([not isinstance(one, NotUsable) for one in read])
-    return np.array([one for one in read if not isinstance(one, NotUsable)]).reshape(
-        -1, len(MEASURES) + len(BANDS)
-    ), usable
+    heard = np.array([one for one in read if not isinstance(one, NotUsable)])
+    return heard.reshape(-1, len(MEASURES) + len(BANDS)), usable
 
 
 def heard_characters(stream: HeardStream) -> tuple[FloatArray, BoolArray]:

@@ -20,7 +20,8 @@ from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.hop_spectra import NoiseMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground import InvalidArgumentError
+from worldstate.ground.checks import check_ranges
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES, Site, drawn_site, ego_moves, site
@@ -93,13 +94,10 @@ class CommissionSettings:
         return MOVING_SITES if self.moving_ego else SITES
 
     def __post_init__(self) -> None:
-        in_range("junctions", self.junctions, 2, 200)
+        check_ranges(self, junctions=(2, 200))
         # Of less there are streams without vehicles, and nothing is learned.
-        in_range("approach_minutes", self.approach_minutes, 0.9, 120.0)
-        in_range("hazard_free_minutes", self.hazard_free_minutes, 0.5, 120.0)
-        in_range("exam_minutes", self.exam_minutes, 0.5, 160.0)
-        in_range("onsets_per_hour", self.onsets_per_hour, 0.1, 3600.0)
-        in_range("seed", self.seed, 0, SEEDS_EACH - 1)
+        check_ranges(self, approach_minutes=(0.9, 120.0), hazard_free_minutes=(0.5, 120.0))
+        check_ranges(self, exam_minutes=(0.5, 160.0), onsets_per_hour=(0.1, 3600.0), seed=(0, SEEDS_EACH - 1))
 
 
 def quick_settings(settings: CommissionSettings) -> CommissionSettings:

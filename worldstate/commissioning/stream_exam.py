@@ -146,7 +146,7 @@ def examine(streams: Sequence[ExaminedStream]) -> Figures:
     found |= loud.sides()
     found["onsets_after"] = mean_of([one.onsets_after for one in loud.outcomes])
     found |= _ranking(streams) | loud.false_alarms() | _worst(streams)
-    return found | _calibration(streams) | _times(streams) | _by_kind(every.outcomes)
+    return found | _calibration(streams) | _by_kind(every.outcomes)
 
 
 def alarm_outcomes(
@@ -213,7 +213,8 @@ def _worst(streams: Sequence[ExaminedStream]) -> Figures:
 def _calibration(streams: Sequence[ExaminedStream]) -> Figures:
     within = np.concatenate([one.posterior.within().reshape(-1, len(HORIZONS_S)) for one in streams])
     coming_s = np.concatenate([one.truth.coming_s.reshape(-1) for one in streams])
-    return chance_figures(within, coming_s)
+    stated = np.concatenate([one.posterior.time_to_visible_s().reshape(-1, 3) for one in streams])
+    return chance_figures(within, coming_s) | time_figures(stated, coming_s)
 
 
 def chance_figures(within: FloatArray, coming_s: FloatArray) -> Figures:
@@ -224,11 +225,6 @@ def chance_figures(within: FloatArray, coming_s: FloatArray) -> Figures:
         found[f"skill_{horizon_s:g}s"] = brier_skill(said, true)
         found[f"ece_{horizon_s:g}s"] = expected_calibration_error(said, true)
     return found
-
-
-def _times(streams: Sequence[ExaminedStream]) -> Figures:
-    stated = np.concatenate([one.posterior.time_to_visible_s().reshape(-1, 3) for one in streams])
-    return time_figures(stated, np.concatenate([one.truth.coming_s.reshape(-1) for one in streams]))
 
 
 def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:

@@ -99,6 +99,18 @@ def in_range(
     return number
 
 
+def check_ranges(instance: object, **ranges: tuple[float, float]) -> None:
+    """Refuse fields of a dataclass outside their ranges, ends included; they stay as they were given.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> check_ranges(SimpleNamespace(speed_mps=8.0, stop_s=4), speed_mps=(0.0, 20.0), stop_s=(0.0, 120.0))
+    """
+    for name, (low, high) in ranges.items():
+        in_range(name, getattr(instance, name), low, high)
+
+
 def pair(name: str, value: ArrayLike, largest: float) -> tuple[float, float]:
     """Return two numbers, neither of which exceeds `largest` in size.
 

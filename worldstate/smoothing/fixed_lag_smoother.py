@@ -313,9 +313,8 @@ class FixedLagSmoother:
         before = f.Node(key, self._graph.value(key))
         state = obs.moved(before.state, step_s)
         after = f.Node(self._add_state(one, stamp_ns, state), state)
-        self._graph.factors.append(
-            f.motion_factor(before, after, step_s, f.motion_noise(self.settings, step_s))
-        )
+        noise = f.motion_noise(self.settings, step_s)
+        self._graph.factors.append(f.motion_factor(before, after, step_s, noise))
 
     def _node(self, one: _Entity, stamp_ns: int) -> f.Node:
         """Return the state nearest to a stamp."""
@@ -343,9 +342,8 @@ class FixedLagSmoother:
         if one.height_key is None:
             one.height_key, start = next(self._numbers), np.array([math.log(said.true_height_m)])
             self._graph.add_variable(one.height_key, start, self._time_s(self._now_ns))
-            self._graph.factors.append(
-                f.prior_factor(one.height_key, start, np.array([[said.true_relative_std**2]]))
-            )
+            variance = np.array([[said.true_relative_std**2]])
+            self._graph.factors.append(f.prior_factor(one.height_key, start, variance))
         return one.height_key
 
     def _keep_heights(self) -> None:

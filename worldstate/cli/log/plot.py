@@ -14,15 +14,10 @@ Examples
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from worldstate import ground, operations
 from worldstate.cli.common import command, inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
-
-if TYPE_CHECKING:
-    from worldstate.operations.viewing.state_figure import SoundPower
-    from worldstate.state import WorldState
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.state_log import read_log
-    from worldstate.operations.viewing.state_figure import check_gif, write_animation, write_birds_eye
+    from worldstate.operations.viewing import state_figure
 
     asked = arguments.out, arguments.birds_eye, arguments.animate
     if not any(asked):
@@ -50,30 +45,25 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     output.check_outputs(arguments, "animate", figures=("out", "birds_eye"))
     command.check_beside(arguments, recording="out", time="birds_eye")
     if arguments.animate is not None:
-        check_gif(arguments.animate)
+        state_figure.check_gif(arguments.animate)
     states, title = [state for _, state in read_log(arguments.log)], arguments.log.name
     shown = max(states, key=lambda state: state.risk)
     if arguments.time is not None:
         shown = min(states, key=lambda state: abs(state.stamp_ns - ground.nanoseconds(arguments.time)))
     if arguments.out is not None:
-        arguments.input = arguments.recording
-        sound = _sound(arguments, states) if arguments.input else None
+        arguments.input, sound = arguments.recording, None
+        if arguments.recording:
+            with (
+                inputs.opened_front_end(arguments) as (audio, front_end),
+                progress.progress_bar("listening", audio.duration_s) as bar,
+            ):
+                sound = state_figure.sound_power(audio, front_end, states, on_second=bar.advance)
         operations.write_state_figure(states, arguments.out, title=title, sound=sound)
     if arguments.birds_eye is not None:
-        write_birds_eye(shown, arguments.birds_eye, title=title)
+        state_figure.write_birds_eye(shown, arguments.birds_eye, title=title)
     if arguments.animate is not None:
         with progress.progress_bar("drawing", len(states)) as bar:
-            write_animation(states, arguments.animate, title=title, on_frame=bar.advance)
+            state_figure.write_animation(states, arguments.animate, title=title, on_frame=bar.advance)
     written = [str(path) for path in asked if path is not None]
     shown_s = ground.seconds(shown.stamp_ns)
     return output.CommandResult({"states": len(states), "birds_eye_s": shown_s, "written": written})
-
-
-def _sound(arguments: argparse.Namespace, states: "list[WorldState]") -> "SoundPower":
-    from worldstate.operations.viewing.state_figure import sound_power
-
-    with (
-        inputs.opened_front_end(arguments) as (audio, front_end),
-        progress.progress_bar("listening", audio.duration_s) as bar,
-    ):
-        return sound_power(audio, front_end, states, on_second=bar.advance)

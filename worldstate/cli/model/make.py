@@ -113,11 +113,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     # The figures of the 56 microphones are those of a standing ego.
     told, lines = report if settings.moving_ego else stream_exam.beside_reference(report), list[str]()
     if arguments.mounting_errors:
-        with progress.progress_bar("mounting", len(heard_stream.mounting_streams(settings))) as bar:
-            heard = commission.exam_of_mountings(
-                array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance
-            )
-        mounted = {name: stream_exam.exam_figures(streams) for name, streams in heard.items()}
+        heard = commission.exam_of_mountings(array, model, settings, folder, arguments.jobs)
+        every = list(progress.track(heard, "mounting", len(heard_stream.mounting_streams(settings))))
+        mounted = {name: stream_exam.exam_figures([one[name] for one in every]) for name in every[0]}
         report["mounting"] = mounted
         lines += ["", *stream_exam.mounting_lines(mounted)]
     if not settings.moving_ego:

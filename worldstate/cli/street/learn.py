@@ -56,7 +56,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.operations.labelling.street_passes import streets_after, write_street
 
-    _check(arguments)
+    ground.in_range("--days", arguments.days, 0.0, 1e5)
+    sensors.check_boxes(arguments, len(arguments.input))
+    # What is known may be written over: it is read before, and its passes are kept.
+    apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})
+    output.check_outputs(apart, "out", figures=("figure",))
     before = street = _known(arguments)
     stages: list[LearnedStreet] = []
     for one in progress.track(arguments.input, "learning", len(arguments.input)):
@@ -69,14 +73,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     found = {"out": str(arguments.out), "n_passes": len(stages), "arms": arms, "sides_heard": heard}
     lines = [*(_line(arm) for arm in street.arms), _heard(street)]
     return output.CommandResult(found, {key: found[key] for key in ("out", "n_passes")}, lines)
-
-
-def _check(arguments: argparse.Namespace) -> None:
-    ground.in_range("--days", arguments.days, 0.0, 1e5)
-    sensors.check_boxes(arguments, len(arguments.input))
-    # What is known may be written over: it is read before, and its passes are kept.
-    apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})
-    output.check_outputs(apart, "out", figures=("figure",))
 
 
 def _known(arguments: argparse.Namespace) -> "LearnedStreet":

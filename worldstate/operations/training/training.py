@@ -34,12 +34,7 @@ from worldstate.ground.extras import check_extra
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 from worldstate.operations.metrics.approach_table import auroc
 
-from .site_references import (
-    STREAMS,
-    asked_while_listening,
-    learned_while_listening,
-    with_site_references,
-)
+from .site_references import STREAMS, asked_while_listening, learned_while_listening, with_site_references
 
 FitMap = Callable[[ArrayLike, ArrayLike], RiskMap]
 
