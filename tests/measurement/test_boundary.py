@@ -305,6 +305,12 @@ def test_numbers_written_as_text_are_no_numbers(text):
         checks.finite_array("position_m", text, (2,))
 
 
+@pytest.mark.parametrize("check", [checks.finite_array, checks.finite_complex])
+def test_rows_of_different_lengths_are_no_array(check):
+    with pytest.raises(InvalidArgumentError, match="spectra: expected numbers, got list"):
+        check("spectra", [[1.0, 2.0], [3.0]], (None, None))
+
+
 @pytest.mark.parametrize("turns", range(-3, 4))
 def test_angles_beside_half_a_turn_stay_in_their_range(turns):
     half = (2 * turns + 1) * math.pi

@@ -44,7 +44,10 @@ def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> 
     >>> finite_complex("spectra", [[1, 1j]], (None, 2)).shape
     (1, 2)
     """
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # Rows of different lengths
+        raise InvalidArgumentError(f"{name}: expected numbers, got {type(value).__name__}") from error
     if array.dtype.kind not in "biufc":
         raise InvalidArgumentError(f"{name}: expected numbers, got {array.dtype}")
     check_shape(name, array.shape, shape)
