@@ -21,10 +21,12 @@ from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras, Visi
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.fixed_lag import Timed
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.settings import HOP_RATE_HZ
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError
 from worldstate.ground.checks import one_of
 from worldstate.ground.typing import Float32Array
+from worldstate.ground.values import seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
 
@@ -209,6 +211,15 @@ class Listener:
     def add(self, *told: Timed) -> None:
         """Take odometry, positions or measurements of other sensors; each counts from its own stamp on."""
         self._waiting.add(told)
+
+    def skip(self, lost_ns: int) -> None:
+        """Let time go on by so many nanoseconds of sound that were lost and are not pushed as silence.
+
+        Nine tenths of a second of silence before it let the snapshot say that samples were lost.
+        """
+        self._adapter.front_end.skip(lost_ns)
+        if isinstance(self._reader, SequenceReader):
+            self._reader.miss(int(seconds(lost_ns) * HOP_RATE_HZ))
 
     def refuse(self, inputs: int) -> None:
         """Count so many inputs that were refused before they reached the belief."""

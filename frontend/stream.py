@@ -276,6 +276,25 @@ class FrontEnd:
         """Return the results of a hop that has ended and waits for later samples, 16 ms at most."""
         return [] if self._resampler is None else self._process_hops(self._resampler.flush())
 
+    def skip(self, lost_ns: int) -> None:
+        """Let time go on by sound that was lost: all later stamps are so many nanoseconds later.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If it is negative.
+
+        Examples
+        --------
+        >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
+        >>> front_end = FrontEnd(array, 8000)
+        >>> front_end.skip(2_000_000_000)
+        >>> [frame.stamp_ns for frame in front_end.process(np.zeros((8000, 3)))]
+        [3000000000]
+        """
+        in_range("lost_ns", lost_ns, 0, 10**18)
+        self._start_ns += lost_ns
+
     def learn_ego_noise(self, none_probability: float) -> None:
         """Set the probability that no source is present, with which the sound is learned as ego-noise.
 

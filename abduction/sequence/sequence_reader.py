@@ -111,12 +111,13 @@ class SequenceReader:
         self.street = street  # Where sides are learned
         self.history = history or SequenceHistory()  # All that is carried; `Checkpoint` writes it to disk
 
-    def miss(self) -> None:
-        """Pass a hop that could not be heard; nothing is learned from it."""
+    def miss(self, hops: int = 1) -> None:
+        """Pass hops that could not be heard; nothing is learned from them."""
         # Ten simulated demos, one second lost: the probability that a vehicle comes is off by .04 in the
         # first half second that is heard again and by .02 in the next. With the last hop heard in place of
         # each lost one it was .08 and .03, with nothing kept there was no reading for a second.
-        self.history = self.history.missed_hop()
+        for _ in range(min(hops, inputs.RECENT_HOPS)):
+            self.history = self.history.missed_hop()
         if self.street is not None and not self.history.hops:
             self.street.interrupt()
 

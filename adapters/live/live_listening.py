@@ -40,8 +40,11 @@ def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[
     if not isinstance(sound, LiveSound):
         got = source.audio_path
         raise InvalidArgumentError(f"source: expected one whose sound is a LiveSound, got {got}")
-    told = 0
+    told, start_ns = 0, sound.start_ns
     for listener, block in listened(source):
+        if sound.start_ns > start_ns:
+            listener.skip(sound.start_ns - start_ns)
+            start_ns = sound.start_ns
         listener.refuse(sum(one(listener) for one in hand_in) + sound.refused - told)
         told = sound.refused
         for step in listener.steps(block):

@@ -14,6 +14,7 @@ import soundfile
 
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.files.file_io import set_aside
+from worldstate.frontend.settings import HOP_RATE_HZ
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range, nanoseconds
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array
@@ -92,6 +93,14 @@ class BoundedChannel(Generic[T]):
                 self._raise_failure()
             return taken
 
+    def take_newest(self, taken: T) -> T:
+        """Return the newest item that waits, or `taken` if none does; what it passes over is dropped."""
+        with self._changed:
+            self.dropped += len(self._items)
+            newest = self._items.pop() if self._items else taken
+            self._items.clear()
+            return newest
+
     def close(self, error: BaseException | None = None) -> None:
         """Say that nothing more comes; an error is raised where it is taken, once nothing waits."""
         with self._changed:
@@ -110,6 +119,11 @@ BLOCKS_PER_SECOND = 40
 # Seconds of sound that wait at most. A short stall of the machine is made up for; a state that comes later
 # than this is no warning, and what is older is dropped.
 LONGEST_WAIT_S = 2.0
+# So much of lost sound is heard as silence, and up to a hop more: a window in which the snapshot says that
+# samples were lost, and not yet that microphones are dead. Silence takes as long to hear as sound, so that a
+# machine that is too slow would fall behind by all that it loses. Of a longer gap the rest is left out, and
+# with it all that waits: what follows is heard in one piece.
+HEARD_SILENCE_S = 0.9
 # A longer gap is no lost block but a device that slept: its zeros would take minutes to work off.
 LONGEST_GAP_S = 60.0
 # A device that has given nothing for so long has stalled; with the hop its state is out within a second.
@@ -185,9 +199,10 @@ class LiveSound(Audio):
     Attributes
     ----------
     start_ns : int
-        Time of the first sample on the stream's clock: not 0 where a belief is resumed.
+        Time of the first sample on the stream's clock: not 0 where a belief is resumed. Later by what was
+        left out of the sound since.
     lost_samples : int
-        Samples a channel that were lost on the way and are zeros in what `blocks` gave.
+        Samples a channel that were lost on the way; `blocks` gave zeros for a second of each gap at most.
     refused : int
         Blocks of another shape, repeated, or numbered back or far ahead, and blocks in which samples were no
         numbers or impossible ones, which are zeros in what `blocks` gave.
@@ -235,6 +250,8 @@ class LiveSound(Audio):
                     block = SoundBlock(np.zeros((0, 0), np.float32), 0, 0.0)
                 if block is None:
                     return
+                if 1.0 < self._missing(block) / self.sample_rate_hz <= LONGEST_GAP_S:
+                    block = self._channel.take_newest(block)
                 given: Iterator[Float32Array]
                 if len(block.samples) and self._fits(block):
                     captured_s, given = block.captured_s, self._sound(block)
@@ -272,37 +289,48 @@ class LiveSound(Audio):
         since_s = (captured_s - self._captured_s) * self._feed.speed
         return self.start_ns + nanoseconds(self.frames / self.sample_rate_hz + since_s)
 
+    def _missing(self, block: SoundBlock) -> int:
+        """Return how many samples are missing between what was given and a block."""
+        behind = self.frames - block.first if self._behind is None else self._behind
+        return block.first + behind - self.frames
+
     def _fits(self, block: SoundBlock) -> bool:
         """Return whether a block is the next one of the stream; count it where it is not."""
-        behind = self.frames - block.first if self._behind is None else self._behind
-        missing = block.first + behind - self.frames
         # Zeros already stand for what a device has held back while it stalled.
         late = self._behind is None and block.captured_s <= self._captured_s
         if (
             late
             or block.samples.shape[1:] != (self.channels,)
-            or not 0 <= missing <= LONGEST_GAP_S * self.sample_rate_hz
+            or not 0 <= self._missing(block) <= LONGEST_GAP_S * self.sample_rate_hz
         ):
             self.refused += 1
             return False
-        self._behind = behind
+        self._behind = self._missing(block) + self.frames - block.first
         return True
 
     def _sound(self, block: SoundBlock) -> Iterator[Float32Array]:
         """Yield a block that fits, after zeros for what was lost before it."""
-        yield from self._zeros(block.first + (self._behind or 0) - self.frames)
+        yield from self._zeros(self._missing(block))
         usable = np.abs(block.samples) <= LARGEST_SAMPLE
         self.refused += not usable.all()
         # Only where it is: a microphone that gives no numbers is one that is silent, and the others hear.
         yield block.samples if usable.all() else np.where(usable, block.samples, np.float32(0.0))
 
     def _zeros(self, missing: int) -> Iterator[Float32Array]:
-        """Yield zeros, at most a second at a time, in place of what was lost."""
+        """Yield zeros, a second at most, in place of what was lost; by the rest the stream begins later."""
         self.lost_samples += missing
-        while missing > 0:
-            some = min(missing, self.sample_rate_hz)
-            yield np.zeros((some, self.channels), np.float32)
-            missing -= some
+        # Whole hops, so that stamps stay on their grid.
+        hops = max(int(HOP_RATE_HZ * (missing / self.sample_rate_hz - HEARD_SILENCE_S)), 0)
+        left_out = round(hops * self.sample_rate_hz / HOP_RATE_HZ)
+        if missing > left_out:
+            yield np.zeros((missing - left_out, self.channels), np.float32)
+        self.start_ns += nanoseconds(hops / HOP_RATE_HZ)
+        if self._behind is not None:
+            self._behind -= left_out
+        while self._keep is not None and left_out > 0:
+            some = min(left_out, self.sample_rate_hz)
+            self._keep(np.zeros((some, self.channels), np.float32))
+            left_out -= some
 
 
 @contextmanager

@@ -66,6 +66,20 @@ def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Mode
         assert states + rest == in_one
 
 
+def test_after_a_loss_that_is_skipped_its_window_is_told_and_the_time_is_right(model: Model) -> None:
+    silence = np.zeros((round(0.9 * RATE_HZ), 3), np.float32)
+    listener = Listener(ARRAY, RATE_HZ, model=model)
+    listener.push(np.concatenate([SOUND, silence]))
+    listener.skip(4 * 10**9)
+    told = {one.stamp_ns: one.heard[0] for one in listener.push(SOUND)}
+    # The last hop of the silence waits in the resampler for what follows.
+    assert list(told) == [nanoseconds(7.9 + 0.1 * hop) for hop in range(30)]
+    lost_s = [stamp_ns / 1e9 for stamp_ns, heard in told.items() if heard.reason == "lost samples"]
+    # As of a second of silence: in one window.
+    assert 0.8 <= max(lost_s) - min(told) / 1e9 <= 1.0
+    assert list(told.values())[-1].share == 1.0
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("size", [1, 37, 480, 48_000])
 def test_states_are_those_of_run_for_blocks_of_any_size(

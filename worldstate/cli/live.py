@@ -298,7 +298,7 @@ def _listen(
                 break
     return {
         "states": warnings.states,
-        "sound_s": sound.frames / sound.sample_rate_hz,
+        "sound_s": ground.seconds(sound.start_ns) - start_s + sound.frames / sound.sample_rate_hz,
         "overruns": sound.overruns,
         "lost_s": sound.lost_s,
         "latency_median_s": latency.quantile_s(0.5),
