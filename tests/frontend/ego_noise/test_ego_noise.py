@@ -97,13 +97,13 @@ def test_wind_knows_nothing_of_its_neighbour_and_the_vehicle_does(monkeypatch: p
 
 def test_the_engine_s_sound_arrives_when_geometry_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the engine, no wind, no road: two microphones, delay and level by hand."""
-    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._places", lambda: ENGINE_M[None])
+    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._PLACES_M", ENGINE_M[None])
     monkeypatch.setattr("worldstate.simulation.sound.ego_sound._add_wind", lambda *_: None)
     monkeypatch.setattr("worldstate.simulation.sound.ego_sound.ROAD_REFLECTION", 0.0)
     monkeypatch.setattr(
         "worldstate.simulation.sound.ego_sound._levels_db", lambda *_: [np.full((8, 9), 94.0)]
     )
-    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._line_shares", lambda: (0.0,))
+    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._LINE_SHARES", (0.0,))
     pair = np.array([[0.0, 0.4, 1.4], [0.0, -0.1, 2.2]])
     sound = ego_noise(pair, np.full(9 * 1024, 5.0), 48_000.0, np.random.default_rng(5))
     edge = np.stack([np.full(1201, 0.4), np.linspace(-0.6, 0.6, 1201), np.full(1201, 1.35)], axis=1)
