@@ -213,13 +213,33 @@ class Listener:
         self._waiting.add(told)
 
     def skip(self, lost_ns: int) -> None:
-        """Let time go on by so many nanoseconds of sound that were lost and are not pushed as silence.
+        """Let time go on by sound that was lost and is not pushed as silence.
 
-        Nine tenths of a second of silence before it let the snapshot say that samples were lost.
+        Push .9 s of silence before, so that the snapshot says that samples were lost.
+
+        Parameters
+        ----------
+        lost_ns : int
+            Length of the sound, nanoseconds.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If it is negative.
+
+        Examples
+        --------
+        >>> from worldstate.frontend.array.microphone_array import ovad_array
+        >>> import numpy as np
+        >>> listener = Listener(ovad_array(), 48_000)
+        >>> before = listener.push(np.zeros((48_000, 56)))
+        >>> listener.skip(2_000_000_000)
+        >>> [state.stamp_ns / 1e9 for state in listener.push(np.zeros((4_800, 56)))]
+        [3.1]
         """
         self._adapter.front_end.skip(lost_ns)
         if isinstance(self._reader, SequenceReader):
-            self._reader.miss(int(seconds(lost_ns) * HOP_RATE_HZ))
+            self._reader.miss(round(seconds(lost_ns) * HOP_RATE_HZ))
 
     def refuse(self, inputs: int) -> None:
         """Count so many inputs that were refused before they reached the belief."""

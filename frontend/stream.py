@@ -277,7 +277,12 @@ class FrontEnd:
         return [] if self._resampler is None else self._process_hops(self._resampler.flush())
 
     def skip(self, lost_ns: int) -> None:
-        """Let time go on by sound that was lost: all later stamps are so many nanoseconds later.
+        """Let time go on by sound that was lost and is not given as silence: all later stamps are later.
+
+        Parameters
+        ----------
+        lost_ns : int
+            Length of the sound, nanoseconds.
 
         Raises
         ------

@@ -124,7 +124,7 @@ LONGEST_WAIT_S = 2.0
 # machine that is too slow would fall behind by all that it loses. Of a longer gap the rest is left out, and
 # with it all that waits: what follows is heard in one piece.
 HEARD_SILENCE_S = 0.9
-# A longer gap is no lost block but a device that slept: its zeros would take minutes to work off.
+# A longer gap is no lost block but a device that slept.
 LONGEST_GAP_S = 60.0
 # A device that has given nothing for so long has stalled; with the hop its state is out within a second.
 STALL_S = 0.5
@@ -250,7 +250,8 @@ class LiveSound(Audio):
                     block = SoundBlock(np.zeros((0, 0), np.float32), 0, 0.0)
                 if block is None:
                     return
-                if 1.0 < self._missing(block) / self.sample_rate_hz <= LONGEST_GAP_S:
+                missing_s = self._missing(block) / self.sample_rate_hz
+                if HEARD_SILENCE_S + 1.0 / HOP_RATE_HZ < missing_s <= LONGEST_GAP_S:
                     block = self._channel.take_newest(block)
                 given: Iterator[Float32Array]
                 if len(block.samples) and self._fits(block):
@@ -291,8 +292,8 @@ class LiveSound(Audio):
 
     def _missing(self, block: SoundBlock) -> int:
         """Return how many samples are missing between what was given and a block."""
-        behind = self.frames - block.first if self._behind is None else self._behind
-        return block.first + behind - self.frames
+        # What the device counts after a stall says nothing of the time before.
+        return 0 if self._behind is None else block.first + self._behind - self.frames
 
     def _fits(self, block: SoundBlock) -> bool:
         """Return whether a block is the next one of the stream; count it where it is not."""
@@ -305,7 +306,8 @@ class LiveSound(Audio):
         ):
             self.refused += 1
             return False
-        self._behind = self._missing(block) + self.frames - block.first
+        if self._behind is None:
+            self._behind = self.frames - block.first
         return True
 
     def _sound(self, block: SoundBlock) -> Iterator[Float32Array]:
