@@ -154,7 +154,7 @@ def stated(made_up: HeardStream, chance: float, *, masked: bool = False) -> Pass
     none = np.zeros((n, 2), bool)
     within, times = np.full((n, 2, 4), chance), np.full((n, 2, 3), np.nan)
     follow = FollowedStream(
-        made_up.hops.time_s, none, none * 0.0, within, times, np.full(n, masked), ((),) * n, frozenset()
+        made_up.hops.time_s, none, none * 0.0, within, times, np.full(n, masked), ((),) * n, frozenset(), ()
     )
     return PassedStream(made_up, stream_truth(made_up), follow)
 

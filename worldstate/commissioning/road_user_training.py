@@ -149,7 +149,8 @@ def with_close(rows: RoadUserRows, close: SoundRows) -> RoadUserRows:
 
 def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
     """Fit a softmax to classes of equal weight, then let them be as frequent as in a town."""
-    rows = RoadUserRows.joined([_tilted(rows, tilt_db) for tilt_db in (0.0, -_TILT_DB, _TILT_DB)])
+    tilts = [replace(rows, measures=tilted(rows.measures, tilt_db)) for tilt_db in (-_TILT_DB, _TILT_DB)]
+    rows = RoadUserRows.joined([rows, *tilts])
     classes = rows.classes
     equal = 1.0 / np.bincount(classes, minlength=len(CLASSES))[classes]
     weights = equal * len(classes) / equal.sum()
@@ -159,9 +160,10 @@ def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
     return RoadUserModel((*MEASURES, *BANDS), CLASSES, *rounded)
 
 
-def _tilted(rows: RoadUserRows, tilt_db: float) -> RoadUserRows:
-    bands = rows.measures[:, len(MEASURES) :] + tilt_db * _NATS_OF_TILT
-    return replace(rows, measures=np.column_stack([rows.measures[:, : len(MEASURES)], bands]))
+def tilted(measures: FloatArray, tilt_db: float) -> FloatArray:
+    """Return numbers as heard by a recorder that rises by so much from the lowest band to the highest."""
+    bands = measures[:, len(MEASURES) :] + tilt_db * _NATS_OF_TILT
+    return np.column_stack([measures[:, : len(MEASURES)], bands])
 
 
 def town_shares(rows: RoadUserRows) -> FloatArray:

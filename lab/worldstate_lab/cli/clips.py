@@ -6,8 +6,9 @@ van, truck, tram, motorcycle, bicycle) or empty. A clip shorter than the memory 
 its mirror image. With --numbers they are read from an archive (`character`, `clip`: the line of the table).
 
 Printed by kind: in which share of the hops the sound is familiar, foreign or a warning signal, and the mean
-probability of each class of road users; over clips with a road_user the log-loss beside that of the shares
-of the table, to which the probabilities are corrected. Every recording counts alike.
+probability of each class of road users, and by how much any of these moves at most if the recorder rises or
+falls by 6 dB over the band; over clips with a road_user the log-loss beside that of the shares of the table,
+to which the probabilities are corrected. Every recording counts alike.
 
 With --simulated N so many clips of each kind are simulated, and how far their numbers are from the real ones
 is printed beside real against real (halves of the recordings): the median over the numbers of |AUROC - .5|,
@@ -33,6 +34,7 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import IDLING, rows_of_clip
 from worldstate.commissioning.recorded_clips import heard_clip
+from worldstate.commissioning.road_user_training import tilted
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
@@ -42,7 +44,7 @@ from worldstate_lab.streets.set_classifiers import boosted_area
 
 MOST_BYTES = 1 << 30
 NUMBERS = len(MEASURES) + len(BANDS)
-SAID, FOLDS = 0.9, 4
+SAID, FOLDS, TILT_DB = 0.9, 4, 6.0
 # Which of the simulator's kinds a kind of clip is held against.
 SIMULATED = {
     **{"car": ("light",), "tram": ("tram",), "engine_idling": tuple(f"idling {kind}" for kind in IDLING)},
@@ -108,6 +110,7 @@ def judged(clips: ClipNumbers, guard: DomainGuard, model: RoadUserModel) -> dict
     )
     shares = np.column_stack([familiar, foreign, 1.0 - familiar - foreign])
     said, kinds = model.probabilities(clips.measures), {}
+    moved = [model.probabilities(tilted(clips.measures, one)) for one in (-TILT_DB, TILT_DB)]
     for kind in dict.fromkeys(clips.kinds.tolist()):
         hops = (clips.kinds == kind)[clips.clip]
         told, users = (clips.by_recording(values, hops).tolist() for values in (shares, said))
@@ -115,6 +118,7 @@ def judged(clips: ClipNumbers, guard: DomainGuard, model: RoadUserModel) -> dict
             "recordings": len(np.unique(clips.recordings[clips.kinds == kind])),
             **dict(zip(("familiar", "foreign", "signal"), told, strict=True)),
             "road_users": dict(zip(model.classes, users, strict=True)),
+            "moved_by_tilt": max(np.abs(clips.by_recording(one - said, hops)).max() for one in moved),
         }
     return {"kinds": kinds, **_calibration(clips, model)}
 
@@ -198,11 +202,11 @@ def clip_lines(report: Mapping[str, Any]) -> list[str]:
     kinds = report["kinds"]
     users = list(next(iter(kinds.values()))["road_users"])
     lines = [f"{'kind':18}{'recordings':>11}{'familiar':>10}{'foreign':>9}{'signal':>8}  mean probability"]
-    lines.append(" " * 56 + "".join(f"  {name:10}" for name in users))
+    lines.append(" " * 56 + "".join(f"  {name:10}" for name in users) + "  moved by a tilt")
     for kind, one in kinds.items():
         told = f"{one['familiar']:10.2f}{one['foreign']:9.2f}{one['signal']:8.2f}"
         shares = "".join(f"  {share:<10.2f}" for share in one["road_users"].values())
-        lines.append(f"{kind:18}{one['recordings']:11}{told}{shares}")
+        lines.append(f"{kind:18}{one['recordings']:11}{told}{shares}  {one['moved_by_tilt']:.3f}")
     for kind, one in report.get("realism", {}).items():
         apart = f"{one['simulated']:.3f} simulated to real, {one['real']:.3f} real to real"
         told = f"classifier {one['simulated_c2st']:.2f}, {one['real_c2st']:.2f}"

@@ -23,6 +23,7 @@ STUDIES = {
         "table",
         "windows",
         "streams",
+        "bearings",
         "corpora",
         "planner",
         "ablations",

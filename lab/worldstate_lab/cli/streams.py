@@ -9,7 +9,8 @@ place was. Then, of the second vehicle from the other side and of the one behind
 chance to come within three seconds where it adds a decibel to the sound and where it adds less, and what
 becomes of its entity. How much it adds stands first, last the trade between naming both sides of two and the
 other side of one, and onsets an hour by kind of hazard-free traffic. "worst" is of the junctions with eight
-cases or more.
+cases or more. With --days, days are drawn from the streams, with as many false onsets as there are, as the
+budget allows and more: how often the watch calls the budget broken, and after how many hours.
 
 The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
 
@@ -17,6 +18,7 @@ Examples
 --------
   worldstate-lab streams streams/*-2001-*.npz --model my_model.json
   worldstate-lab streams streams/SA1-*.npz --model my_model.json --camera none --json
+  worldstate-lab streams streams/*-2001-*.npz --days 1000 --jobs 2
 """
 
 import argparse
@@ -24,11 +26,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
+from worldstate.commissioning.commission import parts_of
+from worldstate.ground.checks import in_range
 from worldstate.operations.metrics.approach_table import Figures
 from worldstate.simulation.parallel import in_processes
+from worldstate_lab.passes.budget_days import budget_days
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import (
     hearing_allows,
@@ -51,13 +58,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--sides", action=argparse.BooleanOptionalAction, default=True,
         help="learn what either arm sounds like from vehicles that come into view (default: on)",
     )  # fmt: skip
-    add("--seed", type=int, default=0, help="of the camera's misses (default: %(default)s)")
+    add("--days", type=int, default=0, metavar="N", help="of each kind, drawn from the streams")
+    add("--seed", type=int, default=0, help="of the camera's misses and of days (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    model = read_model(arguments.model)
+    model, days = read_model(arguments.model), in_range("--days", arguments.days, 0, 100_000)
     given = {"camera": arguments.camera, "seed": arguments.seed, "learns": arguments.sides}
     follow = partial(passed_stream, model=model, **given)
     streams: dict[str, list[PassedStream]] = {}
@@ -73,6 +81,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     lines = ["dB that a second vehicle adds, so long before its own T0", *figure_lines(added, ".1f"), ""]
     lines += [*figure_lines(columns, ".3f"), "", "sides named by risk", *figure_lines(sides, ".3f")]
     lines += ["", "without hazards", *figure_lines(quiet, ".3f")]
+    alarm = parts_of(model)[1].alarm
+    if days and alarm is not None:
+        rng = np.random.default_rng(arguments.seed)
+        report["budget_days"] = found = budget_days(every, alarm.onsets_per_hour, int(days), rng)
+        lines += ["", f"budget, {days:g} days each", *figure_lines(found, ".3f")]
     return CommandResult(report, table={}, lines=lines)
 
 

@@ -46,6 +46,7 @@ from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.state import Entity, WorldState
 from worldstate.state.context import Context
+from worldstate.state.cue import Tally
 
 FRAME_S = 0.1
 _STILL_M = 1e-3  # Of a tenth of a second: slower ones keep their heading
@@ -177,6 +178,7 @@ class FollowedStream:
     masked: BoolArray  # shape (n,): Whether a reason is given why not all could be heard
     entities: tuple[tuple[Entity, ...], ...]  # Of every hop
     merged: frozenset[str]  # Ids that ended in another one
+    tallies: tuple[Tally, ...]  # Of every hop: what the watch over the alarm's budget has counted
 
     def hidden(self, hop: int, side: int, least: float = 0.0) -> list[Entity]:
         """Return the entities hidden on a side at a hop that exist with at least this probability."""
@@ -223,6 +225,7 @@ def followed(
         masked=np.array([any(one.reason for one in state.heard or ()) for state in states]),
         entities=tuple(state.entities for state in states),
         merged=frozenset(one.entity_id for state in states for one in state.events if one.kind == "merged"),
+        tallies=tuple(Tally() if state.budget is None else state.budget.tally for state in states),
     )
 
 

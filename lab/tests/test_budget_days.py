@@ -1,0 +1,64 @@
+"""Days drawn from streams against the watch over the budget: what is kept, what is found, and how soon."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from worldstate_lab.passes.budget_days import broken_after_s, budget_days, chance_blocks, quiet_blocks
+
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+from worldstate.core.budget_watch import onset_factors
+from worldstate.state.cue import Tally
+
+HOPS = 36_000  # An hour
+BUDGET = 25.0
+
+
+@dataclass(frozen=True)
+class MadeUp:
+    """What the days are drawn from, of a stream and of what was believed of it at once."""
+
+    tallies: tuple[Tally, ...]
+    within: np.ndarray
+    coming_s: np.ndarray
+    hazard_free: bool = False
+
+    followed = truth = heard = property(lambda self: self)
+
+
+def street(per_hour: float, seed: int, chance: float = 0.05, true: float = 0.05) -> MadeUp:
+    """Return an hour with onsets at random, and chances of two seconds of which a share comes true."""
+    rng = np.random.default_rng(seed)
+    false = np.cumsum(rng.random(HOPS) < per_hour / HOPS).tolist()
+    tallies = tuple(Tally(quiet_ns=100_000_000 * k, false_onsets=n) for k, n in enumerate(false, 1))
+    came = np.repeat(rng.random((HOPS // 20, 2)) < true, 20, axis=0)
+    within = np.full((HOPS, 2, len(HORIZONS_S)), chance)
+    return MadeUp(tallies, within, np.where(came, 1.0, np.inf))
+
+
+def test_every_onset_of_whole_blocks_is_in_the_block_in_which_it_came() -> None:
+    streams = [street(60.0, seed) for seed in (1, 2)]
+    blocks = quiet_blocks(streams)
+    assert blocks.shape == (20, 36)
+    assert blocks.sum() == sum(one.tallies[-1].false_onsets for one in streams)
+    assert blocks[0].sum() == streams[0].tallies[3599].false_onsets
+    assert chance_blocks(streams).shape == (20, 180, 2)
+
+
+def test_a_budget_that_is_kept_is_not_called_broken_and_more_is_found_the_sooner_the_more_there_is() -> None:
+    found = budget_days([street(12.0, seed) for seed in range(6)], BUDGET, 40, np.random.default_rng(0))
+    assert found["as they are"]["broken"] == found["chances"]["broken"] == 0.0
+    assert found["the budget"]["broken"] <= 0.1
+    twice, ten, later = (found[name] for name in ("2 times", "10 times", "2 times, after six hours"))
+    assert twice["broken"] == ten["broken"] == later["broken"] == 1.0
+    assert ten["median_h"] < 0.25 < twice["median_h"] < later["median_h"] < 6.0
+
+
+@pytest.mark.parametrize(("chance", "true"), [(0.4, 0.02), (0.02, 0.4)])
+def test_chances_that_do_not_come_true_are_found(chance: float, true: float) -> None:
+    streams = [street(12.0, 1, chance, true)]
+    assert budget_days(streams, BUDGET, 5, np.random.default_rng(0))["chances"]["broken"] == 1.0
+
+
+def test_no_onset_never_breaks_a_budget() -> None:
+    assert broken_after_s([onset_factors(0, 10.0, BUDGET)] * 8640, 10.0) == np.inf
