@@ -7,7 +7,7 @@ judged, in which a vehicle is in view within 20 m; the error is that to the near
 
 `z` is the root mean square of error over stated deviation, `surest_half` the mean of its square in the half
 of the hops with the least deviation, `median_deg` that of all hops, of the surest half and sixth. Hops for
-which no bearing is stated count as the least sure ones.
+which no bearing is stated count as the least sure ones. `beyond_60_deg` is the share of bearings so far off.
 
 Examples
 --------
@@ -44,7 +44,7 @@ RATE_HZ, LASTS_S = 24_000, 3.0  # At which nothing is resampled
 OPEN_SHARE = 1.0 / 3.0
 PEERS = ("MUSIC", "NormMUSIC", "SRP")
 SPAN_DEG = 360.0
-SURE = 1.0 / 6.0
+SURE, FAR_RAD = 1.0 / 6.0, np.radians(60.0)  # Farther off it is another peak
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +116,7 @@ class Bearings:
             "stated": float(stated.mean()),
             "z": float(np.sqrt(ratio.mean())),
             "surest_half": float(sure.mean()),
+            "beyond_60_deg": float((np.abs(self.error_rad) > FAR_RAD).mean()),
             **{f"{name}median_deg": _median_deg(self.error_rad[rows]) for name, rows in medians.items()},
             **{f"{name}_deg": _median_deg(errors) for name, errors in self.peers_rad.items()},
             **{f"surest_half_{name}_deg": _median_deg(one[half]) for name, one in self.peers_rad.items()},
