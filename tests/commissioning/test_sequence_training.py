@@ -1,10 +1,14 @@
-"""Boosted trees kept as arrays against scikit-learn's own, and the margin of stated times."""
+"""Boosted trees as arrays against scikit-learn's own, the margin of times, and learning in processes."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from sklearn.ensemble import HistGradientBoostingClassifier
 
+from worldstate.abduction.sequence.sequence_inputs import sequence_inputs
 from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
+from worldstate.commissioning import commission
 from worldstate.commissioning.sequence_training import (
     Growth,
     LabelledStream,
@@ -29,7 +33,7 @@ def test_exported_trees_say_what_the_classifier_says(seed: int) -> None:
     assert said[:, 1].max() < 1e-9
 
 
-def _stream(rng: np.random.Generator, hops: int = 1200) -> LabelledStream:
+def _stream(rng: np.random.Generator, hops: int = 1200) -> tuple[np.ndarray, StreamTruth]:
     """Return a made-up street where evidence of the left side rises before somebody comes, every 12 s."""
     time_s = 0.1 * np.arange(hops)
     coming = np.stack([12.0 - time_s % 12.0, np.full(hops, np.inf)], axis=1)
@@ -37,28 +41,47 @@ def _stream(rng: np.random.Generator, hops: int = 1200) -> LabelledStream:
     sides = np.stack([rises, np.full(hops, -2.0)], axis=1) + rng.normal(size=(hops, 2))
     rest = np.abs(rng.normal(size=(7, hops))).T
     nobody = np.full((hops, 2), -np.inf)
-    return LabelledStream(
-        np.concatenate([sides, rest, rng.normal(size=(hops, 4))], axis=1),
-        StreamTruth(coming, np.zeros(hops, bool), nobody, nobody, np.zeros((hops, 2), bool)),
-    )
+    truth = StreamTruth(coming, np.zeros(hops, bool), nobody, nobody, np.zeros((hops, 2), bool))
+    return np.concatenate([sides, rest, rng.normal(size=(hops, 4))], axis=1), truth
 
 
 @pytest.mark.long
 def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten() -> None:
     rng = np.random.default_rng(5)
-    model = train_sequence([_stream(rng) for _ in range(2)], rng, Growth(8, 16))
-    fresh = _stream(rng)
+    learned = [
+        LabelledStream.of(sequence_inputs(heard), truth) for heard, truth in (_stream(rng), _stream(rng))
+    ]
+    model = train_sequence(learned, 5, Growth(8, 16))
+    fresh, coming_to = _stream(rng)
     others = [_stream(rng), _stream(rng)]
-    margin_s = calibrated_margin_s([(model.posterior(one.evidence), one.truth) for one in others])
-    said = model.posterior(fresh.evidence)
+    margin_s = calibrated_margin_s([(model.posterior(heard), truth) for heard, truth in others])
+    said = model.posterior(fresh)
     assert np.isclose(model.share.sum(), 1.0, atol=1e-4) and said.groups.shape == (1200, 2, len(GROUPS))
-    soon = fresh.truth.coming_s[:, 0] <= 1.0
+    soon = coming_to.coming_s[:, 0] <= 1.0
     within = said.within()[:, 0, -1]
     # A few rounds that are held back are not sure of anything yet; they know which hops are which.
-    assert within[soon].mean() > 0.2 > 2 * within[fresh.truth.coming_s[:, 0] > 6.0].mean()
-    times, coming = said.time_to_visible_s(), fresh.truth.coming_s <= LONGEST_S
+    assert within[soon].mean() > 0.2 > 2 * within[coming_to.coming_s[:, 0] > 6.0].mean()
+    times, coming = said.time_to_visible_s(), coming_to.coming_s <= LONGEST_S
     low, _, high = times[coming].T
-    inside = (low - margin_s <= fresh.truth.coming_s[coming]) & (
-        fresh.truth.coming_s[coming] <= high + margin_s
-    )
+    inside = (low - margin_s <= coming_to.coming_s[coming]) & (coming_to.coming_s[coming] <= high + margin_s)
     assert 0.85 < inside.mean() < 0.96
+
+
+@pytest.mark.long
+def test_what_is_learned_does_not_depend_on_how_many_processes_learn(monkeypatch) -> None:
+    rng = np.random.default_rng(3)
+    streets = [
+        SimpleNamespace(site=f"SA{i // 2}", hazard_free=bool(i % 2), hops=range(600), ego_moves=False)
+        for i in range(8)
+    ]
+    made_up = {id(street): _stream(rng, 600) for street in streets}
+    monkeypatch.setattr(commission, "stream_evidence", lambda windows, street: made_up[id(street)][0])
+    monkeypatch.setattr(commission, "stream_truth", lambda street: made_up[id(street)][1])
+    monkeypatch.setattr(commission, "STANDING", Growth(4, 6))
+    one, two = (
+        commission.learn_sequence(streets, lambda some: None, 30.0, np.random.default_rng(1), jobs)
+        for jobs in (1, 2)
+    )
+    np.testing.assert_array_equal(one.trees.value, two.trees.value)
+    np.testing.assert_array_equal(one.trees.threshold, two.trees.threshold)
+    assert (one.margin_s, one.alarm) == (two.margin_s, two.alarm)

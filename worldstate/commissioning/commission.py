@@ -3,13 +3,13 @@
 import hashlib
 import json
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_inputs import hop_columns
+from worldstate.abduction.sequence.sequence_inputs import hop_columns, sequence_inputs
 from worldstate.abduction.sequence.sequence_model import SequenceModel, SequencePosterior
 from worldstate.abduction.signature.ensemble import KINDS, EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
@@ -44,6 +44,7 @@ from .road_user_training import CHOSEN_FOR_ROAD_USERS, fit_road_users, road_user
 from .sequence_training import (
     MOVING,
     STANDING,
+    Growth,
     LabelledStream,
     calibrated_margin_s,
     stream_truth,
@@ -60,7 +61,7 @@ from .simulated_windows import (
 from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
 
 FOLDS = 4
-LEARNING_STEPS = 2 * FOLDS + 2
+LEARNING_STEPS = 2 * FOLDS + 5  # Windows, trees and close sounds, guard, road users
 LEAST_ONSETS = 3.0
 SIMULATED = "simulated streets"
 # Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
@@ -117,6 +118,7 @@ def learn_sequence(
     fit_windows: FitWindows,
     onsets_per_hour: float,
     rng: np.random.Generator,
+    jobs: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> SequenceModel:
     """Train a sequence model on streams, junction by junction out of fold.
@@ -124,28 +126,47 @@ def learn_sequence(
     `fit_windows` makes a window model of some of the streams. Evidence of a stream always comes from one that
     did not learn its junction: trained on evidence that is too good, trees trust it too much elsewhere.
     """
-    labelled: dict[int, LabelledStream] = {}
-    folds, weights = _folds(streams), _weights(streams)
-    growth = MOVING if streams[0].ego_moves else STANDING
+    evidence = dict[int, FloatArray]()
+    folds = _folds(streams)
     for outside in folds:
         windows = fit_windows([one for i, one in enumerate(streams) if i not in outside])
-        for i in outside:
-            evidence = stream_evidence(windows, streams[i])
-            labelled[i] = LabelledStream(evidence, stream_truth(streams[i]), float(weights[i]))
+        evidence |= {i: stream_evidence(windows, streams[i]) for i in outside}
         on_step()
-    margins, quiet = [], dict[str, list[SequencePosterior]]()
+    inputs = list(in_processes(sequence_inputs, [evidence[i] for i in range(len(streams))], jobs))
+    truths, weights = list(map(stream_truth, streams)), _weights(streams).tolist()
+    labelled = list(map(LabelledStream.of, inputs, truths, weights))
+    lessons = []
     for outside in folds:
-        model = train_sequence([labelled[i] for i in range(len(streams)) if i not in outside], rng, growth)
-        said = {i: model.posterior(labelled[i].evidence) for i in outside}
-        margins.append(calibrated_margin_s([(one, labelled[i].truth) for i, one in said.items()]))
-        for i, posterior in said.items():
+        inside = [one for i, one in enumerate(labelled) if i not in outside]
+        lessons.append(Lesson(inside, [inputs[i] for i in outside], int(rng.integers(2**31))))
+    growth, threads = MOVING if streams[0].ego_moves else STANDING, None if jobs == 1 else 1
+    learned = in_processes(partial(_said_outside, growth=growth, threads=threads), lessons, jobs)
+    margins, quiet = [], dict[str, list[SequencePosterior]]()
+    for outside, said in zip(folds, learned, strict=True):
+        margins.append(calibrated_margin_s([(one, truths[i]) for i, one in zip(outside, said, strict=True)]))
+        for i, posterior in zip(outside, said, strict=True):
             if streams[i].hazard_free:
                 quiet.setdefault(streams[i].site, []).append(posterior)
         on_step()
     alarm, margin_s = alarm_elsewhere(list(quiet.values()), onsets_per_hour), float(np.mean(margins))
-    final = train_sequence(list(labelled.values()), rng, growth)
+    final = train_sequence(labelled, int(rng.integers(2**31)), growth)
     on_step()
     return replace(final, margin_s=margin_s, alarm=alarm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lesson:
+    """Streams to learn from, and the inputs of those that are left out, each of shape (n, 2, inputs)."""
+
+    streams: Sequence[LabelledStream]
+    outside: Sequence[FloatArray]
+    seed: int
+
+
+def _said_outside(lesson: Lesson, growth: Growth, threads: int | None) -> list[SequencePosterior]:
+    """Train on some streams; return what is said of the others."""
+    model = train_sequence(lesson.streams, lesson.seed, growth, threads)
+    return list(map(model.of_inputs, lesson.outside))
 
 
 def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:
@@ -202,7 +223,7 @@ def commission(
     def fit(some: Sequence[HeardStream]) -> EnsembleModel:
         return fitted(*_table_and_beside(real, open_field, domain, some))
 
-    sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
+    sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, jobs, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
     model = train_model(
         windows,
@@ -211,12 +232,14 @@ def commission(
         group="dynamic" if settings.moving_ego else "static",
         excluded_lists=(*excluded_lists, *settings.leave_out),
         simulated=beside,
+        each=partial(in_processes, jobs=jobs),
     )
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out. With recorded
     # clips it is tried all the same, beside two simulated ones a kind.
     if recorded is not None or not settings.quick:
-        model = _with_ears(model, array, streams, recorded, 2 if settings.quick else CLIPS_EACH, rng, jobs)
+        each = 2 if settings.quick else CLIPS_EACH
+        model = _with_ears(model, array, streams, recorded, each, rng, jobs, on_step)
     provenance = replace(model.provenance, fit_for_use=not settings.quick)
     made = replace(model, provenance=provenance, sequence=sequence)
     if not calm:
@@ -234,18 +257,22 @@ def _with_ears(
     clips_each: int,
     rng: np.random.Generator,
     jobs: int,
+    on_step: Callable[[], None],
 ) -> Model:
     """Return a model with a guard and kinds of road users, learned close by and in the streets."""
     rate_hz, about = streams[0].hops.about["sample_rate_hz"], model.provenance.classifier
     close = close_rows(rate_hz, rng, clips_each, jobs)
+    on_step()
     if recorded is not None:
         close, about = SoundRows.joined([close, recorded.rows]), f"{about}; {recorded.told}"
     guard = train_guard(array, streams, close, rng, jobs)
+    on_step()
     sites = list(dict.fromkeys(one.site for one in streams))
     passes = road_user_rows(array, sites, rate_hz, rng, jobs=jobs)
     about = f"{about}; {CHOSEN_FOR_GUARD}; {CHOSEN_FOR_ROAD_USERS}"
     provenance = replace(model.provenance, classifier=about)
     road_users = fit_road_users(with_close(passes, close))
+    on_step()
     return replace(model, provenance=provenance, guard=guard, road_users=road_users)
 
 

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.abduction.sequence.sequence_inputs import SIDES, sequence_inputs
+from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (
     COMING_S,
     GROUPS,
@@ -94,7 +95,7 @@ def stream_truth(heard: HeardStream) -> StreamTruth:
 # an ECE at 2 s of .008 and a Brier skill of .155 on drives not learned, 120 rounds of 8 .003 and .169.
 RATE, RIDGE, INPUTS_EACH = 0.2, 20.0, 0.3
 SMALLEST_LEAF = 300
-EVERY_HOPS = 3  # Neighbours say the same thing
+EVERY_HOPS = 3
 COVERAGE = 0.9
 _FIGURES = 7  # Of a number in the file: it is half as long, and no input is known better
 
@@ -112,23 +113,30 @@ STANDING, MOVING = Growth(270, 16), Growth(120, 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledStream:
-    """Evidence of one stream, by a window model that did not learn from it, and the truth."""
+    """Hops of one stream to learn from, by a window model that did not learn from it."""
 
-    evidence: FloatArray  # As `hop_columns`
-    truth: StreamTruth
+    inputs: FloatArray  # shape (n, 2, inputs)
+    groups: IndexArray  # shape (n, 2)
     weight: float = 1.0  # Of each of its hops
+
+    @classmethod
+    def of(cls, inputs: FloatArray, truth: StreamTruth, weight: float = 1.0) -> "LabelledStream":
+        """Return every third hop of a stream: neighbours say the same thing."""
+        return cls(inputs[::EVERY_HOPS], truth.groups()[::EVERY_HOPS], weight)
 
 
 def train_sequence(
-    streams: Sequence[LabelledStream], rng: np.random.Generator, growth: Growth = STANDING
+    streams: Sequence[LabelledStream],
+    seed: int,
+    growth: Growth = STANDING,
+    threads: int | None = None,
 ) -> SequenceModel:
     """Train on the hops of streams, each weighted so that hazards are as frequent as in use."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
-    inputs = np.concatenate([_rows(sequence_inputs(one.evidence)[::EVERY_HOPS]) for one in streams])
-    labels = [one.truth.groups()[::EVERY_HOPS].reshape(-1) for one in streams]
-    groups = np.concatenate(labels)
-    weights = np.repeat([one.weight for one in streams], list(map(len, labels)))
+    inputs = np.concatenate([one.inputs.reshape(-1, one.inputs.shape[-1]) for one in streams])
+    groups = np.concatenate([one.groups.reshape(-1) for one in streams])
+    weights = np.repeat([one.weight for one in streams], [one.groups.size for one in streams])
     machine = HistGradientBoostingClassifier(
         max_iter=growth.rounds,
         max_leaf_nodes=growth.leaves,
@@ -138,16 +146,14 @@ def train_sequence(
         # Of a few minutes no leaf would have as many hops.
         min_samples_leaf=min(SMALLEST_LEAF, max(len(inputs) // 100, 1)),
         early_stopping=False,
-        random_state=int(rng.integers(2**31)),
+        random_state=seed,
     )
-    machine.fit(inputs, groups, sample_weight=weights)
+    # Of processes beside one another each has its core.
+    with threadpool_limits(threads):
+        machine.fit(inputs, groups, sample_weight=weights)
     share = np.bincount(groups, weights, len(GROUPS)) / weights.sum()
     trees = exported(machine, inputs[:: max(len(inputs) // 100, 1)])
     return SequenceModel(trees, np.maximum(share, 1e-6))
-
-
-def _rows(inputs: FloatArray) -> FloatArray:
-    return inputs.reshape(-1, inputs.shape[-1])
 
 
 def exported(machine: object, check: FloatArray) -> BoostedTrees:
