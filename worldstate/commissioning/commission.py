@@ -149,7 +149,8 @@ def learn_sequence(
                 quiet.setdefault(streams[i].site, []).append(posterior)
         on_step()
     alarm, margin_s = alarm_elsewhere(list(quiet.values()), onsets_per_hour), float(np.mean(margins))
-    final = train_sequence(labelled, int(rng.integers(2**31)), growth)
+    every = [labelled[i] for outside in folds for i in outside]
+    final = train_sequence(every, int(rng.integers(2**31)), growth)
     on_step()
     return replace(final, margin_s=margin_s, alarm=alarm)
 
