@@ -304,15 +304,17 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     with progress_bar("following", len(arguments.trials) + arguments.passes) as bar:
         exam = place_exam(arguments.trials, arguments.passes, arguments.seed, bar.advance)
     rows: list[tuple[str, ...]] = []
+    report = asdict(exam)
     for title, figures in (("trials", exam.trials), ("simulated", exam.passes)):
         if title == "trials":
             rows += [_row(one["name"], one) for one in figures]
         scored = [one for one in figures if one["rmse_m"] is not None]
         if scored:
             means = {name: sum(one[name] for one in scored) / len(scored) for name in _COLUMNS}
+            report[f"mean_of_{title}"] = means | {"worst_rmse_m": max(one["rmse_m"] for one in scored)}
             rows.append(_row(f"{title}, mean of {len(scored)}", means))
     table = Table("places", f"{exam.ms_a_hop:.2f} ms a hop", ("pass", *_COLUMNS.values()), rows)
-    return CommandResult(asdict(exam), table={}, lines=table.lines())
+    return CommandResult(report, table={}, lines=table.lines())
 
 
 def _row(name: str, found: dict[str, float | None]) -> tuple[str, ...]:
