@@ -46,7 +46,8 @@ def test_every_onset_of_whole_blocks_is_in_the_block_in_which_it_came() -> None:
 
 
 def test_a_budget_that_is_kept_is_not_called_broken_and_more_is_found_the_sooner_the_more_there_is() -> None:
-    found = budget_days([street(12.0, seed) for seed in range(6)], BUDGET, 40, np.random.default_rng(0))
+    streams = [street(12.0, seed) for seed in range(6)]
+    found = dict(budget_days(streams, BUDGET, 40, np.random.default_rng(0)))
     assert found["as they are"]["broken"] == found["chances"]["broken"] == 0.0
     assert found["the budget"]["broken"] <= 0.1
     twice, ten, later = (found[name] for name in ("2 times", "10 times", "2 times, after six hours"))
@@ -57,7 +58,8 @@ def test_a_budget_that_is_kept_is_not_called_broken_and_more_is_found_the_sooner
 @pytest.mark.parametrize(("chance", "true"), [(0.4, 0.02), (0.02, 0.4)])
 def test_chances_that_do_not_come_true_are_found(chance: float, true: float) -> None:
     streams = [street(12.0, 1, chance, true)]
-    assert budget_days(streams, BUDGET, 5, np.random.default_rng(0))["chances"]["broken"] == 1.0
+    found = dict(budget_days(streams, BUDGET, 5, np.random.default_rng(0)))
+    assert found["chances"]["broken"] == 1.0
 
 
 def test_no_onset_never_breaks_a_budget() -> None:

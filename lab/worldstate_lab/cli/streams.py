@@ -84,7 +84,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     alarm = parts_of(model)[1].alarm
     if days and alarm is not None:
         rng = np.random.default_rng(arguments.seed)
-        report["budget_days"] = found = budget_days(every, alarm.onsets_per_hour, int(days), rng)
+        found = dict(track(budget_days(every, alarm.onsets_per_hour, int(days), rng), "drawing days"))
+        report["budget_days"] = found
         lines += ["", f"budget, {days:g} days each", *figure_lines(found, ".3f")]
     return CommandResult(report, table={}, lines=lines)
 

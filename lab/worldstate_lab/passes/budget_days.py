@@ -6,7 +6,7 @@ other as a Poisson number says, so that onsets come in the clusters in which the
 day brings is taken in by the watch's own evidence; of onsets all hours are of quiet time.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -48,8 +48,8 @@ def chance_blocks(streams: Sequence[PassedStream]) -> FloatArray:
 
 def budget_days(
     streams: Sequence[PassedStream], onsets_per_hour: float, days: int, rng: np.random.Generator
-) -> Mapping[str, Figures]:
-    """Return how often the watch calls its claims broken, in so many days of each kind, and how soon.
+) -> Iterator[tuple[str, Figures]]:
+    """Yield how often the watch calls its claims broken, in so many days of each kind, and how soon.
 
     Parameters
     ----------
@@ -82,12 +82,15 @@ def budget_days(
         drawn = (blocks[rng.integers(len(blocks), size=BLOCKS)].reshape(-1, 2).tolist() for _ in range(days))
         return _figures([broken_after_s(one, BET_S) for one in drawn])
 
-    found: dict[str, Figures] = {"as they are": onsets(rate), "the budget": onsets(onsets_per_hour)}
-    found |= {f"{ratio:g} times": onsets(ratio * onsets_per_hour) for ratio in RATES}
-    found[f"{RATES[0]:g} times, after six hours"] = onsets(RATES[0] * onsets_per_hour, LATER_BLOCKS)
+    yield "as they are", onsets(rate)
+    yield "the budget", onsets(onsets_per_hour)
+    for ratio in RATES:
+        yield f"{ratio:g} times", onsets(ratio * onsets_per_hour)
+    yield f"{RATES[0]:g} times, after six hours", onsets(RATES[0] * onsets_per_hour, LATER_BLOCKS)
     empty = chance_blocks([one for one in streams if one.heard.hazard_free])
-    kinds = {"chances": chances, "chances without hazards": empty}
-    return found | {name: bets(blocks) for name, blocks in kinds.items() if len(blocks)}
+    for name, blocks in (("chances", chances), ("chances without hazards", empty)):
+        if len(blocks):
+            yield name, bets(blocks)
 
 
 def broken_after_s(factors: Iterable[Sequence[float]], step_s: float) -> float:
