@@ -8,6 +8,7 @@ from worldstate_lab.passes.budget_days import broken_after_s, budget_days, chanc
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.core.budget_watch import onset_factors
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.state.cue import Tally
 
 HOPS = 36_000  # An hour
@@ -64,3 +65,8 @@ def test_chances_that_do_not_come_true_are_found(chance: float, true: float) -> 
 
 def test_no_onset_never_breaks_a_budget() -> None:
     assert broken_after_s([onset_factors(0, 10.0, BUDGET)] * 8640, 10.0) == np.inf
+
+
+def test_streams_without_a_false_onset_are_refused() -> None:
+    with pytest.raises(InvalidArgumentError, match=r"expected false onsets .*, got none in 60 minutes"):
+        next(budget_days([street(0.0, 1)], BUDGET, 1, np.random.default_rng(0)))

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from worldstate.frontend.settings import BEARING_HOPS, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.checks import in_range
+from worldstate.ground.errors import MissingExtraError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import Figures
@@ -59,8 +61,7 @@ class Scene:
 
 def drawn_scene(rng: np.random.Generator) -> Scene:
     """Draw a ring and a source of noise that falls by 3 dB an octave, and let a room or the open carry it."""
-    import pyroomacoustics
-
+    pyroomacoustics = _peer()
     count, radius_m = int(rng.integers(4, 9)), rng.uniform(0.03, 0.1)
     round_rad = 2.0 * np.pi * np.arange(count) / count
     ring = radius_m * np.stack([np.cos(round_rad), np.sin(round_rad), 0.0 * round_rad], axis=1)
@@ -81,6 +82,14 @@ def drawn_scene(rng: np.random.Generator) -> Scene:
     noise = np.std(clean) * 10.0 ** (-rng.uniform(5.0, 20.0) / 20.0) * rng.standard_normal(clean.shape)
     sound = (0.1 / np.std(clean) * (clean + noise)).astype(np.float32)
     return Scene(MicrophoneArray(ring), sound, float(azimuth), indoors)
+
+
+def _peer() -> Any:
+    try:
+        import pyroomacoustics
+    except ImportError as error:
+        raise MissingExtraError("pyroomacoustics", "oracles") from error
+    return pyroomacoustics
 
 
 def _falling_noise(rng: np.random.Generator) -> FloatArray:
@@ -142,14 +151,12 @@ def scene_bearings(number: int, seed: int) -> tuple[bool, Bearings]:
 
 def _of_peers(scene: Scene, settings: FrontEndSettings, ends: Sequence[int]) -> Mapping[str, FloatArray]:
     """Return the azimuths that pyroomacoustics' methods find in the frames of every hop's bearing."""
-    import pyroomacoustics
-
     nfft, band_hz, positions = settings.nfft, list(settings.srp_band_hz), scene.array.positions_m.T
     spectra = StreamingStft(positions.shape[1], nfft, range(nfft // 2 + 1)).push(scene.sound)
     done = nfft + np.arange(len(spectra)) * (nfft // 2)
     found = {}
     for name in PEERS:
-        method = getattr(pyroomacoustics.doa, name)
+        method = getattr(_peer().doa, name)
         peer = method(
             positions, RATE_HZ, nfft, c=SPEED_OF_SOUND_M_S, num_src=1, azimuth=settings.azimuths_rad()
         )

@@ -12,6 +12,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.core.budget_watch import BET_S, RATES, BudgetWatch, chance_factors, onset_factors
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import SECONDS_PER_HOUR, seconds
 from worldstate.operations.metrics.approach_table import Figures, share_interval
@@ -61,8 +62,16 @@ def budget_days(
         Of each kind.
     rng : numpy.random.Generator
         Draws them.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the streams have no false onset in six minutes of quiet time or more.
     """
     quiet, chances = quiet_blocks(streams), chance_blocks(streams)
+    if not quiet.sum():
+        found = f"got none in {len(quiet) * BLOCK_S / 60.0:g} minutes"
+        raise InvalidArgumentError(f"streams: expected false onsets in quiet time, {found}: more streams")
     rate = float(quiet.mean() * SECONDS_PER_HOUR / STEP_S)
     factors = [onset_factors(n, STEP_S, onsets_per_hour) for n in range(round(STEP_S / HOP_S) + 1)]
 
