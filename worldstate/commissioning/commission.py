@@ -233,7 +233,6 @@ def commission(
         group="dynamic" if settings.moving_ego else "static",
         excluded_lists=(*excluded_lists, *settings.leave_out),
         simulated=beside,
-        each=partial(in_processes, jobs=jobs),
     )
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out. With recorded

@@ -4,12 +4,12 @@ Folds keep a recording whole. Thresholds and risk maps are of single windows, on
 recording.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from itertools import product
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -135,8 +135,6 @@ def _gamma(score: FloatArray, alpha: float) -> float:
 N_FOLDS = 5
 
 Trained = TypeVar("Trained")
-# Applies a fit to the windows of every fold, in their order, as `map` does.
-Each: TypeAlias = Callable[[Callable[[FeatureTable], Trained], Sequence[FeatureTable]], Iterable[Trained]]
 
 
 def recording_labels(table: FeatureTable) -> dict[str, str]:
@@ -174,16 +172,15 @@ def out_of_fold(
     folds: TextArray,
     fit: Callable[[FeatureTable], Trained],
     asks: Sequence[Callable[[Trained, BoolArray], FloatArray]],
-    each: Each[Trained] = map,
 ) -> list[FloatArray]:
     """Return posteriors of each window from a classifier trained on the other folds, for each way to ask.
 
     Each of `asks` returns those of the chosen rows of `table`, shape (rows, 4); what comes back is (n, 4).
     """
     passes = [np.empty((len(table), len(CLASSES))) for _ in asks]
-    outside = [folds == fold for fold in np.unique(folds)]
-    trained = each(fit, [table.select(~held_out) for held_out in outside])
-    for held_out, classifier in zip(outside, trained, strict=True):
+    for fold in np.unique(folds):
+        held_out = folds == fold
+        classifier = fit(table.select(~held_out))
         for probabilities, ask in zip(passes, asks, strict=True):
             probabilities[held_out] = ask(classifier, held_out)
     return passes
@@ -242,7 +239,6 @@ def train_model(
     group: Group,
     excluded_lists: Sequence[str] = (),
     simulated: SimulatedWindows | None = None,
-    each: Each[EnsembleModel] = map,
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
     """Train the ensemble and calibrate its cueing.
@@ -260,8 +256,6 @@ def train_model(
         For the provenance.
     simulated : SimulatedWindows, optional
         Learned by the ensemble beside the table.
-    each : callable
-        Applies the fit to the windows of every fold, in their order: over processes, for instance.
     on_step : callable
         Called after each cross-validation and after the last fit.
 
@@ -293,7 +287,7 @@ def train_model(
     check_extra("sklearn")
     rng, inputs = np.random.default_rng(settings.seed), with_site_references(table)
     fit = partial(fit_ensemble, simulated=simulated)
-    levels = _out_of_fold_levels(inputs, fit, each, settings.repeats, rng, on_step)
+    levels = _out_of_fold_levels(inputs, fit, settings.repeats, rng, on_step)
     # The ego's motion is that of the windows that are left in the table.
     motion, domain = ego_motion_of(np.unique(table.environments).tolist()), table.domain
     signature = replace(fit(inputs), domain=None if domain is None else replace(domain, ego_motion=motion))
@@ -326,8 +320,7 @@ def trained_ensemble(
     windows = replace(inputs, features=inputs.features[:, :N_FEATURES])
     heard = learned_while_listening(windows, np.random.default_rng(_HEARD_SEED), or_nothing=True)
     classifier = SiteEnsembleClassifier(_recipes(inputs), simulated)
-    # Products of a few thousand windows: with two threads a fit takes three times as long, and in two
-    # processes with two threads each eight times.
+    # Products of a few thousand windows: with two threads a fit takes three times as long.
     with one_blas_thread():
         return classifier.fit(inputs.features, inputs.labels, inputs.environments, heard)
 
@@ -349,7 +342,6 @@ def _classifier(table: FeatureTable, simulated: SimulatedWindows | None) -> str:
 def _out_of_fold_levels(
     inputs: FeatureTable,
     fit: Callable[[FeatureTable], EnsembleModel],
-    each: Each[EnsembleModel],
     repeats: int,
     rng: np.random.Generator,
     on_step: Callable[[], None],
@@ -361,11 +353,11 @@ def _out_of_fold_levels(
     asks = asked_on_streams(inputs, rng)
     passes = []
     for _ in range(repeats):
-        passes += out_of_fold(inputs, folds_by_recording(inputs, rng), fit, asks, each)
+        passes += out_of_fold(inputs, folds_by_recording(inputs, rng), fit, asks)
         on_step()
     if len(np.unique(inputs.environments)) < 2:
         return [passes]
-    return [out_of_fold(inputs, junction_folds(inputs), fit, asks, each), passes]
+    return [out_of_fold(inputs, junction_folds(inputs), fit, asks), passes]
 
 
 def _policies(
