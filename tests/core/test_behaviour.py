@@ -117,8 +117,14 @@ def test_a_vehicle_seen_a_moment_ago_has_not_gone_into_hiding():
     world = after(WorldFilter(), measured(1.0, FRONT, car(-0.5)), measured(1.1, RIGHT))
     assert set(entities(world)) == {"visible", "hidden"}
     first = entities(world)["visible"].id
-    late = after(WorldFilter(), measured(1.0, FRONT, car(-0.5)), measured(1.3, RIGHT))
-    assert {status: entity.id for status, entity in entities(late).items()} == {"hidden": first}
+
+    def later(answer):
+        return after(WorldFilter(), measured(1.0, FRONT, car(-0.5)), measured(1.3, RIGHT, answer=answer))
+
+    assert {status: entity.id for status, entity in entities(later(Absent(0.6))).items()} == {"hidden": first}
+    # A camera that has died did not see it go.
+    died = entities(later(UNASKED))
+    assert set(died) == {"visible", "hidden"} and died["visible"].id == first
 
 
 def test_a_peak_moves_a_doubtful_entity_less():

@@ -7,7 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import MOSTLY_MISSED
+from worldstate.abduction.co_evidence import MOSTLY_MISSED, Unqueried
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
@@ -18,7 +18,7 @@ from worldstate.belief.track import NEVER_NS, Tracks, born, heard_as
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
 from worldstate.ground import BoolArray
 from worldstate.ground.values import nanoseconds, wrap_angle
-from worldstate.measurement.measurement import Measurement
+from worldstate.measurement import Measurement, Sector
 from worldstate.state import Event
 from worldstate.state.entity import EventKind
 
@@ -109,7 +109,7 @@ def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry
 def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> None:
     """Add one more hidden entity on a side, of unknown side where it is the only one."""
     tracks, sides, shares = memory.tracks, memory.sides, tuple[float, ...]()
-    row = _returning(tracks, k, measurement.stamp_ns, site)
+    row = _returning(memory, k, site)
     if row is None:
         # After a hand-over it is another one, of the other side.
         if sides.both is not None and not hidden_rows(tracks) and all(_rearmed(memory)):
@@ -240,14 +240,31 @@ def _may_be_on(tracks: Tracks, row: int, side: int) -> bool:
     return bool(tracks.side_shares[row][side] > 0.0) if of_side is None else of_side == side
 
 
-def _returning(tracks: Tracks, k: int, stamp_ns: int, site: SiteGeometry) -> int | None:
-    """Return the moving entity last seen near this side's edge within the reocclusion time, if any."""
-    unseen_ns = tracks.unseen_ns(stamp_ns)
-    recent = (unseen_ns >= REOCCLUSION_NS) & (unseen_ns <= _REOCCLUSION_END_NS)
+def _returning(memory: Memory, k: int, site: SiteGeometry) -> int | None:
+    """Return the moving entity that looks have missed near this side's edge for a moment, if any."""
+    tracks = memory.tracks
+    recent = tracks.unseen_ns(memory.stamp_ns) <= _REOCCLUSION_END_NS
     rows = np.flatnonzero(tracks.seen & tracks.moving & recent).tolist()
-    apart_rad = {i: site.sides[k].distance_rad(float(tracks.mean[i, AZIMUTH])) for i in rows}
+    azimuth_rad = {i: float(tracks.mean[i, AZIMUTH]) for i in rows}
+    apart_rad = {
+        i: site.sides[k].distance_rad(at)
+        for i, at in azimuth_rad.items()
+        # A camera that has died since says nothing of it.
+        if _searched_ns(memory, at) - tracks.last_seen_ns[i] >= REOCCLUSION_NS
+    }
     near = (i for i, apart in apart_rad.items() if apart <= _REOCCLUSION_RAD)
     return min(near, key=apart_rad.__getitem__, default=None)
+
+
+def _searched_ns(memory: Memory, azimuth_rad: float) -> int:
+    """Return when a sensor last searched an azimuth."""
+    asked = (one for one in memory.looks.values() if not isinstance(one.answer, Unqueried))
+    there = (
+        one.stamp_ns
+        for one in asked
+        if one.sector_rad is None or Sector.between(*one.sector_rad).touches(azimuth_rad)
+    )
+    return max(there, default=0)
 
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.

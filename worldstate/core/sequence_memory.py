@@ -121,6 +121,8 @@ _SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range
 _ONE_IN_VIEW = np.eye(len(STATES))[
     [len(COMING_S) + i % len(COMING_S) if comes else SEEN for i, comes in enumerate(COMES)]
 ]
+# What has come into view would have been there within so long.
+_LATER = np.array(COMING_S) > 1.0
 LEAST_RISK = 0.1  # An advisory does not stand beside a risk that denies it
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
 
@@ -213,6 +215,16 @@ class SequenceMemory:
         return self.posterior.groups[0, :, : len(COMING_S)]
 
     @cached_property
+    def own_coming(self) -> FloatArray:
+        r"""Probabilities of the groups of `COMING_S` of the vehicle believed there, shape (2, 9).
+
+        .. math:: p'_{k,i} = (1 - u_k)\, p_{k,i} \quad \text{of times beyond a second}
+
+        with the chance u that it has come into view unseen: what comes later is another one then.
+        """
+        return np.where(_LATER, self.coming * (1.0 - np.array(self.unseen))[:, None], self.coming)
+
+    @cached_property
     def comes(self) -> FloatArray:
         """P(a vehicle comes into view within eight seconds), shape (2,)."""
         return np.asarray(np.minimum(self.coming.sum(axis=1), 1.0))
@@ -261,7 +273,27 @@ class SequenceMemory:
         seen = min(float((groups[:, _SEEN_GROUP] / rest).mean()), 1.0 - far)
         hypotheses = (1.0 - none * (1.0 - far), none * seen, none * (1.0 - far - seen))
         told = tuple(comes.tolist())
-        return SideBelief(told, tuple(emerged.tolist()), told, 1.0 - none, hypotheses, self.both_come)
+        chances = told, tuple(emerged.tolist()), told, 1.0 - none, hypotheses
+        return SideBelief(*chances, self.both_come, self._another)
+
+    @property
+    def _another(self) -> tuple[float, ...]:
+        r"""Return P(the vehicle believed there has come into view unseen, and another one is hidden), (3,).
+
+        .. math:: u\, l\, \frac{e}{e + n + (1 - u)\, l}, \qquad
+                  e = q(seen)\, \frac{u}{1 - (1 - u)(1 - o)}
+
+        with the chance u that it has, l and n that one comes beyond a second and within it, and o that what
+        is in view is of no side; of each side by its own reading, and of any.
+        """
+        passed, later = np.array(self.unseen), self.coming[:, _LATER].sum(axis=1)
+        seen = self.posterior.groups[0, :, _SEEN_GROUP] * passed / (1.0 - (1.0 - passed) * (1.0 - _OTHERS))
+        # One of unknown side is as likely hidden as the joint of both sides says.
+        joint = (1.0 - self.none_comes) / max(float(self.comes.sum()), _LEAST_WEIGHT)
+        near, later = (np.append(one, one.sum() * joint) for one in (self.comes - later, later))
+        passed, seen = (np.append(one, min(one.sum(), 1.0)) for one in (passed, seen))
+        weight = np.maximum(seen + near + (1.0 - passed) * later, _LEAST_WEIGHT)
+        return tuple((passed * later * seen / weight).tolist())
 
     def since_emerged_ns(self, stamp_ns: int) -> list[float]:
         """Return how long before a time a vehicle last came into view from each side."""

@@ -176,7 +176,8 @@ def hidden_azimuth(
     if track is not None and track.place is not None:
         return track.motion.azimuth_rad, track.motion.azimuth_std_rad, "measured"
     if kept is not None:
-        return *hidden_bearing(kept.coming[side], site.sides[side]), "context"
+        coming = kept.coming if track is None else kept.own_coming
+        return *hidden_bearing(coming[side], site.sides[side]), "context"
     heard = track if track is not None and track.side == side else None
     motion = site.sides[side].prior() if heard is None else heard.motion
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove

@@ -136,7 +136,7 @@ def _place_hidden(memory: Memory, site: SiteGeometry) -> None:
     """Put the entities that are only heard and hidden where the sequence has them."""
     if memory.sequence is None:
         return
-    tracks, coming = memory.tracks, memory.sequence.coming
+    tracks, coming = memory.tracks, memory.sequence.own_coming
     shares = hidden_shares(tracks, memory.sides)
     for i in np.flatnonzero(~tracks.detected & (shares >= HIDDEN)).tolist():
         side, before = tracks.side[i], MotionBelief(tracks.mean[i], tracks.covariance[i])
