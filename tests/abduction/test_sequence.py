@@ -111,11 +111,41 @@ def test_a_stream_shorter_than_what_is_smoothed_has_an_answer_a_hop(hops: int) -
     np.testing.assert_array_equal(raised, np.tile([True, False], (hops, 1)))
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 8, 9, 16, 33, 64]))
+def test_trees_lead_where_a_walk_from_question_to_question_does(seed: int, leaves: int) -> None:
+    rng = np.random.default_rng(seed)
+    trees, nodes = 7, min(2 * leaves + 3, 127)  # Some behind the last leaf, which nothing leads to
+    yes, no = np.tile(np.arange(nodes), (2, trees, 1))
+    for tree in range(trees):
+        ends = [0]
+        for child in range(1, 2 * int(rng.integers(1, leaves + 1)) - 1, 2):
+            node = ends.pop(int(rng.integers(len(ends))))
+            yes[tree, node], no[tree, node] = rng.permutation([child, child + 1])
+            ends += [child, child + 1]
+    split = rng.integers(3, size=(trees, nodes))
+    threshold, value = rng.normal(size=(2, trees, nodes))
+    classes = rng.integers(2, size=trees)
+    X = rng.normal(size=(4, 3))
+    X[0, 0] = threshold[0, 0]
+    expected = np.tile([0.5, -0.5], (len(X), 1))
+    for row, x in enumerate(X):
+        for tree in range(trees):
+            node = 0
+            while yes[tree, node] != node:
+                node = (yes if x[split[tree, node]] <= threshold[tree, node] else no)[tree, node]
+            expected[row, classes[tree]] += value[tree, node]
+    grown = BoostedTrees(split, threshold, yes, no, value, classes, np.array([0.5, -0.5]))
+    np.testing.assert_allclose(grown.scores(X), expected, rtol=1e-12)
+    np.testing.assert_array_equal(grown.scores(X[1:2]), grown.scores(X)[1:2])
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
         ({"yes": [[1, 0, 2]]}, "yes"),
         ({"no": [[2, 2, 2]]}, "leaf"),
+        ({"no": [[1, 1, 2]]}, "one way to every node"),
         ({"split": [[900, 0, 0]]}, "split"),
         ({"tree_class": [3]}, "tree_class"),
     ],
