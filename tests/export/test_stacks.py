@@ -517,7 +517,7 @@ def mot_text(tmp_path):
 
 
 def test_mot_text_has_a_row_for_what_has_a_place(tmp_path):
-    """Read by py-motmetrics' rule: ten numbers a row without a head, indexed by whole frame and id."""
+    """Ten numbers a row without a head, indexed by whole frame and id."""
     table = np.loadtxt(mot_text(tmp_path), delimiter=",", ndmin=2)
     assert table.shape == (3, 10)
     frames, ids = table[:, 0], table[:, 1]
@@ -529,19 +529,29 @@ def test_mot_text_has_a_row_for_what_has_a_place(tmp_path):
     assert table[:, 6:].tolist() == found
 
 
-READS_MOT = "import sys, motmetrics; print(motmetrics.io.loadtxt(sys.argv[1]).reset_index().to_json())"
+READS_MOT = """
+import json, sys
+from trackeval.datasets import MotChallenge2DBox
+folders = dict(GT_FOLDER="truth", TRACKERS_FOLDER="trackers", SKIP_SPLIT_FOL=True, SEQ_INFO={"street": 3})
+read = MotChallenge2DBox(folders | {"PRINT_CONFIG": False}).get_raw_seq_data("ours", "street")
+told = [read[name] for name in ("tracker_ids", "gt_ids", "tracker_confidences")]
+print(json.dumps([[list(map(float, frame)) for frame in one] for one in told]))
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    "MOTMETRICS" not in os.environ, reason="MOTMETRICS names no Python that has py-motmetrics"
-)
-def test_py_motmetrics_reads_the_rows(tmp_path):
-    command = [os.environ["MOTMETRICS"], "-c", READS_MOT, str(mot_text(tmp_path))]
-    table = json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
-    assert list(table["FrameId"].values()) == [1, 3, 3]
-    assert table["Id"]["0"] == table["Id"]["1"] != table["Id"]["2"]
-    assert list(table["Confidence"].values()) == [0.9, 0.9, 0.25]
+@pytest.mark.skipif("TRACKEVAL" not in os.environ, reason="TRACKEVAL names no Python that has TrackEval")
+def test_trackevals_own_reader_takes_the_rows_as_tracks_and_as_truth(tmp_path):
+    rows = mot_text(tmp_path).read_text()
+    for name in ("trackers/ours/data/street.txt", "truth/street/gt/gt.txt"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text(rows)
+    command = [os.environ["TRACKEVAL"], "-c", READS_MOT]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, text=True).stdout
+    ids, truth, confidences = json.loads(said.splitlines()[-1])
+    assert ids == truth and [len(frame) for frame in ids] == [1, 0, 2]
+    assert ids[0][0] in ids[2] and len(set(ids[2])) == 2
+    assert confidences == [[0.9], [], [0.9, 0.25]]
 
 
 def test_what_is_missing_is_named(log, tmp_path, monkeypatch, capsys):
