@@ -38,7 +38,7 @@ class BoostedTrees:
     A node is a question, ``x[split] <= threshold``, that leads to the node `yes` or `no`, or a leaf, which
     leads to itself. A child stands behind its parent, and has one.
 
-    All questions are asked at once, in the order of memory. Of the leaves of a tree in their order from `yes`
+    All questions are asked at once, those that several trees ask once. Of the leaves of a tree in their order from `yes`
     to `no`, an answer "no" rules out those on its `yes` side; x reaches the first one that is left.
     C. Lucchese et al., "QuickScorer: a fast algorithm to rank documents with additive ensembles of regression
     trees", SIGIR 2015.
@@ -58,9 +58,11 @@ class BoostedTrees:
     value: FloatArray  # shape (trees, nodes): Of leaves
     tree_class: IndexArray  # shape (trees,): Which class's score a tree adds to
     baseline: FloatArray  # shape (classes,)
-    # Questions of all trees side by side, the bits of the leaves that are left after "no"; then the leaves.
-    _asked: IndexArray = field(init=False, repr=False)  # shape (questions, trees)
-    _limit: FloatArray = field(init=False, repr=False)  # shape (questions, trees)
+    # Of what all trees ask, each once: which input, and the threshold. By questions of the trees side by side
+    # which of these it is, and the bits of the leaves that are left after "no"; then the leaves.
+    _asked: IndexArray = field(init=False, repr=False)  # shape (different ones,)
+    _limit: FloatArray = field(init=False, repr=False)  # shape (different ones,)
+    _which: IndexArray = field(init=False, repr=False)  # shape (questions, trees)
     _left: AnyArray = field(init=False, repr=False)  # shape (questions, trees)
     _leaves: FloatArray = field(init=False, repr=False)  # shape (trees, leaves)
 
@@ -112,12 +114,15 @@ class BoostedTrees:
         asked, limit = np.zeros(shape, np.intp), np.full(shape, np.inf)
         left, leaves = np.full(shape, 2**most - 1, word), np.zeros((trees, most))
         asked[at], limit[at] = self.split[row, node], self.threshold[row, node]
+        pairs, which = np.unique(np.stack([asked, limit], axis=-1).reshape(-1, 2), axis=0, return_inverse=True)
         one = word.type(1)
         ruled_out = (one << count[row, self.yes[row, node]].astype(word)) - one
         left[at] &= ~(ruled_out << first[row, node].astype(word))
         row, node = np.nonzero(~asks & (first >= 0))
         leaves[row, first[row, node]] = self.value[row, node]
-        for name, value in (("_asked", asked), ("_limit", limit), ("_left", left), ("_leaves", leaves)):
+        object.__setattr__(self, "_asked", pairs[:, 0].astype(np.intp))
+        object.__setattr__(self, "_limit", np.ascontiguousarray(pairs[:, 1]))
+        for name, value in (("_which", which.reshape(shape)), ("_left", left), ("_leaves", leaves)):
             object.__setattr__(self, name, value)
 
     def scores(self, X: FloatArray) -> FloatArray:
@@ -126,8 +131,8 @@ class BoostedTrees:
         ends = np.empty((len(X), trees), np.intp)
         # Row by row, what a row takes stays in the cache.
         for row, end in zip(X, ends, strict=True):
-            yes = (row.take(self._asked) <= self._limit).astype(self._left.dtype)
-            left = np.bitwise_and.reduce(self._left | -yes, axis=0)
+            yes = -(row.take(self._asked) <= self._limit).astype(self._left.dtype)
+            left = np.bitwise_and.reduce(self._left | yes.take(self._which), axis=0)
             # The lowest bit alone is a power of two.
             end[:] = np.frexp((left & -left).astype(np.float64))[1]
         ends += np.arange(trees) * leaves - 1
