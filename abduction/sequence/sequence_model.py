@@ -38,8 +38,8 @@ class BoostedTrees:
     A node is a question, ``x[split] <= threshold``, that leads to the node `yes` or `no`, or a leaf, which
     leads to itself. A child stands behind its parent, and has one.
 
-    All questions are asked at once, those that several trees ask once. Of the leaves of a tree in their order from `yes`
-    to `no`, an answer "no" rules out those on its `yes` side; x reaches the first one that is left.
+    All questions are asked at once, those that several trees ask once. Of the leaves of a tree in the order
+    from `yes` to `no`, an answer "no" rules out those on its `yes` side; x reaches the first that is left.
     C. Lucchese et al., "QuickScorer: a fast algorithm to rank documents with additive ensembles of regression
     trees", SIGIR 2015.
 
@@ -114,7 +114,8 @@ class BoostedTrees:
         asked, limit = np.zeros(shape, np.intp), np.full(shape, np.inf)
         left, leaves = np.full(shape, 2**most - 1, word), np.zeros((trees, most))
         asked[at], limit[at] = self.split[row, node], self.threshold[row, node]
-        pairs, which = np.unique(np.stack([asked, limit], axis=-1).reshape(-1, 2), axis=0, return_inverse=True)
+        every = np.stack([asked, limit], axis=-1).reshape(-1, 2)
+        pairs, which = np.unique(every, axis=0, return_inverse=True)
         one = word.type(1)
         ruled_out = (one << count[row, self.yes[row, node]].astype(word)) - one
         left[at] &= ~(ruled_out << first[row, node].astype(word))
