@@ -23,6 +23,7 @@ from worldstate.abduction.sequence.sequence_model import (
 )
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.belief.settings import FilterSettings
+from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Tracks, born
 from worldstate.core.memory import first_memory
 from worldstate.core.sequence_memory import ArrivalRate
@@ -381,6 +382,13 @@ def test_one_that_came_into_view_unseen_is_not_the_one_that_comes_behind_it() ->
     assert abs(now.azimuth_rad) < abs(before.azimuth_rad)
     # The chance that another one comes is what the reading says.
     assert worlds[33].belief.risks[0] == pytest.approx(0.49, abs=0.03)
+
+
+def test_rounding_makes_no_chance_to_be_hidden_negative() -> None:
+    """All that is hidden may be another one."""
+    more = float(np.nextafter(0.3, 1.0))
+    sides = SideBelief((0.3, 0.0), (0.5, 0.0), (0.3, 0.0), 0.3, (0.3, 0.5, 0.2), 0.0, (more, 0.0, more))
+    assert [sides.hidden_share(side) for side in (0, None)] == [0.0, 0.0]
 
 
 def test_one_who_may_have_come_from_either_side_is_one_and_two_are_two() -> None:

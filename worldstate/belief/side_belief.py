@@ -46,7 +46,8 @@ class SideBelief:
         """Return P(hidden | exists) of the vehicle believed there."""
         existence = self.existence(side)
         another = self.another[-1 if side is None else side] if self.another else 0.0
-        return min((self.hidden_on(side) - another) / existence, 1.0) if existence > 0.0 else 1.0
+        own = max(self.hidden_on(side) - another, 0.0)  # Rounding may leave less than nothing
+        return min(own / existence, 1.0) if existence > 0.0 else 1.0
 
     def side_shares(self, least: float) -> tuple[float, ...]:
         """Return P(side | one vehicle of unknown side exists), zero below the least, shape (K,)."""

@@ -250,21 +250,21 @@ def _returning(memory: Memory, k: int, site: SiteGeometry) -> int | None:
         i: site.sides[k].distance_rad(at)
         for i, at in azimuth_rad.items()
         # A camera that has died since says nothing of it.
-        if _searched_ns(memory, at) - tracks.last_seen_ns[i] >= REOCCLUSION_NS
+        if _searched_ns(memory, at) >= int(tracks.last_seen_ns[i]) + REOCCLUSION_NS
     }
     near = (i for i, apart in apart_rad.items() if apart <= _REOCCLUSION_RAD)
     return min(near, key=apart_rad.__getitem__, default=None)
 
 
 def _searched_ns(memory: Memory, azimuth_rad: float) -> int:
-    """Return when a sensor last searched an azimuth."""
+    """Return when a sensor last searched an azimuth, `NEVER_NS` if none has."""
     asked = (one for one in memory.looks.values() if not isinstance(one.answer, Unqueried))
     there = (
         one.stamp_ns
         for one in asked
         if one.sector_rad is None or Sector.between(*one.sector_rad).touches(azimuth_rad)
     )
-    return max(there, default=0)
+    return max(there, default=NEVER_NS)
 
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.

@@ -278,7 +278,7 @@ class SequenceMemory:
 
     @property
     def _another(self) -> tuple[float, ...]:
-        r"""Return P(the vehicle believed there has come into view unseen, and another one is hidden), (3,).
+        r"""P(the vehicle believed there has come into view unseen, and another one is hidden), shape (3,).
 
         .. math:: u\, l\, \frac{e}{e + n + (1 - u)\, l}, \qquad
                   e = q(seen)\, \frac{u}{1 - (1 - u)(1 - o)}
