@@ -263,7 +263,7 @@ def look(
     readings: list[tuple[object, ...]] = []
     rate_hz, number = video.frame_rate_hz, -1
     period = max(round(HEALTH_PERIOD_S * rate_hz), 1)
-    with _one_opencv_thread():
+    with one_opencv_thread():
         for number, frame in enumerate(video.frames()):
             small = reduced_to(frame, width_px)  # Once for all detectors
             for state in conditions:
@@ -339,7 +339,7 @@ def _centre(frame: ImageArray) -> ImageArray:
 
 
 @contextmanager
-def _one_opencv_thread() -> Iterator[None]:
+def one_opencv_thread() -> Iterator[None]:
     """Keep OpenCV on the calling thread: recordings are what is worked on side by side."""
     cv2 = optional("cv2")
     before = cv2.getNumThreads()

@@ -1,0 +1,133 @@
+"""Boxes of a detector on staged videos: each recording decoded once, every state of the camera searched.
+
+The files have the layout of `boxes/ID.json`, `OUT/DETECTOR-FAMILY-LEVEL/ID.json`, and are the cache: what
+exists is not searched again. An image that was not searched is null, one that was searched in vain is empty.
+"""
+
+import importlib.util
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from worldstate.adapters.camera.detections import DetectionFrame, Detector
+from worldstate.adapters.camera.detectors import MotionDetector, reduced_to
+from worldstate.adapters.camera.video import open_video
+from worldstate.adapters.files.file_io import write_json
+from worldstate.ground.errors import InputFileError
+from worldstate_lab.degradation.conditions import Condition, camera_conditions, one_opencv_thread
+
+from .recordings import CornerRecording
+
+# Half of the camera's 1936: crops of 832 pixels are then the 416 of the network, and staging costs a quarter.
+WIDTH_PX, REDUCED = 968, 2.0
+MODEL = Path("detector", "nanodet_m.onnx")
+# Of a search every second image halves an hour of inference; a motion detector has to see every image.
+EVERY = {"nanodet": 2, "motion": 1}
+_EXAMPLE = Path(__file__).resolve().parents[3] / "docs" / "examples" / "nanodet.py"
+
+
+@dataclass(frozen=True, slots=True)
+class Staging:
+    """What is searched by which detector, and where its boxes go.
+
+    Examples
+    --------
+    >>> staging = Staging(Path("out"), "motion", MotionDetector)
+    >>> staging.path(Condition("blur", 2), "1_00_0002").as_posix()
+    'out/motion-blur-2/1_00_0002.json'
+    """
+
+    out: Path
+    detector: str
+    make: Callable[[], Detector]  # A new one for every recording and state
+    every: int = 1
+    states: tuple[Condition, ...] = camera_conditions()
+    seed: int = 0
+
+    def folder(self, state: Condition) -> Path:
+        """Return the folder of a state."""
+        return self.out / "-".join([self.detector, state.family, *([str(state.level)] * bool(state.level))])
+
+    def path(self, state: Condition, name: str) -> Path:
+        """Return the file of a recording in a state."""
+        return self.folder(state) / f"{name}.json"
+
+    def missing(self, recording: CornerRecording) -> tuple[Condition, ...]:
+        """Return the states that a recording was not searched in."""
+        return tuple(one for one in self.states if not self.path(one, recording.name).exists())
+
+
+def staging_of(detector: str, folder: Path, out: Path, seed: int = 0) -> Staging:
+    """Return how a named detector searches the recordings of a folder."""
+    make: Callable[[], Detector] = MotionDetector
+    if detector == "nanodet":
+        make = partial(opened_nanodet, folder / MODEL)
+        make()  # What is wrong with a model is stated before the work begins
+    return Staging(out, detector, make, EVERY[detector], seed=seed)
+
+
+@cache
+def opened_nanodet(model: Path) -> Detector:
+    """Open NanoDet for reduced images, once a process: it has no state."""
+    example = nanodet_example()
+    crops = [tuple(value / REDUCED for value in crop) for crop in example.OVAD_CROPS]
+    opened: Detector = example.open_nanodet(model, crops)
+    return opened
+
+
+@cache
+def nanodet_example() -> ModuleType:
+    """Import the decoder, which is a plug-in among the examples and no part of a package."""
+    spec = importlib.util.spec_from_file_location("nanodet", _EXAMPLE)
+    if spec is None or spec.loader is None or not _EXAMPLE.is_file():
+        raise InputFileError(_EXAMPLE, "expected the example of a detector; it comes with the repository")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def stage_recording(staging: Staging, recording: CornerRecording) -> int:
+    """Search a recording in the states that are missing; return the number of searches."""
+    states = staging.missing(recording)
+    if not states:
+        return 0
+    video = open_video(recording.video)
+    detectors = [staging.make() for _ in states]
+    rows: list[list[Any]] = [[] for _ in states]
+    with one_opencv_thread():
+        for at, image in enumerate(video.frames()):
+            small = reduced_to(image, WIDTH_PX)
+            reduced = image.shape[1] / small.shape[1]
+            for state, detector, into in zip(states, detectors, rows, strict=True):
+                searched = at % staging.every == 0
+                rng = _generator(staging.seed, recording.name, state, at)
+                found = detector.detect(state.stage(small, rng, reduced)) if searched else None
+                into.append(None if found is None else _boxes(found, reduced))
+    for state, into in zip(states, rows, strict=True):
+        _write(
+            staging.path(state, recording.name), into, (video.width_px, video.height_px), video.frame_rate_hz
+        )
+    return sum(row is not None for into in rows for row in into)
+
+
+def _generator(seed: int, name: str, state: Condition, image: int) -> np.random.Generator:
+    """Return the generator of one image, so that what is staged depends on no other and on no detector."""
+    return np.random.default_rng([seed, zlib.crc32(f"{name} {state.name}".encode()), image])
+
+
+def _boxes(found: DetectionFrame, reduced: float) -> list[list[Any]]:
+    """Return boxes in pixels of the camera, as the layout has them."""
+    edges = np.round(found.boxes_px * reduced, 1).tolist()
+    scores = np.round(found.scores, 3).tolist()
+    return [[*box, score, label] for box, score, label in zip(edges, scores, found.labels, strict=True)]
+
+
+def _write(path: Path, frames: Sequence[Any], size: tuple[int, int], rate_hz: float) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, {"frames": frames, "size": size, "fps": round(rate_hz, 3)})
