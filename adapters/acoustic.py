@@ -30,6 +30,7 @@ from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.given_spectra import GivenSpectra, SpectrumFrontEnd
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.hop_spectra import falling
 from worldstate.frontend.settings import FrontEndSettings
@@ -166,6 +167,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if isinstance(sequence, SequenceReader):
             front_end_settings = replace(front_end_settings, level_band_hz=LEVEL_BAND_HZ)
         self.source = "acoustic"
+        self.front_end: FrontEnd | SpectrumFrontEnd
         self.front_end = FrontEnd(array, sample_rate_hz, front_end_settings, start_ns=start_ns)
         self.last_frame: AcousticFrame | None = None
         self._model = model
@@ -196,6 +198,11 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         """
         return [self.interpret(frame) for frame in self.front_end.process(block)]
 
+    def take_spectra(self, spectra: GivenSpectra, start_ns: int) -> None:
+        """Read spectra that were computed elsewhere, and one channel of sound."""
+        rate, settings = self.front_end.sample_rate_hz, self.front_end.settings
+        self.front_end = SpectrumFrontEnd(spectra, rate, settings, start_ns=start_ns)
+
     def set_no_source_probability(self, none_probability: float) -> None:
         """Say how likely it is, after the last measurement, that no source is there.
 
@@ -212,7 +219,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         InvalidArgumentError
             If it is out of range.
         """
-        if self.front_end.settings.ego_noise:
+        if isinstance(self.front_end, FrontEnd) and self.front_end.settings.ego_noise:
             self.front_end.learn_ego_noise(none_probability)
 
     def interpret(self, frame: AcousticFrame) -> Measurement:
@@ -312,6 +319,8 @@ def heard_of(frame: AcousticFrame) -> Heard:
     The least of what lost samples and noise, channels that are left out, clipping and a loud source in view
     leave.
     """
+    if frame.heard is None:
+        return Heard(measured=False)
     if (frame.feature <= 0.0).any():
         # No two microphones that are trusted.
         return Heard(0.0, frame.unheard or "dead channels")

@@ -21,6 +21,7 @@ from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras, Visi
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.fixed_lag import Timed
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.given_spectra import GivenSpectra, SpectrumFrontEnd
 from worldstate.frontend.settings import HOP_RATE_HZ
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError
@@ -91,7 +92,7 @@ class Senses:
         The last images of each camera, by its name.
     """
 
-    ears: FrontEnd
+    ears: FrontEnd | SpectrumFrontEnd
     eyes: Mapping[str, VisionQuery]
 
 
@@ -108,6 +109,9 @@ class Listener:
     start_s : float, optional
         Time of the first sample on the clock of the states; 0 where not given, or with a checkpoint of
         another listener its last sample.
+    spectra : GivenSpectra, optional
+        Spatial spectra that another front-end computed for the array of the model; blocks then hold one
+        channel. The snapshots state no budget, and how well could be heard is null.
     **parts
         As `open_source` takes them: `model`, `camera`, `miss_rates`, `context`, `sides`, `moving_ego`,
         `settings`, and `resume`, a `Checkpoint` or a file of one. The checkpoint of a listener goes on at the
@@ -140,6 +144,7 @@ class Listener:
         sample_rate_hz: float,
         *,
         start_s: float | None = None,
+        spectra: GivenSpectra | None = None,
         **parts: Unpack[ListenerParts],
     ) -> None:
         self._blind = not isinstance(array, Source) and parts.get("camera") is None
@@ -150,6 +155,9 @@ class Listener:
             raise InvalidArgumentError(f"{given}: expected nothing beside a source, which has all of it")
         else:
             source = array
+        if spectra is not None:
+            # Nobody has set a threshold with this front-end: no budget is stated.
+            source = replace(source, policy=replace(source.policy, alpha=0.0))
         self.world = source.world()
         self._source, self._rate_hz = source, sample_rate_hz
         self._signature, self._reader = source.signature(), source.reader()
@@ -168,6 +176,8 @@ class Listener:
             front_end_settings=source.settings.front_end(source.array, sample_rate_hz),
             uncalibrated=source.settings.uncalibrated,
         )
+        if spectra is not None:
+            self._adapter.take_spectra(spectra, source.start_ns)
         # What the belief to go on from has taken in already, or what was told before it began, is left out.
         self._since_ns = source.start_ns - 1 if source.before is None else self.world.stamp_ns
         self._waiting = _Waiting(source.others, self._since_ns)

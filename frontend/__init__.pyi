@@ -21,6 +21,7 @@ from .direction.gcc_phat import PairDelays as PairDelays
 from .direction.gcc_phat import gcc_delays as gcc_delays
 from .direction.music import count_sources as count_sources
 from .direction.music import music_spectrum as music_spectrum
+from .given_spectra import GivenSpectra as GivenSpectra
 from .health.channel_health import ArrayHealth as ArrayHealth
 from .health.channel_health import ChannelFault as ChannelFault
 from .settings import FrontEndSettings as FrontEndSettings

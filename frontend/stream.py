@@ -85,9 +85,10 @@ class AcousticFrame:
     lost : float
         Share of the samples of the decision window that are lost: constant or repeated in all channels. STFT
         frames that hold lost samples are left out of everything here; means are over the others.
-    heard : float
+    heard : float or None
         Share that could be heard, of the newest hop or of the window, whichever is less; 0 where less than .4
         of the window is left. Hops of which less than .2 could be heard are left out of everything here.
+        None where it is not measured: of given spectra.
     unheard : str or None
         Why the rest could not: "lost samples", "wind" or "noise far above this place's usual".
     excess_db : float
@@ -122,7 +123,7 @@ class AcousticFrame:
     tone: ToneReading | NotUsable = TONE_IS_OFF
     character: FloatArray | NotUsable = CHARACTER_IS_OFF
     lost: float = 0.0
-    heard: float = 1.0
+    heard: float | None = 1.0
     excess_db: float = 0.0
     unheard: str | None = None
 

@@ -74,7 +74,7 @@ _ALIKE_RAD = math.radians(7.0)
 _NO_SIDE = ("whether the array is mirrored or turned: only sound from a known side (--heard-from) shows it",)
 
 
-class _Hypothesis:
+class Hypothesis:
     """What plane waves and a diffuse field explain, for positions (M, 3) and frequencies (K,)."""
 
     def __init__(self, positions_m: FloatArray, frequencies_hz: FloatArray) -> None:
@@ -156,7 +156,7 @@ class PositionCheck:
         bands = min(max(_BANDS // n, _FEWEST), _MOST, len(bins) // wide)
         first = np.linspace(0, len(bins) - wide, bands).astype(int)
         self._bands = first[:, None] + np.arange(wide)
-        self._frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
+        self.frequencies_hz = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
         self._frames_a_part = round(2.0 * _PART_S * sample_rate_hz / nfft)
         # What independent noise reaches by chance.
         self._noise = 1.0 / (self._frames_a_part * wide)
@@ -190,8 +190,8 @@ class PositionCheck:
             few = f"{_PART_S * len(kept):.2g} s of sound that all microphones hear, 2 s are needed"
             return PositionVerdict(unjudged=(f"order and size: {few}",))
         heard = np.array([coherence for _, coherence in kept])
-        claimed = self._positions, self._frequencies, np.flatnonzero(usable)
-        return _Comparison(*claimed, heard, self._noise).verdict(heard_from_rad)
+        claimed = self._positions, self.frequencies_hz, np.flatnonzero(usable)
+        return Comparison(*claimed, heard, self._noise).verdict(heard_from_rad)
 
 
 def _power(coherence: Complex64Array) -> float:
@@ -200,7 +200,7 @@ def _power(coherence: Complex64Array) -> float:
     return float(np.square(np.abs(coherence)).mean() * n / (n - 1))
 
 
-class _Comparison:
+class Comparison:
     """Hypotheses about some of the channels, (m,), that hear the same parts, coherence (S, K, M, M)."""
 
     def __init__(
@@ -212,10 +212,10 @@ class _Comparison:
         noise: float,
     ) -> None:
         self._positions = positions_m[channels] - positions_m[channels].mean(axis=0)
-        self._frequencies, self._channels = frequencies_hz, channels
+        self.frequencies_hz, self._channels = frequencies_hz, channels
         self._coherence = coherence[:, :, channels][..., channels]
         self._power = (_power(self._coherence) - noise) * self._coherence[..., 0, 0].size
-        self._claimed = _Hypothesis(self._positions, frequencies_hz)
+        self._claimed = Hypothesis(self._positions, frequencies_hz)
 
     def verdict(self, heard_from_rad: float | None) -> PositionVerdict:
         """Compare orders first, then sizes in the best order, then the mounting of what fits."""
@@ -291,7 +291,7 @@ class _Comparison:
     def _best_size(self, order: IndexArray) -> tuple[float | None, bool, tuple[str, ...]]:
         """Return the size that fits better, whether any order would fit as well, and what cannot be told."""
         heard = self._in_order(order)
-        found = {size: _Hypothesis(self._positions * size, self._frequencies) for size in (*_RIGHT, *_OFF)}
+        found = {size: Hypothesis(self._positions * size, self.frequencies_hz) for size in (*_RIGHT, *_OFF)}
         energy = {size: one.best(heard) for size, one in found.items()}
         right, off = (max(some, key=lambda size: energy[size].sum()) for some in (_RIGHT, _OFF))
         is_off = self._gain(energy[off], energy[right]) > _SIZE_GAIN
@@ -307,7 +307,7 @@ class _Comparison:
         ]
         return None, False, (f"{' or '.join(unsure)} the size: this sound fits both",) if unsure else ()
 
-    def _by_chance(self, hypothesis: _Hypothesis, explained: FloatArray) -> bool:
+    def _by_chance(self, hypothesis: Hypothesis, explained: FloatArray) -> bool:
         rng = np.random.default_rng(0)
         orders = (rng.permutation(len(self._positions)) for _ in range(_RANDOM_ORDERS))
         return any(

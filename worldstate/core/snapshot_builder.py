@@ -249,7 +249,8 @@ def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
 
 def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
     """Return how well every source that listens could hear; of one that is silent nothing is known."""
-    listening = [(name, one) for name, one in sorted(memory.rules.items()) if not one.announced]
+    every = sorted(memory.rules.items())
+    listening = [(name, one) for name, one in every if not one.announced and one.heard.measured]
     told = tuple(
         Hearing(name, one.heard.share, one.heard_ns, one.heard.reason)
         for name, one in listening

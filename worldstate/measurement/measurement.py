@@ -104,6 +104,8 @@ class Heard:
         against it.
     excess_db : float
         How far the sound lies above what is usual at this place, dB.
+    measured : bool
+        False where nothing measures the share; the snapshot then states none.
 
     Raises
     ------
@@ -119,6 +121,7 @@ class Heard:
     share: Probability = 1.0
     reason: str | None = None
     excess_db: float = field(default=0.0, metadata=ADDED)
+    measured: bool = field(default=True, metadata=ADDED)
 
     @property
     def usable(self) -> bool:
@@ -126,7 +129,7 @@ class Heard:
         return self.share >= LEAST_HEARD
 
     def __post_init__(self) -> None:
-        check_fields(self, share=(0.0, 1.0), reason=str | None, excess_db=(-1e3, 1e3))
+        check_fields(self, share=(0.0, 1.0), reason=str | None, excess_db=(-1e3, 1e3), measured=bool)
 
 
 @dataclass(frozen=True, slots=True)

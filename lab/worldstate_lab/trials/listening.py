@@ -87,12 +87,12 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     """
     source = open_source(take.path, settings=ListenSettings(alpha=None, uncalibrated=True))
     vision = source.camera_channel()
-    boxes = _boxes(source, vision)
+    boxes = box_table(source, vision)
     truth = _truth(take, boxes)
     pairs = list(measure_steps(replace(source, model=_Silent())))
-    frames = [_slim(frame) for frame, _ in pairs]
+    frames = [frame_row(frame) for frame, _ in pairs]
     stream = hop_stream((m for _, m in pairs), name=take.name)
-    reference = np.array([_reference(frame, vision) for frame, _ in pairs])
+    reference = np.array([reference_rad(frame, vision) for frame, _ in pairs])
     seen = np.isfinite(reference)
     with open_audio(source.audio_path, strict=False) as audio:
         music = _music(audio, source.array, [frame for frame, _ in pairs], seen)
@@ -136,9 +136,14 @@ def model_refusal(take: Take, model: Model) -> str | None:
 def chain_tables(take: Take, chain: str, model: Path | None = None) -> dict[str, HopTable]:
     """Return what the whole chain said of a recording: `decisions`, `tracks` and its hop `stream`."""
     source = open_source(take.path, model=model, settings=CHAINS[chain])
+    return tables_of_steps(take.name, listen_steps(source))
+
+
+def tables_of_steps(name: str, steps: Iterable[Step]) -> dict[str, HopTable]:
+    """Return `decisions`, `tracks` and the hop `stream` of the steps of a recording."""
     rows, tracks, measured, grounded = [], [], [], []
     identities: dict[str, int] = {}
-    for step in listen_steps(source):
+    for step in steps:
         measured.append(step.measurement)
         grounded.append([_grounded(step, grounding) for grounding in (Grounding(), RATELESS)])
         rows.append(_decided(step.state))
@@ -146,7 +151,7 @@ def chain_tables(take: Take, chain: str, model: Path | None = None) -> dict[str,
             if entity.moving and entity.existence_probability >= LIKELY:
                 number = identities.setdefault(entity.id, len(identities))
                 tracks.append((seconds(step.state.stamp_ns), number, entity.azimuth_rad))
-    stream = hop_stream(measured, name=take.name)
+    stream = hop_stream(measured, name=name)
     return {
         "decisions": HopTable.of_rows(DECISION_COLUMNS, rows),
         "tracks": HopTable.of_rows(TRACK_COLUMNS, tracks),
@@ -200,7 +205,7 @@ def pass_time_s(truth: HopTable) -> float | None:
     return float(when) if 0.0 < when - time_s[-1] < LONGEST_FORECAST_S else None
 
 
-def _slim(frame: AcousticFrame) -> tuple[Any, ...]:
+def frame_row(frame: AcousticFrame) -> tuple[Any, ...]:
     """Keep of a hop what methods read, so that an hour of sound stays within some ten megabytes."""
     slope = np.nan if isinstance(frame.looming, NotUsable) else frame.looming.log_slope_hz
     # Of the decision window, not of the shorter one that the bearing is read from: the paper's prominence.
@@ -232,7 +237,8 @@ def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
     return (np.nan, np.nan if horizon_s is None else horizon_s, np.nan)
 
 
-def _boxes(source: Source, vision: VisionQuery) -> HopTable:
+def box_table(source: Source, vision: VisionQuery) -> HopTable:
+    """Return the boxes of a camera with the columns of a trial."""
     log = source.detections
     rows: list[tuple[Any, ...]] = []
     for number, frame in enumerate(() if log is None else log.frames):
@@ -258,11 +264,12 @@ def _truth(take: Take, boxes: HopTable) -> HopTable:
         moments = zip(track.time_s, track.azimuth_rad, track.in_view, strict=True)
         rows += [(time_s, vehicle, azimuth, seen) for time_s, azimuth, seen in moments]
     if not rows and take.t0_s is not None:
-        rows = _widest_moving(boxes)
+        rows = widest_moving(boxes)
     return HopTable.of_rows(TRUTH_COLUMNS, rows)
 
 
-def _widest_moving(boxes: HopTable) -> list[tuple[float, int, float, bool]]:
+def widest_moving(boxes: HopTable) -> list[tuple[float, int, float, bool]]:
+    """Return where the widest moving box of each image stands, as rows of the truth of a trial."""
     widest: dict[float, tuple[float, float]] = {}
     for i in np.flatnonzero(boxes.moving):
         width = float(boxes.box_px[i, 2] - boxes.box_px[i, 0])
@@ -271,7 +278,7 @@ def _widest_moving(boxes: HopTable) -> list[tuple[float, int, float, bool]]:
     return [(time_s, 0, azimuth, True) for time_s, (_, azimuth) in sorted(widest.items())]
 
 
-def _reference(frame: AcousticFrame, vision: VisionQuery) -> float:
+def reference_rad(frame: AcousticFrame, vision: VisionQuery) -> float:
     """Azimuth of the moving box that is nearest to the acoustic bearing, NaN without one."""
     # Half a camera period on: the image nearest in time to the middle of the bearing's window.
     stamp = nanoseconds(seconds(frame.stamp_ns) - frame.bearing_age_s + 0.5 * HOP_S)

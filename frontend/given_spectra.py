@@ -1,0 +1,202 @@
+"""Spatial spectra that another front-end computed, and one channel of sound: one `AcousticFrame` a hop."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import Steering, one_blas_thread
+from worldstate.frontend.direction.bearing import (
+    BearingScatter,
+    about_the_peak,
+    bearing_of,
+    find_peaks,
+    noise_prominence,
+    uniform_std_rad,
+)
+from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD, FEATURE_SEGMENTS
+from worldstate.frontend.spectra.sound_character import SoundCharacter
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, nanoseconds
+from worldstate.ground.checks import check_shape, freeze_arrays, in_range
+from worldstate.ground.typing import Float32Array
+
+from .hop_spectra import SILENCE, Hop, HopCutter, LevelMeter, hop_end, mean_square_per_bin
+from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
+from .stream import CHARACTER_IS_OFF, AcousticFrame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenSpectra:
+    r"""Pair sums of SRP-PHAT that were computed elsewhere, one row a hop of 0.1 s from the start.
+
+    .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_{t,k} \sum_{i<j}
+              \overline{a_{k,i}}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j} \Big|, \qquad P = M (M - 1) / 2
+
+    Parameters
+    ----------
+    values : ndarray, shape (hops, azimuths)
+        In (0, 1]: the form of the published feature, without the diagonal.
+    azimuths_rad : ndarray, shape (azimuths,)
+        Ascending, evenly spaced, left positive; from -90 to 90 degrees at least.
+    array : MicrophoneArray
+        The M microphones that they were computed from.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a value is out of range, or the azimuths do not ascend over the sector ahead.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
+    >>> ahead = np.radians(np.linspace(-90.0, 90.0, 180))
+    >>> GivenSpectra(np.full((30, 180), 0.2), ahead, roof_array_56()).values.shape
+    (30, 180)
+    """
+
+    values: FloatArray
+    azimuths_rad: FloatArray
+    array: MicrophoneArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, values=(None, None), azimuths_rad=(None,))
+        check_shape("values", self.values.shape, (None, len(self.azimuths_rad)))
+        if not (np.diff(self.azimuths_rad) > 0.0).all() or np.ptp(self.azimuths_rad) < np.pi - 1e-6:
+            raise InvalidArgumentError("azimuths_rad: expected ascending ones from -90 to 90 degrees")
+        if not ((self.values > 0.0) & (self.values <= 1.0)).all():
+            raise InvalidArgumentError("values: expected pair sums in (0, 1]")
+
+
+class SpectrumFrontEnd:
+    r"""What `FrontEnd` computes from M channels, from given spectra and one channel.
+
+    Feature, spectrum, bearing and prominence come from the spectra; levels, looming and character from the
+    sound. The spectrum is the pair sum F itself, which SRP-PHAT of many microphones comes near: its diagonal
+    adds 1 / M. The channels' health and the share that could be heard are not measured.
+
+    Parameters
+    ----------
+    spectra : GivenSpectra
+        Hop k of the sound is row k.
+    sample_rate_hz : float
+        Of the sound; no resampling is done, so frames of `settings.nfft` must last as the published ones do.
+    settings : FrontEndSettings
+        Frames, bands and stages; the azimuths are those of the spectra.
+    start_ns : int
+        Time of the first sample, nanoseconds.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
+    >>> ahead = np.radians(np.linspace(-90.0, 90.0, 180))
+    >>> spectra = GivenSpectra(np.full((12, 180), 0.2), ahead, roof_array_56())
+    >>> front_end = SpectrumFrontEnd(spectra, 48_000, FrontEndSettings())
+    >>> sound = np.random.default_rng(0).standard_normal((60_000, 1))
+    >>> [(frame.sample_index, frame.feature.shape, frame.heard) for frame in front_end.process(sound)]
+    [(48000, (60,), None), (52800, (60,), None), (57600, (60,), None)]
+    """
+
+    def __init__(
+        self, spectra: GivenSpectra, sample_rate_hz: float, settings: FrontEndSettings, *, start_ns: int = 0
+    ) -> None:
+        if settings.heard_rate_hz is not None:
+            raise InvalidArgumentError(f"sample_rate_hz: expected about 48 kHz, got {sample_rate_hz:g} Hz")
+        self.spectra, self.array, self.settings = spectra, spectra.array, settings
+        self.sample_rate_hz = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
+        self._start_ns, self._used = start_ns, 0
+        with one_blas_thread():
+            self._least_prominence = self._noise_prominence()
+        self._rows = spectra.values
+        self._published = _at_published_azimuths(spectra)
+        self._scatter = BearingScatter(uniform_std_rad(spectra.azimuths_rad))
+        self._cutter = HopCutter(1, sample_rate_hz)
+        self._meter = LevelMeter(1, sample_rate_hz, settings)
+        band = band_bins(LOOMING_BAND_HZ, sample_rate_hz, settings.nfft)
+        self._stft = StreamingStft(1, settings.nfft, band)
+        self._character = SoundCharacter(sample_rate_hz) if settings.character else None
+        self._floor = EnergyFloor()
+        self._energies: deque[float] = deque(maxlen=WINDOW_HOPS)
+
+    def process(self, block: Float32Array) -> list[AcousticFrame]:
+        """Take samples (n, 1) of full scale 1; return one frame for every hop that has a spectrum.
+
+        Raises
+        ------
+        InvalidArgumentError
+            On another number of channels, NaN or infinity.
+        """
+        samples = np.ascontiguousarray(block, np.float32)
+        check_shape("block", samples.shape, (None, 1))
+        if not np.isfinite(samples).all():
+            raise InvalidArgumentError("block: expected finite numbers")
+        frames = [self._hop(hop) for hop in self._cutter.cut(samples)]
+        return [frame for frame in frames if frame is not None]
+
+    def finish(self) -> list[AcousticFrame]:
+        """Return nothing: no hop waits for later samples."""
+        return []
+
+    def skip(self, lost_ns: int) -> None:
+        """Refuse lost sound: the rows of the spectra count from its first sample."""
+        raise InvalidArgumentError(f"lost_ns: expected sound without a loss beside spectra, got {lost_ns}")
+
+    def _noise_prominence(self) -> float:
+        """Return the ratio up to which a peak is noise, as `FrontEnd` computes it for this array."""
+        rate, nfft = self.sample_rate_hz, self.settings.nfft
+        hz = bin_frequencies_hz(band_bins(self.settings.srp_band_hz, rate, nfft), rate, nfft)
+        beams = [Steering.towards(self.array, hz, self.spectra.azimuths_rad)]
+        return noise_prominence(beams, self.array, hz, BEARING_HOPS * 2.0 * rate / (HOP_RATE_HZ * nfft))
+
+    def _hop(self, hop: Hop) -> AcousticFrame | None:
+        levels = self._meter.push(hop.samples)
+        self._energies.append(self._energy(hop.samples))
+        self._floor.push(self._energies[-1])
+        if self._character is not None:
+            self._character.push(hop.samples[:, 0])
+        return self._frame(hop, levels) if WINDOW_HOPS <= hop.index <= len(self._rows) else None
+
+    def _energy(self, samples: Float32Array) -> float:
+        """Return the mean square in the looming band of the frames that end in a hop."""
+        return float(mean_square_per_bin(power(self._stft.push(samples)), self.settings.nfft).sum())
+
+    def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
+        rows, first = self._rows[: hop.index], hop.index - WINDOW_HOPS
+        spectrum, azimuths = about_the_peak(rows[-BEARING_HOPS:].mean(axis=0), self.spectra.azimuths_rad)
+        peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
+        bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
+        halves = self._published[first : hop.index].reshape(FEATURE_SEGMENTS, -1, self._published.shape[1])
+        return AcousticFrame(
+            stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
+            sample_index=hop_end(hop.index, self.sample_rate_hz),
+            azimuths_rad=self.spectra.azimuths_rad,
+            srp=rows[-WINDOW_HOPS:].mean(axis=0),
+            bearing_rad=bearing.azimuth_rad,
+            bearing_std_rad=bearing.std_rad,
+            prominence=bearing.prominence,
+            least_prominence=floor,
+            peaks=peaks,
+            band_log_energy=levels,
+            looming=self._looming(),
+            feature=halves.mean(axis=1).ravel(),
+            bearing_age_s=0.5 * BEARING_HOPS / HOP_RATE_HZ,
+            character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
+            heard=None,
+        )
+
+    def _looming(self) -> Looming | NotUsable:
+        energies = np.array(self._energies)
+        if len(energies) < MIN_POINTS or energies.min() <= SILENCE:
+            return NotUsable("silence within the window")
+        times_s = (np.arange(-len(energies), 0) + 0.5) / HOP_RATE_HZ
+        low, high = LOOMING_BAND_HZ
+        scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
+        return looming(times_s, np.log(energies), scatter, *self._floor.read(float(energies.min()), scatter))
+
+
+def _at_published_azimuths(spectra: GivenSpectra) -> FloatArray:
+    """Return the spectra at the thirty azimuths of the published feature, shape (hops, 30)."""
+    wanted = FEATURE_AZIMUTHS_RAD
+    return np.array([np.interp(wanted, spectra.azimuths_rad, row) for row in spectra.values])

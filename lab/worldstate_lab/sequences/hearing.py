@@ -1,0 +1,176 @@
+"""The product's chain on a recording of a corner, on either of two paths, as a trial that methods are given.
+
+On the path `seven` the spectra of seven microphones and one channel of sound stand in for the array of the
+model that ships; on the path `pair` the whole product runs on two channels, with a model made for them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from worldstate.abduction.sequence.sequence_inputs import COLUMNS, SIDES
+from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.files.model_file import Model
+from worldstate.adapters.listener import Listener, Step
+from worldstate.adapters.source import ListenSettings, Source, open_source
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+from worldstate.ground.typing import FloatArray
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.state import RiskCue, WorldState
+from worldstate_lab.trials.listening import (
+    box_table,
+    filtered_decisions,
+    frame_row,
+    reference_rad,
+    tables_of_steps,
+    unfiltered_decisions,
+    widest_moving,
+)
+from worldstate_lab.trials.pass_cache import ALPHA, SCORES
+from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
+
+from .recordings import NANODET_BOXES, CornerRecording
+
+PathName = Literal["seven", "pair"]
+# What the product publishes at every hop, by side where it has sides.
+PRODUCT_COLUMNS = (
+    "compared_nats",  # shape (2,): What the alarm of a side is decided by
+    "risk",  # shape (2,)
+    "within",  # shape (2, 4): Chances of coming into view by horizon; NaN without a reading
+    "hypotheses",  # shape (3,): Hidden, visible, none
+    "advised",  # shape (2,)
+    "side_nats",  # shape (2,): Log ratio of a vehicle hidden on a side to none or one in view, of the window
+    "groups",  # shape (2, groups): Posterior of the sequence by itself; NaN without
+    "inputs",  # shape (13,): What the sequence is given of the hop
+)
+_LEAST_NATS = -20.0  # Where nothing is compared yet
+
+
+_SETTINGS = ListenSettings(boxes=NANODET_BOXES)
+_NO_READING = np.full((len(SIDES), len(GROUPS)), np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """One way to run the product over recordings.
+
+    Parameters
+    ----------
+    path : {"seven", "pair"}
+        What hears.
+    model : Model
+        Made for what hears; on `seven` the one that ships.
+    array : MicrophoneArray
+        Of the model.
+    boxes : str or None
+        Folder of boxes beside the sound; None for no camera.
+    miss_rates : MissRates, optional
+        Of the detector; the library's defaults where not given.
+    settings : ListenSettings
+        How it listens.
+    """
+
+    path: PathName
+    model: Model
+    array: MicrophoneArray
+    boxes: str | None = "boxes"
+    miss_rates: MissRates | None = None
+    settings: ListenSettings = _SETTINGS
+
+    def source(self, recording: CornerRecording) -> Source:
+        """Return the recording with its model and its camera."""
+        return open_source(
+            recording.sound if self.path == "pair" else "spectra",
+            array=self.array,
+            detections=None if self.boxes is None else recording.boxes(self.boxes),
+            camera=PinholeCamera.ovad(),
+            miss_rates=self.miss_rates,
+            model=self.model,
+            settings=self.settings,
+        )
+
+    def steps(self, recording: CornerRecording) -> Iterator[Step]:
+        """Yield every hop of a recording."""
+        sound, rate_hz = recording.samples()
+        source = self.source(recording)
+        if self.path == "pair":
+            yield from Listener(source, rate_hz).steps(sound)
+        else:
+            yield from Listener(source, rate_hz, spectra=recording.spectra()).steps(sound[:, :1])
+
+
+def ovad_chain(model: Model, boxes: str | None = "boxes") -> Chain:
+    """Return the path `seven` with a model for OVAD's array."""
+    return Chain("seven", model, ovad_array(), boxes)
+
+
+def heard(chain: Chain, recording: CornerRecording) -> Trial:
+    """Return a recording as the product heard it.
+
+    Beside what every trial has, `chains["filtered"].tracks` are the product's and its hops hold
+    `PRODUCT_COLUMNS`.
+    """
+    source, steps = chain.source(recording), list(chain.steps(recording))
+    vision = source.camera_channel()
+    boxes = box_table(source, vision)
+    said = tables_of_steps(recording.name, steps)
+    stream = said["stream"]
+    rows = [frame_row(one.frame) for one in steps]
+    hops = HopTable.of_rows(("features", "prominence", "log_slope_hz", "bearing_rad"), rows)
+    product = HopTable.of_rows(PRODUCT_COLUMNS, map(_product_row, steps))
+    reference = np.array([reference_rad(one.frame, vision) for one in steps])
+    measured = ("time_s", "answer", "miss_rate", "clutter_rate", "approach", "seen")
+    table = HopTable(
+        {**{name: stream.columns[name] for name in measured}, **hops.columns, **product.columns},
+        recording.name,
+        recording.side,
+        np.nan if recording.hazard_free else recording.t0_s,
+        {"site": recording.junction, "moving": False, "camera": chain.boxes is not None},
+    ).replace(
+        reference_rad=reference,
+        srp_rad=np.where(np.isfinite(reference), hops.bearing_rad, np.nan),
+        bearing_std_rad=np.array([one.frame.bearing_std_rad for one in steps]),
+        shipped=stream.log_likelihoods,
+        grounded=stream.grounded,
+        rateless=stream.rateless,
+    )
+    prior = list(chain.model.signature.reference_prior)
+    about = {**table.about, "prior": dict.fromkeys(SCORES, prior)}
+    truth = HopTable.of_rows(TRUTH_COLUMNS, [] if recording.hazard_free else widest_moving(boxes))
+    policy = chain.model.policies.for_alpha(ALPHA)
+    chains = {"shipped": unfiltered_decisions(said, policy), "filtered": filtered_decisions(said)}
+    return Trial(table.replace(about=about), boxes, truth, chains)
+
+
+def _product_row(step: Step) -> tuple[FloatArray, ...]:
+    state, measured = step.state, step.measurement
+    cues = [_cue(state, side) for side in SIDES]
+    sides, reading = measured.signature.sides, measured.sequence
+    history = step.checkpoint.history
+    priors = cues[0].hypotheses
+    return (
+        np.array([_LEAST_NATS if one.evidence is None else one.evidence.compared_nats for one in cues]),
+        np.array([one.risk for one in cues]),
+        np.array([_chances(one) for one in cues]),
+        np.array([priors.hidden, priors.visible, priors.none]),
+        np.array([one.advisory is not None for one in cues]),
+        np.full(len(SIDES), np.nan) if sides is None else np.array(sides.log_ratios),
+        reading.groups if isinstance(reading, SequenceReading) else _NO_READING,
+        history.recent[-1] if history is not None and history.hops else np.full(len(COLUMNS), np.nan),
+    )
+
+
+def _cue(state: WorldState, side: str) -> RiskCue:
+    return next(one for one in state.cues if one.direction == side)
+
+
+def _chances(cue: RiskCue) -> list[float]:
+    """Return the chances of coming into view by horizon, NaN where nothing is stated."""
+    if cue.within is None:
+        return [np.nan] * len(HORIZONS_S)
+    return [cue.within[f"{horizon:g}"] for horizon in HORIZONS_S]
