@@ -1,0 +1,138 @@
+"""Spectra that another front-end computed, beside one channel of sound."""
+
+import numpy as np
+import pytest
+
+from worldstate.adapters.listener import Listener
+from worldstate.frontend import FrontEnd, FrontEndSettings, GivenSpectra, MicrophoneArray, ovad_array
+from worldstate.frontend.direction.feature import FEATURE_BAND_HZ
+from worldstate.frontend.given_spectra import SpectrumFrontEnd
+from worldstate.frontend.hop_spectra import hop_end
+from worldstate.ground import InvalidArgumentError
+
+RATE_HZ = 48_000
+AHEAD_RAD = np.radians(np.linspace(-90.0, 90.0, 180))
+SEVEN = MicrophoneArray(ovad_array().positions_m[::8])
+SETTINGS = FrontEndSettings(level_band_hz=(50.0, 2700.0), character=True)
+
+
+def plane_wave(azimuth_rad, rng, seconds=2.3):
+    """Return noise from one azimuth at the seven microphones, and as much noise between them, (n, 7)."""
+    n = int(seconds * RATE_HZ)
+    hz = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
+    source = np.fft.rfft(rng.standard_normal(n))
+    delays = -(SEVEN.positions_m @ [np.cos(azimuth_rad), np.sin(azimuth_rad), 0.0]) / 343.0
+    shifted = [np.fft.irfft(source * np.exp(-2j * np.pi * hz * late), n) for late in delays]
+    return 0.05 * (np.stack(shifted, axis=1) + 0.5 * rng.standard_normal((n, 7)))
+
+
+def pair_sums(sound):
+    """Return the pair sums of every hop by pyroomacoustics' STFT and a plain loop over pairs, (hops, 180)."""
+    transform = pytest.importorskip("pyroomacoustics").transform.stft
+    hz = np.arange(1, 257) * RATE_HZ / 512
+    inside = (hz >= FEATURE_BAND_HZ[0]) & (hz < FEATURE_BAND_HZ[1])
+    units = np.stack([np.cos(AHEAD_RAD), np.sin(AHEAD_RAD), 0.0 * AHEAD_RAD])
+    late_s = -(SEVEN.positions_m @ units) / 343.0
+    rows = []
+    for k in range(len(sound) * 10 // RATE_HZ):
+        hop = sound[hop_end(k, RATE_HZ) : hop_end(k + 1, RATE_HZ)]
+        spectra = transform.analysis(hop, 512, 256, win=np.hanning(513)[:-1])[:, 1:257][:, inside]
+        whitened = spectra / np.abs(spectra)
+        total = np.zeros(len(AHEAD_RAD), complex)
+        for i in range(7):
+            for j in range(i + 1, 7):
+                cross = (whitened[:, :, i] * whitened[:, :, j].conj()).mean(axis=0)
+                turn = np.exp(2j * np.pi * np.outer(late_s[i] - late_s[j], hz[inside]))
+                total += turn @ cross / inside.sum()
+        rows.append(np.abs(total) / 21.0)
+    return np.array(rows)
+
+
+def given(sound):
+    return GivenSpectra(pair_sums(sound), AHEAD_RAD, SEVEN)
+
+
+@pytest.mark.parametrize("azimuth_deg", [-40.0, 0.0, 25.0])
+def test_frames_are_those_of_the_channels_that_the_spectra_are_of(azimuth_deg):
+    rng = np.random.default_rng(3)
+    sound = plane_wave(np.radians(azimuth_deg), rng)
+    frames = SpectrumFrontEnd(given(sound), RATE_HZ, SETTINGS).process(sound[:, :1])
+    whole = FrontEnd(SEVEN, RATE_HZ, SETTINGS).process(sound)
+    assert [one.stamp_ns for one in frames] == [one.stamp_ns for one in whole]
+    for one, other in zip(frames, whole, strict=True):
+        assert np.degrees(one.bearing_rad) == pytest.approx(azimuth_deg, abs=2.0)
+        # Frames that straddle two hops are in neither pair sum.
+        assert np.corrcoef(one.feature, other.feature)[0, 1] > 0.99
+        assert np.log(one.feature).mean() == pytest.approx(np.log(other.feature).mean(), abs=0.1)
+
+
+def test_levels_and_looming_are_those_of_the_one_channel():
+    rng = np.random.default_rng(4)
+    louder = np.exp(np.linspace(0.0, 2.0, int(2.3 * RATE_HZ)))[:, None]
+    sound = (plane_wave(0.3, rng) * louder).astype(np.float32)
+    frames = SpectrumFrontEnd(given(sound), RATE_HZ, SETTINGS).process(sound[:, :1])
+    twice = MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
+    quiet = FrontEndSettings(level_band_hz=(50.0, 2700.0), watch_channels=False, character=True)
+    whole = FrontEnd(twice, RATE_HZ, quiet).process(np.repeat(sound[:, :1], 2, axis=1))
+    for one, other in zip(frames, whole, strict=True):
+        np.testing.assert_allclose(one.band_log_energy, other.band_log_energy, atol=1e-5)
+        assert one.looming.inverse_tta_hz == pytest.approx(other.looming.inverse_tta_hz, rel=0.05)
+    np.testing.assert_allclose(frames[-1].character, whole[-1].character, atol=1e-4)
+
+
+def test_blocks_of_any_length_give_the_same_states():
+    rng = np.random.default_rng(5)
+    sound = plane_wave(0.5, rng).astype(np.float32)[:, :1]
+    spectra = GivenSpectra(rng.uniform(0.1, 0.3, (22, 180)), AHEAD_RAD, SEVEN)
+    whole = Listener(ovad_array(), RATE_HZ, spectra=spectra).push(sound)
+    listener = Listener(ovad_array(), RATE_HZ, spectra=spectra)
+    pieces = [state for block in np.array_split(sound, 37) for state in listener.push(block)]
+    # The last hop of the sound has no spectrum.
+    assert len(whole) == 13 and pieces == whole
+
+
+def test_a_checkpoint_goes_on_at_the_next_sample():
+    rng = np.random.default_rng(6)
+    sound = plane_wave(0.5, rng).astype(np.float32)[:, :1]
+    spectra = GivenSpectra(rng.uniform(0.1, 0.3, (23, 180)), AHEAD_RAD, SEVEN)
+    listener = Listener(ovad_array(), RATE_HZ, spectra=spectra)
+    listener.push(sound[:70_000])
+    other = Listener(ovad_array(), RATE_HZ, spectra=spectra, resume=listener.checkpoint())
+    assert other.push(sound[70_000:]) == listener.push(sound[70_000:])
+
+
+def test_what_is_not_measured_is_stated_as_unknown():
+    rng = np.random.default_rng(7)
+    spectra = GivenSpectra(rng.uniform(0.1, 0.3, (15, 180)), AHEAD_RAD, SEVEN)
+    states = Listener(ovad_array(), RATE_HZ, spectra=spectra).push(plane_wave(0.5, rng)[:, :1])
+    assert states[-1].heard is None and not states[-1].calibrated
+    assert states[-1].to_dict()["heard"] is None
+    assert all(cue.alpha is None for cue in states[-1].cues)
+
+
+@pytest.mark.parametrize(
+    ("values", "azimuths", "told"),
+    [
+        (np.full((3, 180), 0.2), AHEAD_RAD[::-1], "ascending"),
+        (np.full((3, 180), 0.2), AHEAD_RAD / 2.0, "-90 to 90"),
+        (np.full((3, 90), 0.2), AHEAD_RAD, "values"),
+        (np.zeros((3, 180)), AHEAD_RAD, "pair sums"),
+        (np.full((3, 180), 1.2), AHEAD_RAD, "pair sums"),
+        (np.full((3, 180), np.nan), AHEAD_RAD, "values"),
+    ],
+)
+def test_spectra_that_are_no_pair_sums_are_refused(values, azimuths, told):
+    with pytest.raises(InvalidArgumentError, match=told):
+        GivenSpectra(values, azimuths, SEVEN)
+
+
+def test_sound_that_does_not_fit_the_spectra_is_refused():
+    spectra = GivenSpectra(np.full((15, 180), 0.2), AHEAD_RAD, SEVEN)
+    front_end = SpectrumFrontEnd(spectra, RATE_HZ, SETTINGS)
+    for block in (np.zeros((10, 2)), np.full((10, 1), np.nan)):
+        with pytest.raises(InvalidArgumentError, match="block"):
+            front_end.process(block)
+    with pytest.raises(InvalidArgumentError, match="loss"):
+        Listener(ovad_array(), RATE_HZ, spectra=spectra).skip(10**9)
+    with pytest.raises(InvalidArgumentError, match="48 kHz"):
+        SpectrumFrontEnd(spectra, 16_000, FrontEndSettings.heard_at(16_000))
