@@ -25,7 +25,7 @@ from worldstate.adapters.camera.detections import YOLO_CLASSES
 from worldstate.adapters.camera.detectors import suppress
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.extras import optional
-from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageArray
 
 # Pixels a side of the network's input, and its normalisation: blue, green, red.
 SIDE_PX = 416
@@ -35,13 +35,17 @@ STRIDES_PX = (8, 16, 32)
 # The distance to each side of a box is the expected value over so many bins, in strides.
 BINS = 8
 MIN_SCORE = 0.3
-MOST_OVERLAP = 0.6  # NanoDet's own; crops show what lies in both twice
+# Of two boxes that overlap by more the better one is kept, of any class: one vehicle is a car and a truck.
+MOST_OVERLAP = 0.5
+# An inner edge of a crop cuts vehicles in two. Such a part counts for less than the whole, which another crop
+# shows, and is dropped if so much of it lies in a better box.
+CUT_PX, CUT_SCORE, MOST_WITHIN = 6.0, 0.8, 0.7
 # The network's classes are COCO's eighty; those of the road stand at these places.
 CLASSES = tuple(YOLO_CLASSES)
 
 Crop = tuple[float, float, float]  # Left, top, side; pixels of the image
 # Three across an image of 1936 x 1216 pixels: in the middle they hold the street, above them is sky.
-OVAD_CROPS: tuple[Crop, ...] = ((0.0, 336.0, 832.0), (552.0, 336.0, 832.0), (1104.0, 336.0, 832.0))
+OVAD_CROPS: tuple[Crop, ...] = ((0.0, 337.0, 832.0), (552.0, 337.0, 832.0), (1104.0, 337.0, 832.0))
 
 
 class NanoDet:
@@ -61,20 +65,37 @@ class NanoDet:
 
     def detect(self, frame: ImageArray, /) -> DetectionFrame:
         """Return road users in an image (height, width, 3), blue first."""
+        width, height = frame.shape[1], frame.shape[0]
         found = [self._in_crop(frame, crop) for crop in self._crops]
         boxes, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
         best, names = scores.max(axis=1), scores.argmax(axis=1)
-        # Classes do not suppress each other: each lies in a plane of its own.
-        kept = suppress(boxes + 1e5 * names[:, None], best, MOST_OVERLAP)
+        kept = suppress(boxes, best, MOST_OVERLAP)
+        kept = kept[~_within_better(boxes[kept])]
         labels = tuple(YOLO_CLASSES[CLASSES[at]] for at in names[kept])
-        height, width = frame.shape[:2]
         return DetectionFrame(np.clip(boxes[kept], 0.0, [width, height] * 2), best[kept], labels)
 
     def _in_crop(self, frame: ImageArray, crop: Crop) -> tuple[FloatArray, FloatArray]:
         left, top, side = crop
         outputs = self._session.run(None, {self._input: as_input(cut(frame, crop))})
-        boxes, scores = decoded(outputs)
-        return boxes * (side / SIDE_PX) + [left, top] * 2, scores
+        inner, scores = decoded(outputs)
+        boxes = inner * (side / SIDE_PX) + [left, top] * 2
+        near_px = CUT_PX * side / 832.0
+        parted = (left > 0) & (boxes[:, 0] < left + near_px)
+        parted |= (left + side < frame.shape[1]) & (boxes[:, 2] > left + side - near_px)
+        return boxes, scores * np.where(parted, CUT_SCORE, 1.0)[:, None]
+
+
+def _within_better(boxes: FloatArray) -> BoolArray:
+    """Return which boxes, the best first, lie for the most part in a better one, or such a one in them."""
+    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
+    common = np.clip(high - low, 0.0, None).prod(axis=2)
+    areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
+    share = common / np.maximum(np.minimum(areas[:, None], areas[None]), 1e-9)
+    dropped = np.zeros(len(boxes), bool)
+    for at in range(1, len(boxes)):
+        dropped[at] = bool((share[at, :at][~dropped[:at]] > MOST_WITHIN).any())
+    return dropped
 
 
 def cut(frame: ImageArray, crop: Crop) -> ImageArray:

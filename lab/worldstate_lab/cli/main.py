@@ -33,6 +33,7 @@ STUDIES = {
         "foreign",
         "kinds",
         "place",
+        "staged",
     )
 }
 BENCHES = {

@@ -274,7 +274,7 @@ def approach_section(found: Evaluation) -> Section:
     # Without OpenCV, or with a video that cannot be read, the rest of the figure stays.
     images: tuple[ApproachImage, ...] = ()
     with suppress(WorldstateError):
-        images = _approach_images(videos[trial.name], trial)
+        images = approach_images(videos[trial.name], trial)
     name = f"Approach {trial.name} at {trial.site}, from the {trial.label}"
     figure = approach_figure(f"{name}: lead {leads[middle]:.1f} s (paper's: 2.3 s)", trial, said, images)
     text = f"The approach with the median lead of the {detected.size} that {PROPOSED} detects."
@@ -332,7 +332,7 @@ def approach_figure(
     )
 
 
-def _approach_images(video: Path, trial: Trial) -> tuple[ApproachImage, ...]:
+def approach_images(video: Path, trial: Trial) -> tuple[ApproachImage, ...]:
     """Read the three images of an approach: hidden, just after T0, and at the pass.
 
     The pass is the image with the highest moving box.

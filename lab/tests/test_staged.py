@@ -1,0 +1,166 @@
+"""Staged videos of a corner, searched by a stand-in, and what is counted of them: no recording is needed."""
+
+import json
+from itertools import chain
+
+import cv2
+import numpy as np
+import pytest
+from worldstate_lab.cli.main import main
+from worldstate_lab.degradation.conditions import Condition
+from worldstate_lab.metrics.intervals import stratified_draws
+from worldstate_lab.sequences import staged_video
+from worldstate_lab.sequences.recordings import NANODET_BOXES, read_boxes, read_recordings
+from worldstate_lab.sequences.staged_looks import (
+    box_choices,
+    left_out_choices,
+    staged_beta,
+    vision_row,
+    watched_images,
+)
+from worldstate_lab.sequences.staged_video import Staging, stage_recording
+
+from worldstate.adapters.camera.detections import DetectionFrame
+
+WIDTH, HEIGHT, IMAGES, T0 = 240, 162, 40, 2.0
+# Of the video's first and last row nothing is searched, and NanoDet's stand-in searches every second image.
+CLEAN, DARK, NOISY = Condition("clean"), Condition("darkness", 4), Condition("noise", 1)
+
+
+def block(number):
+    """Return left and right of what moves from the image of T0 on, None before."""
+    left = 6 * (number - 20)
+    return (left, left + 60) if left >= 0 else None
+
+
+class Bright:
+    """A detector of one bright block."""
+
+    def detect(self, frame):
+        columns = np.flatnonzero(frame[frame.shape[0] // 2, :, 0] > 150)
+        if not columns.size:
+            return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+        box = [[float(columns[0]), 30.0, float(columns[-1] + 1), 130.0]]
+        return DetectionFrame(np.array(box), np.array([0.8]), ("car",))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two junctions with an approach and a hazard-free recording each, as the recordings lie."""
+    folder = tmp_path_factory.mktemp("corner")
+    rows = [
+        (f"{name}{site}", site, side)
+        for site in ("SA1", "SB3")
+        for name, side in (("a", "left"), ("n", "none"))
+    ]
+    lines = [f"{name},{site},{side},{T0},4.0," for name, site, side in rows]
+    (folder / "truth.csv").write_text("\n".join(["id,junction,side,t0_s,seconds,entry_exit", *lines]) + "\n")
+    for place in ("video", "boxes"):
+        (folder / place).mkdir()
+    for name, _, side in rows:
+        write_recording(folder, name, approach=side != "none")
+    return folder
+
+
+def write_recording(folder, name, approach):
+    codec = cv2.VideoWriter.fourcc(*"mp4v")
+    video = cv2.VideoWriter(str(folder / "video" / f"{name}.mp4"), codec, 10.0, (WIDTH, HEIGHT))
+    frames = []
+    for number in range(IMAGES):
+        image = np.full((HEIGHT, WIDTH, 3), 80, np.uint8)
+        place = block(number) if approach else None
+        if place:
+            image[31:131, slice(*place)] = 230
+        video.write(image)
+        frames.append([[place[0], 31, place[1], 131, 0.8, "car"]] if place else [])
+    video.release()
+    document = {"frames": frames, "size": [WIDTH, HEIGHT], "fps": 10.0}
+    (folder / "boxes" / f"{name}.json").write_text(json.dumps(document))
+
+
+@pytest.fixture(scope="module")
+def staging(folder, tmp_path_factory):
+    states = tuple(
+        Condition(family, level) for family in ("blur", "darkness", "noise") for level in (1, 2, 3, 4)
+    )
+    staging = Staging(tmp_path_factory.mktemp("staged"), "nanodet", Bright, 2, (CLEAN, *states))
+    for recording in read_recordings(folder):
+        assert stage_recording(staging, recording) == 13 * IMAGES / 2
+    return staging
+
+
+def test_a_state_has_the_layout_of_the_clean_boxes_and_is_searched_once(folder, staging):
+    recording = read_recordings(folder)[0]
+    document = json.loads(staging.path(CLEAN, recording.name).read_text())
+    assert (document["size"], document["fps"], len(document["frames"])) == ([WIDTH, HEIGHT], 10.0, IMAGES)
+    assert [one is None for one in document["frames"]] == [False, True] * (IMAGES // 2)
+    log = read_boxes(staging.path(CLEAN, recording.name))
+    assert np.diff(log.stamps_ns).tolist() == [200_000_000] * (IMAGES // 2 - 1)
+    (box,) = log.frames[-1].boxes_px
+    np.testing.assert_allclose(box, [108.0, 31.0, 168.0, 131.0], atol=3.0)
+    assert stage_recording(staging, recording) == 0
+
+
+def test_nothing_is_left_of_a_search_that_fails(folder, tmp_path):
+    class Failing(Bright):
+        def detect(self, frame):
+            found = super().detect(frame)
+            if len(found):
+                raise RuntimeError("out of memory")
+            return found
+
+    with pytest.raises(RuntimeError):
+        stage_recording(Staging(tmp_path, "failing", Failing, 1, (CLEAN,)), read_recordings(folder)[0])
+    assert not [*tmp_path.rglob("*.json")]
+
+
+def test_what_is_staged_depends_on_state_and_image_only(folder, staging, tmp_path):
+    recording = read_recordings(folder)[0]
+    alone = Staging(tmp_path, "nanodet", Bright, 2, (NOISY,))
+    stage_recording(alone, recording)
+    assert alone.path(NOISY, recording.name).read_bytes() == staging.path(NOISY, recording.name).read_bytes()
+
+
+def test_least_score_and_height_are_those_that_find_the_vehicle_and_nothing_else(folder):
+    watched = [watched_images(one) for one in read_recordings(folder)]
+    assert [len(one.images) for one in watched] == [20, 30, 20, 30]
+    best = box_choices(watched)[0]
+    assert (best.found, best.false) == (1.0, 0.0)
+    assert watched[0].seen(0.8, 99.0) == 20
+    assert not watched[0].seen(0.81, 0.0) and not watched[0].seen(0.0, 100.0)
+    assert [*left_out_choices(watched)] == ["SA1", "SB3"]
+
+
+def test_the_dark_camera_is_not_aware_and_the_clean_one_is(folder, staging):
+    recordings = read_recordings(folder)
+    approaches = [one for one in recordings if not one.hazard_free]
+    draws = stratified_draws([one.junction for one in approaches], np.random.default_rng(0), draws=20)
+    clean, dark = (vision_row(staging, state, recordings, draws) for state in (CLEAN, DARK))
+    assert (clean.looks, clean.aware.value, dark.aware.value) == (20, 1.0, 0.0)
+    assert clean.hazard_free == {"SA1": 0.0, "SB3": 0.0}
+    curves = staged_beta(staging, approaches, draws)
+    darkness = curves.overall.value[1]
+    assert darkness[0] == 0.0 and darkness[-1] == 1.0
+    assert curves.looks[:, :, 0].sum() == 3 * 20
+    assert not [one for one in curves.falls if one.along == "degradation" and one.where.startswith("dark")]
+
+
+def test_the_command_stages_and_prints_what_it_counted(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(staged_video, "opened_nanodet", lambda model: Bright())
+    words = ["staged", str(folder), "--out", str(tmp_path / "staged")]
+    assert main([*words, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["recordings"] == 4
+    assert len(report["choice"]["tried"]) == 49 and [*report["choice"]["left_out"]] == ["SA1", "SB3"]
+    states = [*report["vision"]]
+    assert len(states) == 17 and states[0] == "clean" and states[-1] == "lens 1"
+    rates = chain.from_iterable(
+        chain.from_iterable(one.values()) for one in report["beta"]["by_angle"].values()
+    )
+    assert all(one is None or 0.0 <= np.ravel(one)[0] <= 1.0 for one in rates)
+    assert main(words) == 0
+    assert "camera alone" in capsys.readouterr().out
+
+
+def test_boxes_that_count_are_named_once():
+    assert (NANODET_BOXES.min_score, NANODET_BOXES.min_height_px) == (0.3, 60.0)
