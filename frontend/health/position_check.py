@@ -33,11 +33,11 @@ from .geometry_check import PlaneWaves, diffuse_coherence
 # A frame, and a part of the sound in which one source dominates: a syllable of speech.
 _FRAME_S, _PART_S = 0.032, 0.25
 # Up to here every exchange of two channels is tried. One hypothesis of 56 channels takes half a second.
-_FEW = 16
+FEW = 16
 # Parts kept, those with the most coherent sound; bands times channels, the fewest and the most bands.
 _PARTS, _BANDS, _FEWEST, _MOST = 60, 192, 10, 24
 # Two seconds: below, one word decides.
-_LEAST_PARTS = 8
+LEAST_PARTS = 8
 # From waves of eight spacings, whose phases begin to differ, to those that alias a little; an array whose
 # numbers are inches is judged by waves that a smaller one hears, too.
 _BAND, _LEAST_TOP_HZ, _BOTTOM_HZ = (0.25, 1.5), 2000.0, (200.0, 1000.0)
@@ -54,13 +54,13 @@ _OFF = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0, 10.0, 25.4, 39.37
 # Least gain of another order and of another size in the logarithm of what is left unexplained, and in
 # standard deviations. Simulated rooms: right orders lose by 0.5 and more, right sizes by 0.09 (rings of 4)
 # and 0.01 (56 microphones, of which one direction explains a tenth); wrong sizes gain by 0.02 and more.
-_ORDER_GAIN, _SIZE_GAIN, _SIGMAS = 0.05, 0.015, 4.0
+_ORDER_GAIN, SIZE_GAIN, _SIGMAS = 0.05, 0.015, 4.0
 # Mean square of the coherence below which there is no sound that all microphones hear.
 _COHERENT = 0.02
 # Of four microphones every order is few exchanges away.
 _RANDOM_ORDERS, _LEAST_BY_CHANCE, _MOSTLY = 3, 4, 0.6
 # Sizes that a sound must exclude before the one claimed is called right.
-_OFF_BY_30 = (0.77, 1.3)
+OFF_BY_30 = (0.77, 1.3)
 # Least share of the coherent energy that is counted as unexplained, and distance over the extent of the array
 # within which two microphones count as in one place.
 _LEAST_LEFT, _SAME_PLACE = 0.02, 0.05
@@ -71,7 +71,7 @@ _DIRECT, _PARTS_OF_ONE = 0.5, 0.8
 _SIDE_RAD = math.radians(15.0)
 _ALIKE_RAD = math.radians(7.0)
 
-_NO_SIDE = ("whether the array is mirrored or turned: only sound from a known side (--heard-from) shows it",)
+NO_SIDE = ("whether the array is mirrored or turned: only sound from a known side (--heard-from) shows it",)
 
 
 class Hypothesis:
@@ -146,7 +146,7 @@ class PositionCheck:
 
     def __init__(self, array: MicrophoneArray, sample_rate_hz: float) -> None:
         n = array.n_microphones
-        self._positions = array.positions_m
+        self.positions_m, self.sample_rate_hz = array.positions_m, sample_rate_hz
         nfft = 2 ** round(math.log2(_FRAME_S * sample_rate_hz))
         low, high = (share * array.alias_hz() for share in _BAND)
         top = min(max(high, _LEAST_TOP_HZ), 0.45 * sample_rate_hz)
@@ -156,7 +156,7 @@ class PositionCheck:
         bands = min(max(_BANDS // n, _FEWEST), _MOST, len(bins) // wide)
         first = np.linspace(0, len(bins) - wide, bands).astype(int)
         self._bands = first[:, None] + np.arange(wide)
-        self.frequencies_hz = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
+        self._frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
         self._frames_a_part = round(2.0 * _PART_S * sample_rate_hz / nfft)
         # What independent noise reaches by chance.
         self._noise = 1.0 / (self._frames_a_part * wide)
@@ -181,17 +181,25 @@ class PositionCheck:
     def _strongest(self) -> list[tuple[float, Complex64Array]]:
         return sorted(self._parts, key=lambda one: -one[0])[:_PARTS]
 
+    def heard(self) -> Complex64Array:
+        """Coherence (S, K, M, M) of the parts with the most sound that all microphones hear."""
+        kept = [coherence for power, coherence in self._strongest() if power > _COHERENT]
+        shape = len(self._frequencies), len(self.positions_m), len(self.positions_m)
+        return np.asarray(kept, np.complex64).reshape(-1, *shape)
+
+    def comparison(self, usable: BoolArray, heard: Complex64Array) -> "Comparison":
+        """Return what hypotheses about the usable channels (M,) are compared by, on parts that were heard."""
+        return Comparison(self.positions_m, self._frequencies, np.flatnonzero(usable), heard, self._noise)
+
     def verdict(self, usable: BoolArray, heard_from_rad: float | None = None) -> PositionVerdict:
         """Judge order and size of the usable channels (M,), by a sound of known azimuth their mounting."""
-        kept = [one for one in self._strongest() if one[0] > _COHERENT]
+        heard = self.heard()
         if np.count_nonzero(usable) < 3:
             return PositionVerdict(unjudged=("order and size: three usable microphones are needed",))
-        if len(kept) < _LEAST_PARTS:
-            few = f"{_PART_S * len(kept):.2g} s of sound that all microphones hear, 2 s are needed"
+        if len(heard) < LEAST_PARTS:
+            few = f"{_PART_S * len(heard):.2g} s of sound that all microphones hear, 2 s are needed"
             return PositionVerdict(unjudged=(f"order and size: {few}",))
-        heard = np.array([coherence for _, coherence in kept])
-        claimed = self._positions, self.frequencies_hz, np.flatnonzero(usable)
-        return Comparison(*claimed, heard, self._noise).verdict(heard_from_rad)
+        return self.comparison(usable, heard).verdict(heard_from_rad)
 
 
 def _power(coherence: Complex64Array) -> float:
@@ -212,14 +220,24 @@ class Comparison:
         noise: float,
     ) -> None:
         self._positions = positions_m[channels] - positions_m[channels].mean(axis=0)
-        self.frequencies_hz, self._channels = frequencies_hz, channels
+        self._frequencies, self._channels = frequencies_hz, channels
         self._coherence = coherence[:, :, channels][..., channels]
         self._power = (_power(self._coherence) - noise) * self._coherence[..., 0, 0].size
         self._claimed = Hypothesis(self._positions, frequencies_hz)
 
+    def explained(self, positions_m: FloatArray) -> FloatArray:
+        """Share of the coherent energy of all parts that positions (m, 3) explain in each, (S,)."""
+        best = Hypothesis(positions_m, self._frequencies).best(self._coherence)
+        return np.asarray(best / self._power)
+
+    def is_better(self, new_m: FloatArray, old_m: FloatArray) -> bool:
+        """Whether positions (m, 3) explain more than others by the gain that decides on a size."""
+        shares = (self._power * self.explained(one) for one in (new_m, old_m))
+        return self._gain(*shares) > SIZE_GAIN
+
     def verdict(self, heard_from_rad: float | None) -> PositionVerdict:
         """Compare orders first, then sizes in the best order, then the mounting of what fits."""
-        order, unsure = self._best_order()
+        order, unsure = self.best_order()
         size, by_chance, untold = self._best_size(order)
         if size is not None and self._is_one_wave:
             size, untold = None, ("the size: one wave shows none to an upright array",)
@@ -229,7 +247,7 @@ class Comparison:
             return PositionVerdict(order=tuple(self._channels[np.argsort(order)].tolist()))
         if size is not None:
             return PositionVerdict(size=size)
-        mounting, unheard = ((), _NO_SIDE) if heard_from_rad is None else self._mounting(heard_from_rad)
+        mounting, unheard = ((), NO_SIDE) if heard_from_rad is None else self._mounting(heard_from_rad)
         return PositionVerdict(mounting=mounting, unjudged=(*unsure, *untold, *unheard))
 
     @property
@@ -261,11 +279,11 @@ class Comparison:
         left = np.maximum(self._power - np.array([old.sum(), new.sum()]), _LEAST_LEFT * self._power)
         return math.log(left[0] / left[1])
 
-    def _best_order(self) -> tuple[IndexArray, tuple[str, ...]]:
+    def best_order(self) -> tuple[IndexArray, tuple[str, ...]]:
         """Exchange two channels as long as that explains more; return the order, and what cannot be told."""
         order = np.arange(len(self._positions))
         explained = self._claimed.best(self._coherence)
-        while len(order) <= _FEW:
+        while len(order) <= FEW:
             tried = [_exchanged(order, *pair) for pair in combinations(range(len(order)), 2)]
             found = [self._claimed.best(self._in_order(one)) for one in tried]
             best = int(np.argmax([one.sum() for one in found]))
@@ -291,10 +309,10 @@ class Comparison:
     def _best_size(self, order: IndexArray) -> tuple[float | None, bool, tuple[str, ...]]:
         """Return the size that fits better, whether any order would fit as well, and what cannot be told."""
         heard = self._in_order(order)
-        found = {size: Hypothesis(self._positions * size, self.frequencies_hz) for size in (*_RIGHT, *_OFF)}
+        found = {size: Hypothesis(self._positions * size, self._frequencies) for size in (*_RIGHT, *_OFF)}
         energy = {size: one.best(heard) for size, one in found.items()}
         right, off = (max(some, key=lambda size: energy[size].sum()) for some in (_RIGHT, _OFF))
-        is_off = self._gain(energy[off], energy[right]) > _SIZE_GAIN
+        is_off = self._gain(energy[off], energy[right]) > SIZE_GAIN
         size = off if is_off else right
         # Numbers in another unit fit in no order either, and what explains most of the sound is no chance.
         explains = energy[size].sum() > _MOSTLY * self._power
@@ -302,9 +320,7 @@ class Comparison:
             return None, True, ()
         if is_off:
             return off, False, ()
-        unsure = [
-            f"{one:g} times" for one in _OFF_BY_30 if self._gain(energy[right], energy[one]) < _SIZE_GAIN
-        ]
+        unsure = [f"{one:g} times" for one in OFF_BY_30 if self._gain(energy[right], energy[one]) < SIZE_GAIN]
         return None, False, (f"{' or '.join(unsure)} the size: this sound fits both",) if unsure else ()
 
     def _by_chance(self, hypothesis: Hypothesis, explained: FloatArray) -> bool:

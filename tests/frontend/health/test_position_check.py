@@ -8,9 +8,12 @@ import pyroomacoustics as pra
 import pytest
 import soundfile
 
+from worldstate.adapters.files.array_file import read_array
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.health.fitted_positions import FittedPositions, fit_positions
 from worldstate.frontend.health.position_check import PositionCheck, PositionVerdict
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.emitters.syntheses import voice
 
 RATE = 16_000
@@ -36,10 +39,15 @@ def room(positions: np.ndarray, azimuths_deg: tuple[float, ...], seed: int = 0) 
     return (0.1 * (sound / sound.std() + noise)).astype(np.float32)
 
 
-def verdict(sound: np.ndarray, positions: np.ndarray, heard_from_deg: float | None = None) -> PositionVerdict:
+def taken(sound: np.ndarray, positions: np.ndarray) -> PositionCheck:
     check = PositionCheck(MicrophoneArray(positions), RATE)
     for start in range(0, len(sound), RATE):
         check.push(sound[start : start + RATE])
+    return check
+
+
+def verdict(sound: np.ndarray, positions: np.ndarray, heard_from_deg: float | None = None) -> PositionVerdict:
+    check = taken(sound, positions)
     heard_from = None if heard_from_deg is None else float(np.radians(heard_from_deg))
     return check.verdict(np.ones(len(positions), bool), heard_from)
 
@@ -127,3 +135,82 @@ def test_clipped_sound_is_impaired(
     limit = float(talkers.std())
     assert run(tmp_path, talkers.clip(-limit, limit), ring(6, 0.045)) == 1
     assert "impaired" in capsys.readouterr().out
+
+
+SQUARE = ring(4, 0.032)
+
+
+@pytest.fixture(scope="module")
+def around() -> list[np.ndarray]:
+    """Two recordings of talkers from six sides each."""
+    return [room(SQUARE, tuple(range(turn, 360, 60)), seed=turn) for turn in (0, 30)]
+
+
+def fitted(sounds: list[np.ndarray], claimed: np.ndarray) -> FittedPositions:
+    return fit_positions([taken(one, claimed) for one in sounds], np.ones(len(claimed), bool))
+
+
+def error_m(found: np.ndarray, there: np.ndarray) -> float:
+    """Largest distance of a microphone from where it stands, up to a turn or a mirror image."""
+    a, b = ((one - one.mean(axis=0))[:, :2] for one in (found, there))
+    u, _, v = np.linalg.svd(a.T @ b)
+    return float(np.linalg.norm(a @ (u @ v) - b, axis=1).max())
+
+
+@pytest.mark.parametrize(
+    "claimed",
+    [
+        1.4 * SQUARE,
+        0.7 * SQUARE,
+        SQUARE[[0, 2, 1, 3]],
+        SQUARE + 0.006 * np.random.default_rng(2).standard_normal((4, 3)) * [1.0, 1.0, 0.0],
+    ],
+)
+def test_positions_are_recovered_up_to_a_turn(around: list[np.ndarray], claimed: np.ndarray) -> None:
+    found = fitted(around, claimed)
+    assert error_m(found.positions_m, SQUARE) < 0.004
+    assert error_m(claimed, SQUARE) > 0.006
+    assert found.explained > found.explained_before + 0.005
+    assert not any("less than 4 s" in one for one in found.unjudged)
+    assert any("mirrored or turned" in one for one in found.unjudged)
+    assert any(one.startswith("z: 0.77 or 1.3 times") for one in found.unjudged)
+
+
+def test_fitting_true_positions_returns_them(around: list[np.ndarray]) -> None:
+    """Law, as everything is better by chance on the sound that it was fitted to: it is judged on another."""
+    found = fitted(around, SQUARE)
+    np.testing.assert_array_equal(found.positions_m, SQUARE)
+    assert found.explained == found.explained_before
+
+
+def test_an_unusable_channel_stays() -> None:
+    sound = np.column_stack([room(ring(5, 0.032), (-30.0, 0.0, 30.0), seed=3), np.zeros(3 * 2 * RATE)])
+    claimed = np.vstack([1.4 * ring(5, 0.032), [0.1, 0.2, 0.0]])
+    found = fit_positions([taken(sound.astype(np.float32), claimed)], np.arange(6) < 5)
+    np.testing.assert_array_equal(found.positions_m[5], claimed[5])
+    assert found.explained > found.explained_before
+
+
+def test_what_cannot_be_fitted_is_refused(around: list[np.ndarray]) -> None:
+    quiet = [np.zeros((4 * RATE, 4), np.float32)]
+    with pytest.raises(InvalidArgumentError, match="2 s of sound"):
+        fitted(quiet, SQUARE)
+    with pytest.raises(InvalidArgumentError, match="3 to 16"):
+        fit_positions([taken(quiet[0], SQUARE)], np.arange(4) < 2)
+    others = [taken(around[0], SQUARE), PositionCheck(MicrophoneArray(SQUARE), 48_000)]
+    with pytest.raises(InvalidArgumentError, match="one sample rate"):
+        fit_positions(others, np.ones(4, bool))
+
+
+def test_the_command_writes_an_array_file(
+    around: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    soundfile.write(tmp_path / "other.wav", around[1], RATE, subtype="PCM_24")
+    options = ("--fit", str(tmp_path / "fitted.xml"), "--also", str(tmp_path / "other.wav"))
+    run(tmp_path, around[0], 1.4 * SQUARE, *options)
+    printed = capsys.readouterr().out
+    assert "of the coherent sound, those given" in printed
+    assert "not fitted: z: 0.77 or 1.3 times" in printed
+    assert error_m(read_array(tmp_path / "fitted.xml").positions_m, SQUARE) < 0.004
+    assert run(tmp_path, around[0], SQUARE, "--also", "other.wav") == 2
+    assert "expected --fit" in capsys.readouterr().err

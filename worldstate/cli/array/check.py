@@ -8,6 +8,10 @@ exchanged or in another order, an array of another size.
 No sound tells whether an array is mirrored or turned: --heard-from DEG says where one sound came from, in
 degrees, left positive.
 
+--fit writes an array file with positions near those of --array that explain the sound better, and
+states by how much, on quarters of a second that were not fitted. What the sound does not show is named and
+stays as given. Sound from many sides is needed: --also names further recordings of the same array.
+
 Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
 and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
 ten for small ones; levels and gusts take six seconds, drifts twenty.
@@ -16,6 +20,7 @@ Examples
 --------
   worldstate array check some.wav --array mics.xml
   worldstate array check clapping.wav --array mics.xml --heard-from 40
+  worldstate array check some.wav --array mics.xml --fit fitted.xml --also other.wav third.wav
   worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json
 """
 
@@ -28,9 +33,12 @@ from typing import TYPE_CHECKING
 from worldstate import frontend
 from worldstate.cli.common import inputs, output, progress
 from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.serialisation import encode
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
+    from worldstate.frontend.health.fitted_positions import FittedPositions
+    from worldstate.frontend.health.position_check import PositionCheck
     from worldstate.operations.recordings.channel_report import RecordingHealth
 
 # Least extent in shortest waves; what metres are divided by where they are taken for another unit; extents of
@@ -49,20 +57,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--duration", type=float, metavar="S", help="its length by another clock, seconds")
     add("--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)")
     add("--heard-from", type=float, metavar="DEG", help="azimuth of the only source, left positive")
+    add("--fit", type=Path, metavar="XML", help="write positions that explain the sound better")
+    add("--also", type=Path, nargs="+", default=[], metavar="SOUND", help="for --fit: further recordings")
     add("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
+    from worldstate.adapters.files.array_file import write_array_xml
+    from worldstate.frontend.health.fitted_positions import fit_positions
     from worldstate.operations.recordings import channel_report
 
-    output.check_outputs(arguments, figures=("figure",))
+    output.check_outputs(arguments, "fit", figures=("figure",))
+    if arguments.also and arguments.fit is None:
+        raise InvalidArgumentError("--also: expected --fit, which alone hears further recordings")
     if arguments.heard_from is not None:
         in_range("--heard-from", arguments.heard_from, -360.0, 360.0)
     with inputs.opened_front_end(arguments) as (audio, front_end):
         array = front_end.array
         check_extent(array, front_end.settings.srp_band_hz[1])
-        health = examine(audio, front_end, arguments.heard_from)
+        health, check = examine(audio, front_end, arguments.heard_from)
         if arguments.duration is not None:
             rate = channel_report.rate_from_duration(
                 audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
@@ -70,6 +84,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
             health = replace(health, sample_rate=rate)
         heard = health, audio, array, inputs.stance(array)
         report, lines = channel_report.as_json(*heard), list(channel_report.as_text(*heard))
+    if arguments.fit is not None:
+        checks = [check, *(_heard(path, array) for path in arguments.also)]
+        fit = fit_positions(checks, health.hears_waves(array.n_microphones))
+        write_array_xml(arguments.fit, replace(array, positions_m=fit.positions_m.round(4)))
+        report, lines = report | {"fit": encode(fit)}, [*lines, *fit_lines(fit)]
     if arguments.figure is not None:
         channel_report.write_array_figure(array, health, arguments.figure)
     return output.CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
@@ -89,8 +108,8 @@ def check_extent(array: "frontend.MicrophoneArray", highest_hz: float) -> None:
 
 def examine(
     audio: "Audio", front_end: "frontend.FrontEnd", heard_from_deg: float | None = None
-) -> "RecordingHealth":
-    """Listen to an open recording to its end."""
+) -> "tuple[RecordingHealth, PositionCheck]":
+    """Listen to an open recording to its end; return what was found, and the check of positions."""
     from worldstate.frontend.health.position_check import PositionCheck
     from worldstate.operations.recordings.channel_report import HealthLog
 
@@ -104,4 +123,21 @@ def examine(
     health = log.summary()
     heard_from_rad = None if heard_from_deg is None else math.radians(heard_from_deg)
     usable = health.hears_waves(front_end.array.n_microphones)
-    return replace(health, positions=check.verdict(usable, heard_from_rad))
+    return replace(health, positions=check.verdict(usable, heard_from_rad)), check
+
+
+def _heard(path: Path, array: "frontend.MicrophoneArray") -> "PositionCheck":
+    from worldstate.adapters.audio.sound_file import open_sound
+    from worldstate.frontend.health.position_check import PositionCheck
+
+    with open_sound(path, array.n_microphones, channels=array.channels, strict=False) as audio:
+        check = PositionCheck(array, audio.sample_rate_hz)
+        for block in audio.blocks(audio.sample_rate_hz):
+            check.push(block)
+    return check
+
+
+def fit_lines(fit: "FittedPositions") -> list[str]:
+    """Lines of what fitted positions explain, and what the sound does not show."""
+    better = f"explain {fit.explained:.3f} of the coherent sound, those given {fit.explained_before:.3f}"
+    return [f"fit: these positions {better}", *(f"not fitted: {one}" for one in fit.unjudged)]
