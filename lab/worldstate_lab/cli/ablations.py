@@ -5,13 +5,16 @@ whatever the camera answered; the raw statistic read as the risk; looming added.
 weight of looming are set on other recordings, in five folds that are the same in every row.
 
 INPUT is a data set in the OVAD layout or hop streams that `worldstate model threshold --save-streams` wrote;
-approaches need a T0, and there have to be hazard-free recordings.
+approaches need a T0, and there have to be hazard-free recordings. A folder of the real corner (see
+`worldstate-lab sequences`) is heard on its spectra: with the camera trusted fully, with eq. (5), and as the
+whole product publishes it, for each folder of boxes in --boxes, which `worldstate-lab staged` writes.
 
 Examples
 --------
   worldstate sim make --out sim --static 40 && worldstate-lab ablations sim
   worldstate model threshold sim --out model.json --save-streams sim.npz
   worldstate-lab ablations sim.npz --json
+  worldstate-lab ablations ovad-sequences --boxes boxes staged/nanodet-blur-4 --miss-rates beta.json
 """
 
 import argparse
@@ -28,10 +31,12 @@ from worldstate.abduction.cueing.risk_map import (
     fit_isotonic,
 )
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.camera.miss_rates import load_miss_rates
+from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.cli.common.inputs import add_array_options, given_array
 from worldstate.cli.common.listening import read_streams
 from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.progress import track
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
@@ -51,6 +56,8 @@ from worldstate_lab.metrics.stream_statistic import (
     stream_statistic,
 )
 from worldstate_lab.report.table import figure_lines
+from worldstate_lab.sequences.hearing import ovad_chain
+from worldstate_lab.sequences.recordings import TRUTH, read_recordings
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,18 +276,43 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_array_options(parser)
     add("--model", type=Path, help="model file (default: the one that ships)")
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
+    add("--boxes", nargs="+", default=["boxes"], metavar="DIR", help="of a real corner (default: boxes)")
+    add("--miss-rates", type=Path, metavar="JSON", help="of the detector: one more row")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--seed", type=int, default=0, help="deals the folds (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    policy = read_model(arguments.model).policies.policies[0]
+    model = read_model(arguments.model)
+    policy = model.policies.policies[0]
     switches = AblationSwitches(alpha=arguments.alpha, sustain_hops=policy.sustain_hops)
+    if (arguments.inputs[0] / TRUTH).is_file():
+        return _corner(arguments, model, switches)
     streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     table = ablation_table(streams, policy.reference_prior, arguments.seed, switches)
     rows = {name: asdict(row) for name, row in table.items()}
     report = {"recordings": len(streams), "alpha": arguments.alpha, "rows": rows}
     return CommandResult(report, table={}, lines=figure_lines(rows))
+
+
+def _corner(arguments: argparse.Namespace, model: Model, switches: AblationSwitches) -> CommandResult:
+    """Return the rows of a real corner, a table for each folder of boxes."""
+    # The rows are formed by this module's own tables.
+    from worldstate_lab.sequences.camera_rows import corner_rows
+
+    recordings = read_recordings(arguments.inputs[0])
+    measured = None if arguments.miss_rates is None else load_miss_rates(arguments.miss_rates)
+    states, lines = {}, list[str]()
+    for boxes in track(arguments.boxes, "cameras"):
+        folder = boxes if (arguments.inputs[0] / boxes).is_dir() else str(Path(boxes).absolute())
+        chain = ovad_chain(model, folder)
+        rows = corner_rows(chain, recordings, measured, switches, arguments.seed, arguments.jobs)
+        states[Path(boxes).name] = rows
+        for kind, some in rows.items():
+            lines += ["", f"{Path(boxes).name}, {kind}:", *figure_lines(some)]
+    report = {"recordings": len(recordings), "alpha": arguments.alpha, "states": states}
+    return CommandResult(report, table={}, lines=lines)
 
 
 def presence_statistic(

@@ -5,7 +5,7 @@ model that ships; on the path `pair` the whole product runs on two channels, wit
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -71,6 +71,8 @@ class Chain:
         Folder of boxes beside the sound; None for no camera.
     miss_rates : MissRates, optional
         Of the detector; the library's defaults where not given.
+    degradation : float
+        d of the camera, where it is known.
     settings : ListenSettings
         How it listens.
     """
@@ -80,11 +82,12 @@ class Chain:
     array: MicrophoneArray
     boxes: str | None = "boxes"
     miss_rates: MissRates | None = None
+    degradation: float = 0.0
     settings: ListenSettings = _SETTINGS
 
     def source(self, recording: CornerRecording) -> Source:
         """Return the recording with its model and its camera."""
-        return open_source(
+        source = open_source(
             recording.sound if self.path == "pair" else "spectra",
             array=self.array,
             detections=None if self.boxes is None else recording.boxes(self.boxes),
@@ -93,6 +96,7 @@ class Chain:
             model=self.model,
             settings=self.settings,
         )
+        return replace(source, degradation=self.degradation)
 
     def steps(self, recording: CornerRecording) -> Iterator[Step]:
         """Yield every hop of a recording."""

@@ -1,0 +1,48 @@
+"""Ablations of a folder of the real corner, on a made-up one."""
+
+import json
+
+import numpy as np
+import pytest
+from made_up_corner import write_corner
+from worldstate_lab.cli.main import main
+from worldstate_lab.sequences.camera_rows import product_row
+
+from worldstate.operations.recordings.hop_table import HopTable
+
+
+def hops(name, label, t0_s, *, advised, present, seen):
+    """Return 20 hops from 1.0 s on with a state that does not change."""
+    time_s = 1.0 + 0.1 * np.arange(20)
+    columns = {
+        "time_s": time_s,
+        "advised": np.repeat([[advised, False]], 20, axis=0),
+        "hypotheses": np.repeat([[present, 0.0, 1.0 - present]], 20, axis=0),
+        "seen": np.full(20, seen),
+        "there": time_s > 2.0,
+    }
+    return HopTable(columns, name, label, t0_s, {"site": "SA1"})
+
+
+def test_what_is_known_without_a_detection_counts_as_awareness():
+    streams = [hops(f"f{i}", "none", np.nan, advised=False, present=0.1, seen=False) for i in range(5)]
+    streams += [hops(f"a{i}", "left", 2.0, advised=i < 3, present=0.9, seen=False) for i in range(5)]
+    row = product_row(streams, np.random.default_rng(0))
+    assert (row["warned"], row["approaches"], row["onsets"]) == (3, 5, 0)
+    assert (row["aware"], row["vision_only"], row["hazard_free_aware_SA1"]) == (1.0, 0.0, 0.0)
+
+
+def test_a_presence_as_high_as_in_quiet_streets_is_no_awareness():
+    streams = [hops(f"f{i}", "none", np.nan, advised=False, present=0.5, seen=False) for i in range(5)]
+    streams += [hops(f"a{i}", "left", 2.0, advised=False, present=0.5, seen=False) for i in range(5)]
+    assert product_row(streams, np.random.default_rng(0))["aware"] == 0.0
+
+
+@pytest.mark.long
+def test_the_command_prints_what_each_camera_is_worth(tmp_path, capsys):
+    folder = write_corner(tmp_path / "corner", np.random.default_rng(0), approaches=4, hazard_free=4)
+    assert main(["ablations", str(folder), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["states"]["boxes"]
+    assert {"full", "signature_only", "vision_trusted", "eq_5"} <= set(rows["statistic"])
+    assert {"product", "product, no camera", "product, vision trusted"} <= set(rows["product"])
+    assert rows["product"]["product, no camera"]["vision_only"] == 0.0

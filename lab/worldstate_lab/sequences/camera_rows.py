@@ -1,0 +1,159 @@
+"""What the camera, its miss rates and eq. (5) are worth on real recordings, and awareness by state."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+
+import numpy as np
+
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
+from worldstate.adapters.acoustic import Grounding
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.operations.metrics.approach_table import (
+    ApproachTable,
+    Figures,
+    mean_of,
+    onset_outcome,
+    rising_edges,
+)
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.simulation.parallel import in_processes
+from worldstate_lab.cli.ablations import AblationRow, AblationSwitches, ablation_table, evaluate_ablation
+from worldstate_lab.metrics.intervals import deal_folds
+
+from .hearing import Chain, heard
+from .recordings import CornerRecording
+
+# A camera that is trusted fully misses nothing; of a rate of zero the logarithm would be infinite.
+_NEVER = 1e-6
+TRUSTED = MissRates(
+    (0.0, 90.0), {"trusted": FamilyCounts(((1e9,) * 5,), ((0.0,) * 5,), (1e3,) * 5, (0.0,) * 5)}
+)
+
+
+def corner_rows(
+    chain: Chain,
+    recordings: Sequence[CornerRecording],
+    measured: MissRates | None,
+    switches: AblationSwitches,
+    seed: int,
+    jobs: int = 1,
+) -> dict[str, dict[str, Figures]]:
+    """Return the rows of the paper's statistic and of the product with one camera, by what they change."""
+    last_s = last_seen_s(recordings, chain)
+    made: dict[str, list[HopTable]] = {
+        name: corner_streams(one, recordings, last_s, jobs) for name, one in variants(chain, measured).items()
+    }
+    prior = list(chain.model.signature.reference_prior)
+    by_statistic = statistic_rows(made["product"], prior, seed, switches)
+    return {
+        "statistic": {name: asdict(row) for name, row in by_statistic.items()},
+        "product": {name: product_row(some, np.random.default_rng(seed)) for name, some in made.items()},
+    }
+
+
+def variants(chain: Chain, measured: MissRates | None) -> dict[str, Chain]:
+    """Return the product with one thing changed at a time."""
+    grounded = replace(chain.settings, grounding=Grounding())
+    found = {"product": chain, "product, vision trusted": replace(chain, miss_rates=TRUSTED)}
+    if chain.boxes == "boxes":
+        # Without a camera its state does not matter, and eq. (5) is about the sound.
+        found["product, no camera"] = replace(chain, boxes=None)
+        found["product, eq. (5)"] = replace(chain, settings=grounded)
+    if measured is not None:
+        found["product, measured beta"] = replace(chain, miss_rates=measured)
+    return found
+
+
+def corner_streams(
+    chain: Chain, recordings: Sequence[CornerRecording], last_seen_s: Mapping[str, float], jobs: int = 1
+) -> list[HopTable]:
+    """Hear recordings; column `there` says up to when the vehicle is in view, by the clean boxes."""
+    heard_hops = in_processes(partial(_stream, chain), recordings, jobs)
+    return [_with_truth(one, last_seen_s[one.name]) for one in heard_hops]
+
+
+def _stream(chain: Chain, recording: CornerRecording) -> HopTable:
+    hops = heard(chain, recording).hops
+    return hops.replace(log_likelihoods=hops.shipped)
+
+
+def _with_truth(hops: HopTable, last_s: float) -> HopTable:
+    return hops.replace(there=(hops.time_s > hops.t0_s) & (hops.time_s <= last_s))
+
+
+def last_seen_s(recordings: Sequence[CornerRecording], chain: Chain) -> dict[str, float]:
+    """Return when the clean boxes show the vehicle of each approach for the last time; T0 where never."""
+    found = {}
+    for one in recordings:
+        vision = replace(chain, boxes="boxes").source(one).camera_channel()
+        stamps = vision.detections.stamps_ns
+        seen = [any(box.moving for box in vision.sightings(int(stamp))) for stamp in stamps]
+        times_s = stamps[np.array(seen, bool)] * 1e-9
+        found[one.name] = float(times_s.max(initial=one.t0_s))
+    return found
+
+
+def statistic_rows(
+    streams: Sequence[HopTable], prior: Sequence[float], seed: int, switches: AblationSwitches
+) -> dict[str, AblationRow]:
+    """Return the rows of the paper's statistic: each part off, the camera trusted fully, eq. (5) on."""
+    trusted = [one.replace(miss_rate=np.full(len(one), _NEVER)) for one in streams]
+    changed = {
+        "vision_trusted": trusted,
+        "eq_5": [one.replace(log_likelihoods=one.grounded) for one in streams],
+        "eq_5_without_rate": [one.replace(log_likelihoods=one.rateless) for one in streams],
+    }
+    rows = {
+        name: evaluate_ablation(some, prior, np.random.default_rng(seed), switches)
+        for name, some in changed.items()
+    }
+    return {**ablation_table(streams, prior, seed, switches), **rows}
+
+
+def product_row(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float = 0.02) -> Figures:
+    """Return what the published states of recordings are worth.
+
+    `aware` is the share of the hops from T0 to the last image with the vehicle in which an object is seen, or
+    P(hidden) + P(visible) is above the threshold that a share alpha of hazard-free hops reaches, five folds;
+    `vision_only` is the share in which an object is seen.
+    """
+    approaches = [one for one in streams if not one.hazard_free]
+    free = [one for one in streams if one.hazard_free]
+    alarms = {one.name: np.asarray(one.advised.any(axis=1), bool) for one in streams}
+    outcomes = [onset_outcome(one.time_s[rising_edges(alarms[one.name])], one.t0_s) for one in approaches]
+    found = ApproachTable(outcomes, [alarms[one.name] for one in free]).figures()
+    aware = _aware(streams, rng, alpha)
+    sites = sorted({str(one.about["site"]) for one in free})
+    by_site = {site: [aware[one.name] for one in free if one.about["site"] == site] for site in sites}
+    in_view = {one.name: one.after_sight() for one in approaches}
+    return {
+        "warned": sum(one.detected for one in outcomes),
+        "approaches": len(approaches),
+        "lead_s": found["lead_s"],
+        "onsets": sum(len(rising_edges(alarms[one.name])) for one in free),
+        "advisory_share": found["hazard_free_share"],
+        "aware": mean_of(np.concatenate([aware[one.name][in_view[one.name]] for one in approaches])),
+        "vision_only": mean_of(np.concatenate([one.seen[in_view[one.name]] for one in approaches])),
+        **{f"hazard_free_aware_{site}": mean_of(np.concatenate(some)) for site, some in by_site.items()},
+    }
+
+
+def _aware(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float) -> dict[str, BoolArray]:
+    """Return by recording in which hops something is known to be there; thresholds of other folds."""
+    sites = [str(one.about["site"]) for one in streams]
+    folds = deal_folds([one.label for one in streams], sites, rng).tolist()
+    found = {}
+    for fold in set(folds):
+        others = [one for one, at in zip(streams, folds, strict=True) if at != fold and one.hazard_free]
+        gamma = neyman_pearson_threshold([_presence(one) for one in others], alpha)
+        for one, at in zip(streams, folds, strict=True):
+            if at == fold:
+                found[one.name] = np.asarray(one.seen.astype(bool) | (_presence(one) >= gamma))
+    return found
+
+
+def _presence(hops: HopTable) -> FloatArray:
+    """Return P(hidden) + P(visible) as published, shape (n,)."""
+    return np.asarray(1.0 - hops.hypotheses[:, 2])
