@@ -17,14 +17,17 @@ Examples
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.listener import Step
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
@@ -53,6 +56,7 @@ from worldstate_lab.sequences.staged_video import (
     stage_recording,
     staging_of,
 )
+from worldstate_lab.trials.trial import Decisions, Trial
 
 _PRINTED_CHOICES = 10
 
@@ -179,12 +183,22 @@ def _timeline(arguments: argparse.Namespace, recordings: Sequence[CornerRecordin
     named = {one.name: one for one in recordings if not one.hazard_free}
     if arguments.timeline not in named:
         raise InvalidArgumentError(f"--timeline: expected an approach, got {arguments.timeline}")
-    recording = named[arguments.timeline]
-    trial = heard(ovad_chain(read_model(None)), recording)
+    recording, chain = named[arguments.timeline], ovad_chain(read_model(None))
+    trial = heard(chain, recording)
     images = approach_images(recording.video, trial)
     title = f"Approach {recording.name} at {recording.junction}, from the {recording.side}"
-    figure = approach_figure(title, trial, trial.chains["filtered"], images)
+    figure = approach_figure(title, trial, _decided(trial, chain.steps(recording)), images)
     path: Path = arguments.out / f"timeline-{recording.name}.png"
     with figure_file(path, *figure.size_in) as canvas:
         figure.draw(canvas)
     return path
+
+
+def _decided(trial: Trial, steps: Iterable[Step]) -> Decisions:
+    """Return what the alarm compared at every hop with its threshold, both as probabilities."""
+    evidence = [
+        max((cue.evidence for cue in one.state.cues if cue.evidence), key=lambda terms: terms.compared_nats)
+        for one in steps
+    ]
+    compared, threshold = expit([(one.compared_nats, one.threshold_nats) for one in evidence]).T
+    return replace(trial.chains["filtered"], score=compared, threshold=threshold)

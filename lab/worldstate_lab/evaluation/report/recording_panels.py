@@ -415,9 +415,11 @@ def _draw_image(axes: "Axes", shown: ApproachImage) -> None:
 
 def _draw_statistic(axes: "Axes", t0_s: float, said: Decisions, seen_s: FloatArray) -> None:
     axes.plot(said.time_s, said.score, color=HIDDEN, label="statistic $s(t)$")
-    label = rf"$\gamma(\alpha={ALPHA:g})$"
-    if np.isfinite(said.threshold).all():
-        axes.axhline(float(said.threshold[0]), color=DECISION, linestyle=":", label=label)
+    if said.threshold.size and np.isfinite(said.threshold).all():
+        # One for all hops is the rule's; the product's changes from hop to hop.
+        label = rf"$\gamma(\alpha={ALPHA:g})$" if said.threshold.size == 1 else "threshold"
+        level = np.broadcast_to(said.threshold, said.time_s.shape)
+        axes.plot(said.time_s, level, color=DECISION, linestyle=":", label=label)
     # Advisory and boxes stand above the range of the statistic, where they cover nothing of it.
     top = max(1.0, float(np.nanmax(said.score, initial=0.0)))
     bars = [(t, _HOP_S) for t in said.time_s[said.alarm]]
