@@ -1,5 +1,6 @@
 """Checkpoints on disk: the filter's memory, site estimate, a sequence's history, the sound of the arms."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,18 @@ from worldstate.ground.serialisation import decode, encode
 
 from .file_io import read_json, refused_as_file, write_json
 
+
+@dataclass(frozen=True, slots=True)
+class PortNumbers:
+    """Numbers of signed datagrams that were taken last, by port: what a restart must not take again."""
+
+    last: Mapping[str, int]
+
+
 # What a checkpoint holds beside the memory of the filter.
-_BESIDE: dict[str, Any] = {"site": SiteEstimate, "history": SequenceHistory, "street": StreetHearing}
+_BESIDE: dict[str, Any] = {
+    "site": SiteEstimate, "history": SequenceHistory, "street": StreetHearing, "ports": PortNumbers,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +41,8 @@ class Checkpoint:
         `SequenceReader.history`; None without a sequence model.
     street : StreetHearing or None
         `StreetListener.hearing`; likewise.
+    ports : PortNumbers or None
+        None where no port has a key.
     senses : object or None
         What a `Listener` goes on with at the very next sample: the sound and images of its windows. No file
         holds it.
@@ -46,6 +59,7 @@ class Checkpoint:
     site: SiteEstimate | None = None
     history: SequenceHistory | None = None
     street: StreetHearing | None = None
+    ports: PortNumbers | None = None
     senses: object = field(default=None, compare=False, repr=False)
 
     def to_dict(self) -> dict[str, Any]:

@@ -5,11 +5,13 @@ machine, and what a detector finds in its images.
 """
 
 import hmac
+import json
 import socket
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, Self, TypeAlias, TypeVar
@@ -41,12 +43,47 @@ _OLDEST_S = 1e-9 * LAG_NS
 PINNED_S = 10.0
 
 
+# Between the time of sending that a datagram states and this machine's clock: clocks that NTP keeps differ by
+# milliseconds, and what was held back for longer would pass for fresh.
+CLOCKS_APART_S = 0.5
+# Asked of the kernel, which grants less where its limit is lower: what came while another thread computes.
+_KERNEL_BYTES = 1 << 22
+
+
 @dataclass(frozen=True, slots=True)
 class Trust:
     """Whose datagrams a port takes: those of its first sender where neither addresses nor a key are given."""
 
     allow: tuple[str, ...] = ()
     key: bytes | None = field(default=None, repr=False)
+    numbers: Mapping[str, int] = field(default_factory=dict)  # Taken last by each port, before this run
+
+
+def signed(record: Mapping[str, object], key: bytes, port: str) -> bytes:
+    r"""Return a datagram of an object that a port with this key takes, once and now.
+
+    Parameters
+    ----------
+    record : mapping of str to object
+        JSON-able; with ``"age_s"`` from capture to this call.
+    key : bytes
+        The secret of ``--key``.
+    port : str
+        Which takes it: ``odometry``, ``detections``, or ``detections/NAME`` where cameras have names.
+
+    Examples
+    --------
+    >>> text, code = signed({"speed_mps": 5.0}, b"sixteen bytes or more", "odometry").split(b"\n")
+    >>> len(code), text[:18]
+    (64, b'{"speed_mps": 5.0,')
+    """
+    now = {"port": port, "sent_s": time.time(), "number": time.time_ns()}
+    text = json.dumps({**record, **now}).encode()
+    return text + b"\n" + _code(key, text)
+
+
+def _code(key: bytes, text: bytes) -> bytes:
+    return hmac.new(key, text, "sha256").hexdigest().encode()
 
 
 class ReaderThread(ABC):
@@ -74,7 +111,9 @@ class DatagramSocket(ReaderThread, Generic[T]):
     """Records that arrive as UDP datagrams of one JSON object, with ``"age_s"`` from capture to sending.
 
     Where it has a ``"number"``, numbers must rise. With a key a line follows: the HMAC-SHA256 of the object
-    in hexadecimal digits, and the number is due, which keeps a datagram from being sent again.
+    in hexadecimal digits. Then the number is due, which keeps a datagram from being sent again, and so are
+    ``"port"``, which keeps it from another one, and ``"sent_s"``, the Unix time, from being held back.
+    All of it is checked by the thread that reads: what is refused displaces nothing that waits.
 
     Parameters
     ----------
@@ -84,8 +123,8 @@ class DatagramSocket(ReaderThread, Generic[T]):
         From the time of capture to the stream's clock: `LiveSound.stamp_ns`.
     decode : callable
         From the object without its age to what it stands for.
-    option : str
-        That named the address, for messages.
+    name : str
+        ``"port"`` of its datagrams: the option that named the address, and after a slash the camera.
     trust : Trust, optional
         Whose datagrams are taken.
 
@@ -109,52 +148,66 @@ class DatagramSocket(ReaderThread, Generic[T]):
         address: str,
         stamp_ns: Callable[[float], int],
         decode: Callable[[object], T],
-        option: str,
+        name: str,
         trust: Trust | None = None,
     ) -> None:
-        self._socket, self._stamp_ns = _bound_socket(address, option), stamp_ns
-        self._decode, self._trust = decode, trust or Trust()
-        self._datagrams: BoundedChannel[tuple[float, bytes, Sender]] = BoundedChannel(WAITING_DATAGRAMS)
+        self._socket, self._stamp_ns = _bound_socket(address, f"--{name.partition('/')[0]}"), stamp_ns
+        self._decode, self._trust, self.name = decode, trust or Trust(), name
+        self._records: BoundedChannel[tuple[float, T]] = BoundedChannel(WAITING_DATAGRAMS)
         self._pinned: tuple[float, Sender] | None = None
-        self._last: dict[str, int] = {}  # The number taken last, by host; by a key there is one
+        # The number taken last, by host; by a key there is one
+        before = self._trust.numbers.get(name)
+        self._last = {} if before is None else {"": before}
         super().__init__(self._socket.close)
         self.port, self.refused, self.problem = int(self._socket.getsockname()[1]), 0, ""
+        self._counting, self._delivered = threading.Lock(), 0
 
     @property
     def dropped(self) -> int:
         """Datagrams that were not taken in time."""
-        return self._datagrams.dropped
+        return self._records.dropped
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """The number that was taken last by a key, under the name of the port; empty before the first."""
+        return {self.name: self._last[""]} if "" in self._last else {}
 
     def deliver(self, take: Callable[[int, T], None]) -> int:
         """Pass on what waits, each with the time of its capture on the stream's clock, nanoseconds.
 
-        What cannot be read, or is refused there, is counted; return how many were.
+        What cannot be read, or is refused there, is counted; return how many were since the call before.
         """
-        before = self.refused
-        for arrived_s, datagram, sender in self._datagrams.take_all():
+        for captured_s, told in self._records.take_all():
             try:
-                age_s, told = self._read_one(arrived_s, datagram, sender)
-                take(self._stamp_ns(arrived_s - age_s), told)
+                take(self._stamp_ns(captured_s), told)
             except WorldstateError as error:
-                self.refused, self.problem = self.refused + 1, str(error)
-        return self.refused - before
+                self._refuse(error)
+        before, self._delivered = self._delivered, self.refused
+        return self._delivered - before
+
+    def _refuse(self, error: WorldstateError) -> None:
+        with self._counting:
+            self.refused, self.problem = self.refused + 1, str(error)
 
     def _read_one(self, arrived_s: float, datagram: bytes, sender: Sender) -> tuple[float, T]:
+        """Return when a datagram's object was captured, and what it stands for."""
         pinned = self._check_sender(arrived_s, sender)
         try:
             record = decode_json(self._checked_text(datagram).decode(), "datagram")
         except UnicodeDecodeError as error:
             raise InvalidArgumentError("datagram: expected UTF-8") from error
-        age_s, number = 0.0, None
-        if isinstance(record, dict):
-            age_s, number = record.pop("age_s", 0.0), record.pop("number", None)
-        source = "" if self._trust.key is not None else sender[0]
+        about = record if isinstance(record, dict) else {}
+        age_s = in_range("age_s", decode(float, about.pop("age_s", 0.0), "age_s"), 0.0, _OLDEST_S)
+        source, number = sender[0], about.pop("number", None)
+        if self._trust.key is not None:
+            source = ""
+            self._check_sent(about.pop("port", None), about.pop("sent_s", None))
         if number is not None or self._trust.key is not None:
             last = self._last.get(source, -1)
             number = decode(int, number, "number")
             if number <= last:
                 raise InvalidArgumentError(f"number: expected one above {last}, taken already, got {number}")
-        read = in_range("age_s", age_s, 0.0, _OLDEST_S), self._decode(record)
+        read = arrived_s - age_s, self._decode(record)
         if number is not None:
             self._last[source] = number
         self._pinned = pinned
@@ -182,9 +235,18 @@ class DatagramSocket(ReaderThread, Generic[T]):
         if self._trust.key is None:
             return datagram
         text, _, code = datagram.rpartition(b"\n")
-        if not hmac.compare_digest(hmac.new(self._trust.key, text, "sha256").hexdigest().encode(), code):
+        if not hmac.compare_digest(_code(self._trust.key, text), code):
             raise InvalidArgumentError("datagram: expected a line with the HMAC-SHA256 of the key")
         return text
+
+    def _check_sent(self, port: object, sent_s: object) -> None:
+        """Refuse what was signed for another port, or was sent at another time."""
+        if port != self.name:
+            raise InvalidArgumentError(f"port: expected {self.name!r}, got {port!r:.60}")
+        late_s = time.time() - decode(float, sent_s, "sent_s")
+        if abs(late_s) > CLOCKS_APART_S:
+            problem = f"expected the time within {CLOCKS_APART_S:g} s, got one {late_s:.3f} s ago"
+            raise InvalidArgumentError(f"sent_s: {problem}")
 
     def _read(self) -> None:
         self._socket.settimeout(_POLL_S)
@@ -193,7 +255,10 @@ class DatagramSocket(ReaderThread, Generic[T]):
                 datagram, sender = self._socket.recvfrom(_LARGEST_BYTES)
             except OSError:  # nothing came, or what the system says of a datagram sent before
                 continue
-            self._datagrams.put((time.monotonic(), datagram, sender))
+            try:
+                self._records.put(self._read_one(time.monotonic(), datagram, sender))
+            except WorldstateError as error:
+                self._refuse(error)
 
 
 class DetectionSocket(DatagramSocket[DetectionFrame]):
@@ -203,8 +268,11 @@ class DetectionSocket(DatagramSocket[DetectionFrame]):
     without detections is sent, too: it was searched. A datagram that is lost is an image not asked.
     """
 
-    def __init__(self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None) -> None:
-        super().__init__(address, stamp_ns, partial(frame_of, where="datagram"), "--detections", trust)
+    def __init__(
+        self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None, camera: str = ""
+    ) -> None:
+        name = f"detections/{camera}".rstrip("/")
+        super().__init__(address, stamp_ns, partial(frame_of, where="datagram"), name, trust)
 
 
 class OdometrySocket(DatagramSocket[OdometryRecord]):
@@ -217,7 +285,7 @@ class OdometrySocket(DatagramSocket[OdometryRecord]):
 
     def __init__(self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None) -> None:
         read = partial(decode, OdometryRecord, where="datagram")
-        super().__init__(address, stamp_ns, read, "--odometry", trust)
+        super().__init__(address, stamp_ns, read, "odometry", trust)
 
 
 def _bound_socket(address: str, option: str) -> socket.socket:
@@ -226,6 +294,8 @@ def _bound_socket(address: str, option: str) -> socket.socket:
     if not host or not port.isdecimal() or int(port) >= 1 << 16:
         raise InvalidArgumentError(f"{option}: expected HOST:PORT to listen at, got {address}")
     listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    with suppress(OSError):
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
     try:
         listening.bind((host, int(port)))
     except OSError as error:

@@ -4,15 +4,18 @@ import argparse
 import hashlib
 import hmac
 import json
+import re
 import socket
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 
 from worldstate.adapters.live import live_sensors
-from worldstate.adapters.live.live_sensors import OdometrySocket, Trust
+from worldstate.adapters.live.live_sensors import DetectionSocket, OdometrySocket, Trust
 from worldstate.cli.live import _trust
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
@@ -25,7 +28,10 @@ def odometry(speed_mps: float, **more: object) -> bytes:
     return json.dumps({"speed_mps": speed_mps, "yaw_rate_rad_s": 0.0, **more}).encode()
 
 
-def signed(text: bytes, key: bytes = SECRET) -> bytes:
+def signed(speed_mps: float, number: int, key: bytes = SECRET, **other: object) -> bytes:
+    """Return what a sender of its own writes by the recipe of the page."""
+    about = {"port": "odometry", "sent_s": time.time(), "number": number}
+    text = odometry(speed_mps, **(about | other))
     return text + b"\n" + hmac.new(key, text, hashlib.sha256).hexdigest().encode()
 
 
@@ -80,22 +86,113 @@ def test_a_host_is_allowed_by_its_name_too():
         _trust(argparse.Namespace(allow=["no such host"], key=None))
 
 
+@pytest.mark.parametrize("age_s", ["x", None, [1], {}, True])
+def test_an_age_that_is_no_number_is_refused(age_s):
+    assert taken(Trust(), (0, odometry(1, age_s=age_s)), (0, odometry(2)))[0] == [2]
+
+
 def test_numbers_rise_and_what_is_old_is_left_out():
     sent = [odometry(n, number=n) for n in (1, 2, 2, 1, 3)] + [odometry(4, number=4, age_s=2.1)]
     assert taken(Trust(), *((0, one) for one in sent))[0] == [1, 2, 3]
 
 
 def test_a_key_is_proved_by_any_sender_and_nothing_is_taken_twice():
-    first = signed(odometry(1, number=1))
+    first = signed(1, 1)
     wrong = [
         odometry(2, number=2),
-        signed(odometry(3, number=3), b"another secret of 16 bytes"),
-        signed(odometry(4)),  # without a number it could be sent again
+        signed(3, 3, b"another secret of 16 bytes"),
+        signed(4, None),  # without a number it could be sent again
         first,
         first.replace(b'"speed_mps": 1', b'"speed_mps": 9'),
     ]
-    sent = [(0, first), *((1, one) for one in wrong), (1, signed(odometry(5, number=5)))]
+    sent = [(0, first), *((1, one) for one in wrong), (1, signed(5, 5))]
     assert taken(Trust(key=SECRET), *sent)[0] == [1, 5]
+
+
+@pytest.mark.parametrize(
+    ("other", "problem"),
+    [
+        ({"port": "detections"}, "port: expected 'odometry', got 'detections'"),
+        ({"port": None}, "port: expected 'odometry', got None"),
+        ({"sent_s": None}, "sent_s: expected a finite number"),
+        ({"sent_s": -6.0}, r"sent_s: expected the time within 0.5 s, got one 6.0.. s ago"),
+        ({"sent_s": 6.0}, r"sent_s: expected the time within 0.5 s, got one -[56]...."),
+    ],
+)
+def test_what_was_signed_for_another_port_or_time_is_refused(other, problem):
+    if isinstance(other.get("sent_s"), float):
+        other = {"sent_s": time.time() + other["sent_s"]}
+    speeds, said = taken(Trust(key=SECRET), (0, signed(1, 1, **other)), (0, signed(2, 2)))
+    assert speeds == [2]
+    assert re.match(problem, said), said
+
+
+def test_what_was_signed_for_one_camera_is_refused_at_another():
+    look = {"boxes": [], "scores": [], "classes_str": []}
+    for camera, looks in (("front", 1), ("rear", 0)):
+        seen: list[object] = []
+        with DetectionSocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET), camera) as told:
+            send(told.port, live_sensors.signed(look, SECRET, "detections/front"))
+            wait_until(lambda told=told, seen=seen: told.deliver(lambda *look: seen.append(look)) or seen)
+        assert len(seen) == looks
+        assert told.problem == ("" if looks else "port: expected 'detections/rear', got 'detections/front'")
+
+
+def test_a_datagram_that_was_taken_is_refused_after_a_restart():
+    first, speeds = signed(1, 7), []
+    numbers: dict[str, int] = {}
+    for datagram in (first, first, signed(2, 8)):
+        trust = Trust(key=SECRET, numbers=numbers)
+        with OdometrySocket("127.0.0.1:0", nanoseconds, trust) as told:
+            send(told.port, datagram)
+            before = len(speeds)
+            wait_until(
+                lambda told=told, before=before: (
+                    told.deliver(lambda at_ns, one: speeds.append(one.speed_mps)) or len(speeds) > before
+                )
+            )
+        numbers = told.numbers
+    assert speeds == [1, 2]
+    assert numbers == {"odometry": 8}
+
+
+def test_rubbish_of_strangers_displaces_nothing_that_waits():
+    sent = [live_sensors.signed({"speed_mps": n, "yaw_rate_rad_s": 0.0}, SECRET, "odometry") for n in (1, 2)]
+    speeds: list[float] = []
+    with OdometrySocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET)) as told:
+        send(told.port, sent[0])
+        for _ in range(20):
+            send(told.port, *[b"rubbish"] * 50)
+            time.sleep(0.01)
+        send(told.port, sent[1])
+        wait_until(lambda: told.refused == 1000)
+        wait_until(lambda: told.deliver(lambda at_ns, one: speeds.append(one.speed_mps)) and len(speeds) == 2)
+    assert speeds == [1, 2]
+    assert (told.dropped, told.refused) == (0, 1000)
+
+
+def test_the_recipe_of_the_page_is_taken(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "live_details.md").read_text("utf-8")
+    recipe = next(one for one in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "hmac.new" in one)
+    (tmp_path / "secret").write_bytes(SECRET + b"\n")
+    monkeypatch.chdir(tmp_path)
+    looks: list[object] = []
+    with DetectionSocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET)) as told:
+        exec(recipe.replace("9100", str(told.port)), {})
+        wait_until(lambda: told.deliver(lambda *look: looks.append(look)) or looks)
+    assert (len(looks), told.problem) == (1, "")
+
+
+def send(port: int, *datagrams: bytes) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for datagram in datagrams:
+            sender.sendto(datagram, ("127.0.0.1", port))
+
+
+def wait_until(holds: Callable[[], object]) -> None:
+    until_s = time.monotonic() + 5.0
+    while not holds() and time.monotonic() < until_s:
+        time.sleep(0.005)
 
 
 def test_a_short_secret_is_refused(tmp_path, capsys):

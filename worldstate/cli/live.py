@@ -19,10 +19,11 @@ with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. With it, 
 the model of a moving ego is taken where --model names none.
 
 A port takes its first sender until that one is silent for ten seconds, or all of --allow. With --key, the
-file of a secret, a datagram ends in a line with its HMAC-SHA256 and has a "number" that rises.
+file of a secret, a datagram ends in a line with its HMAC-SHA256, and has a "number" that rises, the "port"
+that it is for (odometry, detections or detections/NAME) and "sent_s", the Unix time of sending.
 
---save-state keeps belief and site every minute and at the end, --resume goes on from them: from the time at
-which they end, or by --start from a later one.
+--save-state keeps belief, site and the numbers taken last every minute and at the end, --resume goes on from
+them: from the time at which they end, or by --start from a later one.
 
 Examples
 --------
@@ -39,10 +40,10 @@ import socket
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from worldstate import adapters, ground
 from worldstate.cli.common import command, exports, inputs, listening, output, progress, sensors
@@ -56,6 +57,8 @@ if TYPE_CHECKING:
 
     HandIn = Callable[[Listener], int]
     Losses = Callable[[], dict[str, object]]
+
+Port = TypeVar("Port", bound="DatagramSocket[Any]")
 
 
 # Lost sound is said at most so often.
@@ -124,10 +127,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         sound = LiveSound(feed, keep)
         source = _source(arguments, given, sound) if recorded is None else replace(recorded, sound=sound)
         sound.start_ns = source.start_ns
-        source, look, looks_lost = _with_cameras(given, source, sound, opened)
-        tell, odometry_lost = _odometry(arguments, sound, opened)
+        ports = _Ports(_trust(arguments, source.before), sound, opened)
+        source, look, looks_lost = _with_cameras(given, source, ports)
+        tell, odometry_lost = _odometry(arguments, ports)
         steps = live_steps(source, look, tell)
-        figures = _listen(arguments, given, source, sound, steps) | looks_lost() | odometry_lost()
+        figures = _listen(arguments, given, source, ports, steps) | looks_lost() | odometry_lost()
         return output.CommandResult(figures | {"array": inputs.stance(source.array)})
 
 
@@ -175,8 +179,33 @@ def _played(arguments: argparse.Namespace, recorded: "adapters.Source") -> "Soun
     return Playback(audio, arguments.speed, arguments.duration)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ports:
+    """Ports that listen beside the microphones, until `opened` ends."""
+
+    trust: "Trust"
+    sound: "LiveSound"
+    opened: ExitStack
+    sockets: "list[DatagramSocket[Any]]" = field(default_factory=list)
+
+    def open(self, kind: "Callable[..., Port]", address: str, *camera: str) -> "Port":
+        """Open a port, of one of several cameras that of its name."""
+        port = kind(address, self.sound.stamp_ns, self.trust, *camera)
+        self.opened.enter_context(port)
+        self.sockets.append(port)
+        return port
+
+    def kept(self, last: "adapters.Step") -> "adapters.Checkpoint":
+        """Return what to go on from, with the numbers that were taken last."""
+        from worldstate.adapters.files.checkpoint_file import PortNumbers
+
+        taken = [one.numbers for one in self.sockets]
+        numbers = {k: v for held in (self.trust.numbers, *taken) for k, v in held.items()}
+        return replace(last.checkpoint, ports=PortNumbers(numbers) if numbers else None)
+
+
 def _with_cameras(
-    given: sensors.GivenSensors, source: "adapters.Source", sound: "LiveSound", opened: ExitStack
+    given: sensors.GivenSensors, source: "adapters.Source", ports: _Ports
 ) -> "tuple[adapters.Source, HandIn, Losses]":
     """Return the source with the cameras that were asked for, what hands their looks in, and their losses."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS, SENSOR
@@ -184,13 +213,11 @@ def _with_cameras(
     from worldstate.operations.recordings.car_cameras import with_cameras
 
     if given.arguments.camera_device is not None:
-        return _with_device(given, source, sound, opened)
+        return _with_device(given, source, ports.sound, ports.opened)
     named = given.named()
-    addresses = named or dict(zip([SENSOR], given.arguments.detections, strict=False))
-    sockets = {
-        name: opened.enter_context(DetectionSocket(address, sound.stamp_ns, _trust(given.arguments)))
-        for name, address in addresses.items()
-    }
+    sockets = {name: ports.open(DetectionSocket, address, name) for name, address in named.items()}
+    for address in () if named else given.arguments.detections:
+        sockets[SENSOR] = ports.open(DetectionSocket, address)
     if named:
         source = with_cameras(source, given.car, dict.fromkeys(named, NO_LOOKS))
     elif sockets:
@@ -223,15 +250,13 @@ def _with_device(
     return seen, lambda to: looks.deliver(to.look), losses
 
 
-def _odometry(
-    arguments: argparse.Namespace, sound: "LiveSound", opened: ExitStack
-) -> "tuple[HandIn, Losses]":
+def _odometry(arguments: argparse.Namespace, ports: _Ports) -> "tuple[HandIn, Losses]":
     """Return what hands the odometry in that was asked for, and its losses."""
     from worldstate.adapters.live.live_sensors import OdometrySocket
 
     if arguments.odometry is None:
         return lambda to: 0, dict
-    told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns, _trust(arguments)))
+    told = ports.open(OdometrySocket, arguments.odometry)
 
     def hand_in(listener: "Listener") -> int:
         return told.deliver(lambda stamp_ns, record: listener.add(record.at(stamp_ns)))
@@ -239,7 +264,7 @@ def _odometry(
     return hand_in, _losses([told], "odometry", "odometry_")
 
 
-def _trust(arguments: argparse.Namespace) -> "Trust":
+def _trust(arguments: argparse.Namespace, before: "adapters.Checkpoint | None" = None) -> "Trust":
     from worldstate.adapters.files.file_io import read_bytes
     from worldstate.adapters.live.live_sensors import Trust
 
@@ -248,9 +273,10 @@ def _trust(arguments: argparse.Namespace) -> "Trust":
         problem = f"expected a secret of at least {SHORTEST_KEY} bytes, got {len(key)}"
         raise ground.InputFileError(arguments.key, problem)
     try:
-        return Trust(tuple(map(socket.gethostbyname, arguments.allow)), key)
+        allow = tuple(map(socket.gethostbyname, arguments.allow))
     except (OSError, UnicodeError) as error:
         raise InvalidArgumentError(f"--allow: expected hosts, got {arguments.allow} ({error})") from error
+    return Trust(allow, key, {} if before is None or before.ports is None else before.ports.last)
 
 
 def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
@@ -267,7 +293,7 @@ def _listen(
     arguments: argparse.Namespace,
     given: sensors.GivenSensors,
     source: "adapters.Source",
-    sound: "LiveSound",
+    ports: _Ports,
     steps: "Iterator[LiveStep]",
 ) -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
@@ -276,11 +302,11 @@ def _listen(
     from worldstate.operations.recordings.recording_report import WarningMeter, calibration_words
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
-    notice = _loss_notices()
+    notice, sound = _loss_notices(), ports.sound
     start_s = ground.seconds(source.start_ns)
     longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
-        _kept(arguments) as keep,
+        _kept(arguments, ports) as keep,
         line_writer(arguments.out, partial(GrowingFile, most_bytes=exports.most_bytes(arguments))) as write,
         exports.exported_hops(arguments, source, given.car.crossing_m, live=True) as export,
         _view(arguments) as show,
@@ -312,7 +338,7 @@ def _listen(
 
 
 @contextmanager
-def _kept(arguments: argparse.Namespace) -> "Iterator[Callable[[adapters.Step], None]]":
+def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[adapters.Step], None]]":
     """Lend a function that saves --save-state once a minute, and save it at the end, whatever ends the run.
 
     The error that ends it says what was kept.
@@ -322,7 +348,7 @@ def _kept(arguments: argparse.Namespace) -> "Iterator[Callable[[adapters.Step], 
     def save() -> None:
         nonlocal saved_ns
         if path is not None and last is not None:
-            adapters.save_checkpoint(path, last.checkpoint)
+            adapters.save_checkpoint(path, ports.kept(last))
             saved_ns = last.state.stamp_ns
 
     def keep(step: "adapters.Step") -> None:

@@ -1,0 +1,101 @@
+"""Attacks on a whole run, from other processes: what a stranger may not take away or bring in."""
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.files.checkpoint_file import read_checkpoint
+from worldstate.adapters.live.live_sensors import signed
+from worldstate.adapters.state_log import read_log
+
+RATE, SECRET = 8_000, b"sixteen bytes or more"
+LOOK = {"boxes": [], "scores": [], "classes_str": [], "age_s": 0.02}
+# As many datagrams a second as are asked for, in bursts of a hundredth of it.
+FLOOD = """
+import socket, sys, time
+port, rate, size = map(int, sys.argv[1:])
+sender, begun_s, sent = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), time.monotonic(), 0
+while True:
+    while sent < rate * (time.monotonic() - begun_s):
+        sender.sendto(b"x" * size, ("127.0.0.1", port))
+        sent += 1
+    time.sleep(0.002)
+"""
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("street")
+    noise = np.random.default_rng(4).normal(0.0, 0.1, (2 * RATE, 4)).astype(np.float32)
+    soundfile.write(folder / "street.wav", noise, RATE, subtype="PCM_24")
+    (folder / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
+    (folder / "lens.json").write_text(json.dumps(lens))
+    (folder / "key").write_bytes(SECRET)
+    return folder
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+@contextmanager
+def looking(port: int):
+    """Send a signed look ten times a second from a detector of one's own."""
+    ended = threading.Event()
+
+    def look() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not ended.wait(0.1):
+                sender.sendto(signed(LOOK, SECRET, "detections"), ("127.0.0.1", port))
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def fresh_looks(street, folder, seconds: float, *flood: int) -> float:
+    """Return in which share of the hops after the first two seconds a look was fresh."""
+    port, folder = free_port(), folder / "-".join(map(str, (0, *flood)))
+    folder.mkdir()
+    play = "--play", "street.wav", "--array", "mics.csv", "--uncalibrated", "--duration", str(seconds)
+    seen = "--detections", f"127.0.0.1:{port}", "--camera", "lens.json", "--key", "key"
+    kept = "--out", str(folder / "s.jsonl"), "--save-state", str(folder / "belief.json"), "--json"
+    script = [sys.executable, "-m", "worldstate", "live", *play, *seen, *kept]
+    process = subprocess.Popen(script, cwd=street, stdout=subprocess.PIPE)
+    attack = [subprocess.Popen([sys.executable, "-c", FLOOD, str(port), *map(str, flood)])] if flood else []
+    with looking(port):
+        told = json.loads(process.communicate(timeout=60 + 3 * seconds)[0])
+    for one in attack:
+        one.kill()
+        one.wait()
+    assert told["detections_dropped"] <= 64  # before the first state
+    if flood:
+        assert told["detections_refused"] > 100
+        assert "HMAC-SHA256" in told["last_refusal"]
+    assert read_checkpoint(folder / "belief.json").ports.last["detections"] > 0
+    states = [state for _, state in read_log(folder / "s.jsonl") if state.stamp_ns > 2_000_000_000]
+    fresh = [
+        any(state.stamp_ns - look.stamp_ns <= 150_000_000 for look in state.searched) for state in states
+    ]
+    return sum(fresh) / len(fresh)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [7, 1_000])
+def test_a_flood_takes_at_most_a_tenth_of_the_looks(street, tmp_path, size):
+    without = fresh_looks(street, tmp_path, 8.0)
+    assert fresh_looks(street, tmp_path, 8.0, 5_000, size) >= 0.9 * without
