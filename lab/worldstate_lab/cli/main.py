@@ -31,6 +31,7 @@ STUDIES = {
         "reach",
         "clips",
         "foreign",
+        "four",
         "kinds",
         "place",
         "staged",

@@ -1,0 +1,323 @@
+"""`worldstate-lab four`: road users behind corners on a board of four microphones, heard by the product.
+
+FOLDER holds truth.csv (file, site, side, kind, seconds) and the recordings; MODEL was made for the board. No
+time of coming into view is known, and outdoors recordings run on past it. So three things are asked:
+
+- the side of each vehicle outdoors by the second half of its recording: the one whose published risk has the
+  larger mean; beside it the side by the window's log ratios, and by the sign of the surest 16 % of the
+  bearings, which need no model;
+- the area under the ROC curve of 1 - P(none) of the hops in the last two seconds against those in the first
+  two of the same recording, its mean over recordings of 5 s and more;
+- advisories by kind: one for a person is a failure of the guard.
+
+Some channels of these recordings are whole buffers of 1024 samples early. That is read from the sound alone,
+and the channels are aligned; figures of the recordings as they are stand beside (`as_recorded`).
+
+Carts, and recordings without a side, are listed and not scored.
+
+Examples
+--------
+  worldstate-lab four four-microphones --model board.json
+  worldstate-lab four four-microphones --model board.json --json --jobs 2
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.adapters.audio.sound_file import open_sound
+from worldstate.adapters.files.file_io import read_rows
+from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.adapters.listener import Listener, Step
+from worldstate.adapters.source import open_source
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.progress import track
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.values import seconds
+from worldstate.operations.metrics.approach_table import Figures, auroc, mean_of, share_interval
+from worldstate.simulation.parallel import in_processes
+from worldstate_lab.metrics.intervals import highest_share, stratified_draws
+from worldstate_lab.report.table import Table, Value
+
+BUFFER = 1024
+# Of the sound that is compared for lost buffers: wind below, little sound of vehicles above.
+_BAND_HZ = (200.0, 6000.0)
+# Share of the bearings that the paper calls the surest.
+_SUREST = 0.16
+_ENDS_S, _LEAST_S = 2.0, 5.0
+_PERSONS = ("human", "man", "woman")
+_OUTDOORS, _UNSCORED = "OA", ("cart", "")
+_CENTRAL = (0.025, 0.975)
+_FORMS = ("risk", "window", "bearing")
+
+
+@dataclass(frozen=True, slots=True)
+class BoardRecording:
+    """One recording, and what is known of it."""
+
+    path: Path
+    site: str
+    side: str
+    kind: str
+
+    @property
+    def group(self) -> str:
+        """Site, side and kind."""
+        return f"{self.site} {self.side} {self.kind}"
+
+    @property
+    def scored(self) -> bool:
+        """Whether a side and a kind that is heard in streets are known."""
+        return self.side in SIDES and self.kind not in _UNSCORED
+
+    @property
+    def drives_outdoors(self) -> bool:
+        """Whether it is a car in the street."""
+        return self.scored and self.site == _OUTDOORS and self.kind == "car"
+
+
+@dataclass(frozen=True, slots=True)
+class BoardOutcome:
+    """What the product made of a recording."""
+
+    recording: BoardRecording
+    hops: int
+    buffers: tuple[int, ...]  # Lost by each channel
+    sides: Mapping[str, str | None]  # Side in the second half by risk, window and bearing
+    rise: float | None  # AUROC of the last two seconds against the first two
+    advised: bool
+
+
+def read_board(folder: Path) -> list[BoardRecording]:
+    """Read truth.csv."""
+    rows = read_rows(folder / "truth.csv", ("file", "site", "side", "kind"))
+    found = [BoardRecording(folder / r["file"], r["site"], r["side"], r["kind"]) for _, r in rows]
+    if not found:
+        raise InputFileError(folder / "truth.csv", "expected recordings, got none")
+    return found
+
+
+def lost_buffers(sound: Float32Array, sample_rate_hz: float) -> tuple[int, ...]:
+    r"""Return how many buffers each channel (n, M) lost before the sound began, at least 0.
+
+    The peak of the cross-correlation with the first channel, phases alone,
+
+    .. math:: \hat\tau_m = \arg\max_\tau \Big| \sum_f \frac{X_m X_0^*}{|X_m X_0|} e^{2 \pi j f \tau} \Big|
+
+    in whole buffers: a board of centimetres delays sound by a few samples.
+    """
+    n = 2 * len(sound)
+    spectra = np.fft.rfft(sound, n, axis=0)
+    cross = spectra * spectra[:, :1].conj()
+    hertz = np.fft.rfftfreq(n, 1.0 / sample_rate_hz)[:, None]
+    heard = (hertz > _BAND_HZ[0]) & (hertz < _BAND_HZ[1])
+    phases = np.where(heard, cross / np.maximum(np.abs(cross), np.finfo(np.float32).tiny), 0.0)
+    late = np.abs(np.fft.irfft(phases, n, axis=0)).argmax(axis=0)
+    late = np.round(((late + n // 2) % n - n // 2) / BUFFER).astype(int)
+    return tuple((late.max() - late).tolist())
+
+
+def aligned(sound: Float32Array, buffers: Sequence[int]) -> Float32Array:
+    """Give every channel (n, M) the time of the one that lost the fewest buffers."""
+    starts = BUFFER * (max(buffers) - np.array(buffers))
+    length = len(sound) - int(starts.max())
+    return np.stack([sound[at : at + length, m] for m, at in enumerate(starts.tolist())], axis=1)
+
+
+def heard(recording: BoardRecording, model: Model, array: Path | None, *, align: bool) -> BoardOutcome:
+    """Hear one recording by the whole product, without a camera."""
+    source = open_source(recording.path, array=array, model=model)
+    with open_sound(recording.path, source.array.n_microphones) as audio:
+        rate_hz = audio.sample_rate_hz
+        sound = np.concatenate(list(audio.blocks(rate_hz)))
+    buffers = lost_buffers(sound, rate_hz)
+    sound = aligned(sound, buffers) if align else sound
+    return outcome(recording, buffers, list(Listener(source, rate_hz).steps(sound)), len(sound) / rate_hz)
+
+
+def outcome(
+    recording: BoardRecording, buffers: tuple[int, ...], steps: Sequence[Step], duration_s: float
+) -> BoardOutcome:
+    """Score the hops of one recording."""
+    time_s = np.array([seconds(one.state.stamp_ns) for one in steps])
+    present = np.array([1.0 - one.state.cues[0].hypotheses.none for one in steps])
+    advised = any(cue.advisory is not None for one in steps for cue in one.state.cues)
+    late = [one for one, at_s in zip(steps, time_s, strict=True) if at_s > 0.5 * duration_s]
+    sides = dict(zip(_FORMS, (_of_risk(late), _of_window(late), _of_bearing(late)), strict=True))
+    ends = time_s > duration_s - _ENDS_S
+    kept = ends | (time_s <= _ENDS_S)
+    rise = auroc(present[kept], ends[kept]) if duration_s >= _LEAST_S else None
+    return BoardOutcome(recording, len(steps), buffers, sides, rise, advised)
+
+
+def _side(leftwards: FloatArray) -> str | None:
+    """Return the side that numbers a hop speak for in the mean, left positive; None of none."""
+    mean = float(np.nansum(leftwards))
+    return None if mean == 0.0 else SIDES[0] if mean > 0.0 else SIDES[1]
+
+
+def _of_risk(steps: Sequence[Step]) -> str | None:
+    risks = [{cue.direction: cue.risk for cue in one.state.cues} for one in steps]
+    return _side(np.array([one[SIDES[0]] - one[SIDES[1]] for one in risks]))
+
+
+def _of_window(steps: Sequence[Step]) -> str | None:
+    known = [one.measurement.signature.sides for one in steps]
+    return _side(np.array([one.log_ratios[0] - one.log_ratios[1] for one in known if one is not None]))
+
+
+def _of_bearing(steps: Sequence[Step]) -> str | None:
+    prominence = np.array([one.frame.prominence for one in steps])
+    surest = highest_share(prominence, np.ones((1, len(steps))), _SUREST)[0]
+    return _side(np.sign([one.frame.bearing_rad for one in steps])[surest])
+
+
+def run_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> dict[str, Any]:
+    """Return the figures of all recordings that were heard."""
+    scored = [one for one in outcomes if one.recording.scored]
+    cars = [one for one in scored if one.recording.drives_outdoors]
+    persons = [one for one in scored if one.recording.kind in _PERSONS]
+    forms = {form: side_figures(cars, form) for form in _FORMS}
+    return {
+        "by_kind": {name: counts(some) for name, some in _by("kind", scored).items()},
+        "by_group": {name: counts(some) for name, some in _by("group", scored).items()},
+        "side": forms[_FORMS[0]],
+        "side_by": forms,
+        "hazard": hazard_figures(cars, rng),
+        "persons": {"recordings": len(persons), "advisories": sum(one.advised for one in persons)},
+    }
+
+
+def _by(what: str, outcomes: Sequence[BoardOutcome]) -> dict[str, list[BoardOutcome]]:
+    """Sort outcomes by an attribute of their recordings."""
+    found: dict[str, list[BoardOutcome]] = {}
+    for one in sorted(outcomes, key=attrgetter(f"recording.{what}")):
+        found.setdefault(getattr(one.recording, what), []).append(one)
+    return found
+
+
+def counts(outcomes: Sequence[BoardOutcome]) -> Figures:
+    """Return a group in counts: with an advisory, on the right side, with more hazard at the end."""
+    rises = _rises(outcomes)
+    return {
+        "count": len(outcomes),
+        "hops": sum(one.hops for one in outcomes),
+        "advisories": sum(one.advised for one in outcomes),
+        "side_right": _right(outcomes, _FORMS[0]),
+        "side_of": len(outcomes),
+        "hazard_higher": int(np.sum(rises > 0.5)),
+        "hazard_of": len(rises),
+    }
+
+
+def _right(outcomes: Sequence[BoardOutcome], form: str) -> int:
+    return sum(one.sides[form] == one.recording.side for one in outcomes)
+
+
+def _rises(outcomes: Sequence[BoardOutcome]) -> FloatArray:
+    return np.array([one.rise for one in outcomes if one.rise is not None])
+
+
+def side_figures(outcomes: Sequence[BoardOutcome], form: str) -> dict[str, Any]:
+    """Return how often the side is right, with exact intervals, and the mean of the recalls of both sides."""
+    shares = {name: _share(_right(some, form), len(some)) for name, some in _by("side", outcomes).items()}
+    whole = _share(_right(outcomes, form), len(outcomes))
+    return {**whole, "balanced": _balanced([one["share"] for one in shares.values()]), "by_side": shares}
+
+
+def _share(count: int, of: int) -> dict[str, Any]:
+    known = {"share": count / of, "interval": share_interval(count, of)} if of else {}
+    return {"right": count, "of": of, "share": None, "interval": None, **known}
+
+
+def _balanced(by_side: Sequence[float]) -> float | None:
+    """Mean over both sides, None where one of them was not recorded."""
+    return mean_of(by_side) if len(by_side) == len(SIDES) else None
+
+
+def hazard_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> dict[str, Any]:
+    """Return the mean over recordings of the area of the last seconds against the first."""
+    known = [one for one in outcomes if one.rise is not None]
+    rises = _rises(known)
+    by_side = {name: float(_rises(some).mean()) for name, some in _by("side", known).items()}
+    drawn = (
+        rises[stratified_draws([one.recording.side for one in known], rng)].mean(axis=1) if known else rises
+    )
+    return {
+        "auroc": mean_of(rises),
+        "pairs": len(known),
+        "interval": np.quantile(drawn, _CENTRAL).tolist() if known else None,
+        "higher": int(np.sum(rises > 0.5)),
+        "balanced": _balanced([*by_side.values()]),
+        "by_side": by_side,
+    }
+
+
+def _lines(title: str, figures: Mapping[str, Any]) -> list[str]:
+    names = ("count", "advisories", "side_right", "hazard_higher", "hazard_of")
+    rows = [(group, *(str(one[name]) for name in names)) for group, one in figures["by_group"].items()]
+    hazard, persons = figures["hazard"], figures["persons"]
+    sides = [
+        (form, f"{one['right']} of {one['of']}", _value(one["share"], one), _value(one["balanced"]))
+        for form, one in figures["side_by"].items()
+    ]
+    ends = (
+        "cars outdoors",
+        str(hazard["pairs"]),
+        _value(hazard["auroc"], hazard),
+        _value(hazard["balanced"]),
+    )
+    tables = (
+        Table("groups", title, ("by site, side and kind", *names), rows),
+        Table("sides", "Side in the second half", ("cars outdoors by", "right", "share", "balanced"), sides),
+        Table("hazard", "Last 2 s against the first 2 s", ("", "recordings", "AUROC", "balanced"), [ends]),
+    )
+    told = f"persons with an advisory: {persons['advisories']} of {persons['recordings']}"
+    return [line for table in tables for line in ("", *table.lines())] + ["", told]
+
+
+def _value(value: float | None, figures: Mapping[str, Any] = MappingProxyType({})) -> Value:
+    low, high = figures.get("interval") or (np.nan, np.nan)
+    return Value(np.nan if value is None else value, low, high)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("folder", type=Path, metavar="FOLDER", help="truth.csv and the recordings it names")
+    add("--model", type=Path, required=True, metavar="FILE", help="made for the board, by model make")
+    add("--array", type=Path, metavar="FILE", help="microphone positions (default: the model's)")
+    add("--seed", type=int, default=0, help="of intervals by drawn recordings (default: %(default)s)")
+    add("--jobs", type=int, default=1, help="processes (default: %(default)s)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    recordings, model = read_board(arguments.folder), read_model(arguments.model)
+    found: dict[str, Any] = {}
+    for align, title in ((True, "channels aligned"), (False, "as recorded")):
+        work = partial(heard, model=model, array=arguments.array, align=align)
+        outcomes = list(track(in_processes(work, recordings, arguments.jobs), title, len(recordings)))
+        found[title] = run_figures(outcomes, np.random.default_rng(arguments.seed))
+    lost = [one.recording.path.name for one in outcomes if any(one.buffers)]
+    listed = [one.path.name for one in recordings if not one.scored]
+    report = {
+        "recordings": len(recordings),
+        "lost_buffers": len(lost),
+        "listed": listed,
+        **found["channels aligned"],
+        "as_recorded": found["as recorded"],
+    }
+    lines = [f"{len(lost)} of {len(recordings)} recordings have channels that lost buffers"]
+    lines += [line for title, one in found.items() for line in _lines(title, one)]
+    lines += ["", f"listed, not scored: {', '.join(listed)}"]
+    return CommandResult(report, table={}, lines=lines)
