@@ -12,6 +12,7 @@ import pytest
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.detections import Detector
 from worldstate.adapters.camera.video import open_video
+from worldstate.adapters.own_parts import OwnDetector
 from worldstate.ground.errors import InputFileError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,8 +94,10 @@ def test_a_model_that_is_not_there_is_named(nanodet, tmp_path):
     not (RECORDINGS / "detector").is_dir(),
     reason="no ovad-sequences, neither where OVAD_SEQUENCES points nor in ../shared",
 )
-def test_boxes_are_those_that_come_with_the_recordings(nanodet):
-    detector = nanodet.open_nanodet(RECORDINGS / "detector" / "nanodet_m.onnx")
+def test_boxes_are_those_that_come_with_the_recordings(nanodet, monkeypatch):
+    # As `worldstate run --detector nanodet` makes it, without an argument.
+    monkeypatch.setenv("NANODET_ONNX", str(RECORDINGS / "detector" / "nanodet_m.onnx"))
+    detector = OwnDetector.of("nanodet", nanodet.open_nanodet)
     given = json.loads((RECORDINGS / "boxes" / "1_04_0018.json").read_text())["frames"]
     shared = []
     for number, image in enumerate(open_video(RECORDINGS / "video" / "1_04_0018.mp4").frames()):
