@@ -21,10 +21,14 @@ from .log_messages import LogMessage, LogSink
 _LOG = logging.getLogger(__name__)
 HOST = "127.0.0.1"
 MOST_VIEWERS = 8
+# Connections of one address, and of all, that have not asked yet: the oldest makes room for the newest. A
+# viewer asks at once, so that those which send a byte now and then keep no viewer out.
+MOST_ASKING, MOST_ASKING_OF_ALL = 8, 64
 # Messages that wait for a viewer: three seconds of hops. The oldest makes room for the newest.
 MOST_WAITING = 100
 # A viewer that takes nothing for so long is disconnected.
 STALLED_S = 10.0
+# A viewer has so long for its whole head.
 _HEAD_S, _HEAD_BYTES, _BLOCK_BYTES, _POLL_S = 5.0, 1 << 13, 1 << 16, 0.2
 _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
@@ -92,6 +96,7 @@ class OriginGate:
         self.refused = self.stalled = 0
         self._server, self._origins = server, frozenset(origins)
         self._places, self._stopped = threading.Semaphore(MOST_VIEWERS), threading.Event()
+        self._asking: list[tuple[str, socket.socket]] = []
         self._thread = threading.Thread(target=self._accept, daemon=True)
 
     def __enter__(self) -> Self:
@@ -110,28 +115,44 @@ class OriginGate:
         self._listening.settimeout(_POLL_S)
         while not self._stopped.is_set():
             try:
-                viewer, _ = self._listening.accept()
+                viewer, (address, _) = self._listening.accept()
             except OSError:  # no viewer came, or it has gone
                 continue
-            if self._places.acquire(blocking=False):
-                threading.Thread(target=self._serve, args=(viewer,), daemon=True).start()
-            else:
-                self._refuse(viewer)
-                viewer.close()
+            self._make_room(address)
+            self._asking.append((address, viewer))
+            threading.Thread(target=self._serve, args=(address, viewer), daemon=True).start()
 
-    def _serve(self, viewer: socket.socket) -> None:
-        try:
-            with viewer, suppress(OSError):
-                viewer.settimeout(_HEAD_S)
+    def _make_room(self, address: str) -> None:
+        """Hang up on what has waited longest where too many wait."""
+        every = list(self._asking)
+        same = [one for one in every if one[0] == address]
+        if len(same) >= MOST_ASKING or len(every) >= MOST_ASKING_OF_ALL:
+            oldest = (same if len(same) >= MOST_ASKING else every)[0]
+            with suppress(ValueError):  # it has asked meanwhile
+                self._asking.remove(oldest)
+                self.refused += 1
+                _hang_up(oldest[1])
+
+    def _serve(self, address: str, viewer: socket.socket) -> None:
+        with viewer, suppress(OSError):
+            try:
                 head = _head(viewer)
-                if not _may_connect(head, self._origins):
-                    self._refuse(viewer)
-                    return
-                with socket.create_connection(self._server, _HEAD_S) as server:
-                    server.sendall(head)
-                    self._join(viewer, server)
-        finally:
-            self._places.release()
+            finally:
+                with suppress(ValueError):  # it made room
+                    self._asking.remove((address, viewer))
+            if not (_may_connect(head, self._origins) and self._places.acquire(blocking=False)):
+                self._refuse(viewer)
+                return
+            try:
+                self._admit(head, viewer)
+            finally:
+                self._places.release()
+
+    def _admit(self, head: bytes, viewer: socket.socket) -> None:
+        viewer.settimeout(_HEAD_S)
+        with socket.create_connection(self._server, _HEAD_S) as server:
+            server.sendall(head)
+            self._join(viewer, server)
 
     def _refuse(self, viewer: socket.socket) -> None:
         self.refused += 1
@@ -173,8 +194,9 @@ def _hang_up(one: socket.socket) -> None:
 
 def _head(viewer: socket.socket) -> bytes:
     """Return what a viewer asks with, up to the empty line; a viewer that sends none is left."""
-    head = b""
+    head, until_s = b"", time.monotonic() + _HEAD_S
     while not head.endswith(b"\r\n\r\n"):
+        viewer.settimeout(max(until_s - time.monotonic(), 1e-3))
         block = viewer.recv(1)
         if not block or len(head) >= _HEAD_BYTES:
             raise ConnectionError

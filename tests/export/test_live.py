@@ -5,6 +5,7 @@ import json
 import os
 import socket
 import struct
+import threading
 import time
 
 import pytest
@@ -149,6 +150,50 @@ def test_what_is_no_websocket_is_refused_and_places_are_few():
             except ConnectionRefusedError:
                 time.sleep(0.05)
         assert len(viewers) == foxglove_server.MOST_VIEWERS
+
+
+def dripping(port, number):
+    """Open connections that never ask, from as many addresses as there are numbers."""
+    asked = []
+    for one in number:
+        asked.append(socket.socket())
+        asked[-1].bind((f"127.0.0.{one}", 0))
+        asked[-1].connect(("127.0.0.1", port))
+        asked[-1].sendall(b"GET / HTTP/1.1\r\n")
+    return asked
+
+
+@pytest.mark.parametrize("number", [[1] * 40, range(2, 130)])
+def test_connections_that_drip_keep_no_viewer_out(number):
+    with live_server(0) as (_, port):
+        asked = dripping(port, number)
+        try:
+            viewers = [Client(port) for _ in range(foxglove_server.MOST_VIEWERS)]
+            assert all(viewer.receive()["op"] == "serverInfo" for viewer in viewers)
+            waiting = [one for one in threading.enumerate() if "_serve" in one.name]
+            most = foxglove_server.MOST_ASKING if number == [1] * 40 else foxglove_server.MOST_ASKING_OF_ALL
+            assert len(waiting) <= most + len(viewers)
+        finally:
+            for one in asked:
+                one.close()
+
+
+def test_one_deadline_holds_for_a_whole_head(monkeypatch):
+    monkeypatch.setattr(foxglove_server, "_HEAD_S", 0.6)
+    with live_server(0) as (_, port):
+        (one,) = dripping(port, [1])
+        one.settimeout(0.1)
+        begun_s, ended = time.monotonic(), False
+        while not ended and time.monotonic() < begun_s + 5.0:
+            try:
+                one.sendall(b"X")
+                ended = one.recv(1) == b""
+            except TimeoutError:
+                continue
+            except ConnectionError:
+                ended = True
+        assert 0.4 < time.monotonic() - begun_s < 2.0
+        one.close()
 
 
 def test_a_viewer_that_takes_nothing_holds_nobody_up_and_is_let_go(monkeypatch):
