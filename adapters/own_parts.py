@@ -149,7 +149,15 @@ class OwnDetector:
     def detect(self, frame: ImageArray) -> DetectionFrame:
         """Return what it finds in an image."""
         with of_part(self.name):
-            return self.detector.detect(frame)
+            found = self.detector.detect(frame)
+        return checked_frame(self.name, found)
+
+
+def checked_frame(name: str, found: object) -> DetectionFrame:
+    """Return what a detector gave; refuse None and whatever else is no `DetectionFrame`."""
+    if not isinstance(found, DetectionFrame):
+        raise InvalidArgumentError(f"{name}: expected a DetectionFrame, got {found!r:.60}")
+    return found
 
 
 @contextmanager

@@ -16,10 +16,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, Self, TypeAlias, TypeVar
 
+import numpy as np
+
 from worldstate.adapters.camera.camera_channel import ImageHealth
 from worldstate.adapters.camera.detections import DetectionFrame, Detector, frame_of
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.files.odometry_file import OdometryRecord
+from worldstate.adapters.own_parts import checked_frame
 from worldstate.core.fixed_lag import LAG_NS
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range
 from worldstate.ground.errors import OwnPartError
@@ -335,7 +338,8 @@ class ImageLooks:
     Attributes
     ----------
     refused : int
-        Images of another size, and those whose boxes were refused.
+        Images of another size or none, those at which the detector failed or gave no `DetectionFrame`, and
+        those whose boxes were refused. Only a part that an installed package brings ends the run.
     problem : str
         What was wrong with the last of them.
     """
@@ -358,23 +362,44 @@ class ImageLooks:
         Return how many were refused.
         """
         before = self.refused
-        for captured_s, image in self._images.take_all():
+        for captured_s, image in self._waiting():
             try:
-                self._check_size(image)
                 stamp_ns = self._stamp_ns(captured_s)
-                self._health.read(stamp_ns, image)
-                take(stamp_ns, self._detector.detect(image))
+                take(stamp_ns, self._found(stamp_ns, image))
             except OwnPartError:
                 raise
             except WorldstateError as error:
                 self.refused, self.problem = self.refused + 1, str(error)
         return self.refused - before
 
+    def _waiting(self) -> list[tuple[float, ImageArray]]:
+        """Return the images that wait; what ended the camera counts once."""
+        try:
+            return self._images.take_all()
+        except Exception as error:  # whatever the callback that fills the channel ended it with
+            if (problem := f"camera: expected images, got {error!r}") != self.problem:
+                self.refused, self.problem = self.refused + 1, problem
+            return []
+
+    def _found(self, stamp_ns: int, image: ImageArray) -> DetectionFrame:
+        """Return what the detector finds in an image that has the size of the lens."""
+        try:
+            self._check_size(image)
+            self._health.read(stamp_ns, image)
+            found: object = self._detector.detect(image)
+        except WorldstateError:
+            raise
+        except Exception as error:  # of the caller's own detector, which may raise anything
+            raise InvalidArgumentError(f"camera: expected a detector that works, got {error!r}") from error
+        return checked_frame("camera", found)
+
     def degradation(self, stamp_ns: int) -> float:
         """Return d as last read, 0 where no scale of health is known."""
         return self._health.level
 
     def _check_size(self, image: ImageArray) -> None:
+        if not (isinstance(image, np.ndarray) and image.ndim == 3):
+            raise InvalidArgumentError(f"--camera: expected images, got {type(image).__name__}")
         got = image.shape[1], image.shape[0]
         if got != self._size_px:
             width, height = self._size_px

@@ -16,9 +16,10 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import NO_LOOKS, REMEMBERED, VisionQuery
 from worldstate.adapters.live.live_sensors import CameraFeed, DetectionSocket, ImageLooks, image_channel
 from worldstate.adapters.live.live_sound import BoundedChannel, LiveSound
+from worldstate.adapters.own_parts import OwnDetector
 from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.array.microphone_array import ovad_array
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, OwnPartError
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 
@@ -205,6 +206,46 @@ def test_datagrams_that_cannot_be_read_are_counted_and_named():
 def test_an_address_is_a_host_and_a_port(address):
     with pytest.raises(InvalidArgumentError, match="expected HOST:PORT"):
         DetectionSocket(address, nanoseconds)
+
+
+class Odd:
+    """A detector that does something else at each image."""
+
+    def __init__(self) -> None:
+        self._given = iter([None, RuntimeError("no memory on the card"), 7, KeyError("boxes"), box(260.0)])
+
+    def detect(self, image: np.ndarray) -> object:
+        given = next(self._given)
+        if isinstance(given, Exception):
+            raise given
+        return given
+
+
+@pytest.mark.parametrize("own", [Odd, lambda: OwnDetector("mine", Odd())])
+def test_a_callback_that_fails_or_gives_none_costs_its_image(source, own):
+    camera, images = replace(source, detections=NO_LOOKS).camera_channel(), image_channel()
+    looks, problems = ImageLooks(images, own(), nanoseconds, (640, 480)), []
+    for number, image in enumerate([None, np.zeros(4), *[np.zeros((480, 640, 3), np.uint8)] * 5]):
+        images.put((0.1 * number, image))
+        try:
+            looks.deliver(camera.see)
+        except OwnPartError as error:  # a part of an installed package ends the run with its name
+            problems.append(str(error))
+            continue
+        problems.append(looks.problem)
+    assert looks.refused + sum("mine: expected a part" in one for one in problems) == 6
+    assert "expected images, got NoneType" in problems[0]
+    assert "expected a DetectionFrame, got None" in problems[2]
+    assert "no memory on the card" in problems[3]
+    assert [seen.label for seen in camera.sightings(nanoseconds(0.6))] == ["car"]
+
+
+def test_a_camera_that_ends_with_an_error_counts_once(source):
+    images = image_channel()
+    looks = ImageLooks(images, Counting(), nanoseconds, (640, 480))
+    images.close(OSError("unplugged"))
+    assert [looks.deliver(source.camera_channel().see) for _ in range(3)] == [1, 0, 0]
+    assert "unplugged" in looks.problem
 
 
 class Capture:
