@@ -133,7 +133,7 @@ def learn_sequence(
         evidence |= {i: stream_evidence(windows, streams[i]) for i in outside}
         on_step()
     inputs = list(in_processes(sequence_inputs, [evidence[i] for i in range(len(streams))], jobs))
-    truths, weights = list(map(stream_truth, streams)), _weights(streams).tolist()
+    truths, weights = list(map(stream_truth, streams)), stream_weights(streams).tolist()
     labelled = list(map(LabelledStream.of, inputs, truths, weights))
     lessons = []
     for outside in folds:
@@ -178,7 +178,7 @@ def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:
     return [[i for i, at in enumerate(folds) if at == fold] for fold in sorted(set(folds))]
 
 
-def _weights(streams: Sequence[HeardStream]) -> FloatArray:
+def stream_weights(streams: Sequence[HeardStream]) -> FloatArray:
     """Return what a hop of each stream counts, so that hazard-free time has its share of use."""
     free = np.array([one.hazard_free for one in streams])
     hops = np.array([len(one.hops) for one in streams])
