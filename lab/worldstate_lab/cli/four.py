@@ -5,7 +5,8 @@ time of coming into view is known, and outdoors recordings run on past it. So th
 
 - the side of each vehicle outdoors by the second half of its recording: the one whose published risk has the
   larger mean; beside it the side by the window's log ratios, and by the sign of the surest 16 % of the
-  bearings, which need no model;
+  bearings, which need no model; and each of these over the hops until the loudest one, since in many second
+  halves the vehicle has passed and drives away on the other side;
 - the area under the ROC curve of 1 - P(none) of the hops in the last two seconds against those in the first
   two of the same recording, its mean over recordings of 5 s and more;
 - advisories by kind: one for a person is a failure of the guard.
@@ -27,7 +28,6 @@ from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ from worldstate.ground.values import seconds
 from worldstate.operations.metrics.approach_table import Figures, auroc, mean_of, share_interval
 from worldstate.simulation.parallel import in_processes
 from worldstate_lab.metrics.intervals import highest_share, stratified_draws
-from worldstate_lab.report.table import Table, Value
+from worldstate_lab.report.table import MISSING, Table, Value, cell_text
 
 BUFFER = 1024
 # Of the sound that is compared for lost buffers: wind below, little sound of vehicles above.
@@ -57,7 +57,7 @@ _ENDS_S, _LEAST_S = 2.0, 5.0
 _PERSONS = ("human", "man", "woman")
 _OUTDOORS, _UNSCORED = "OA", ("cart", "")
 _CENTRAL = (0.025, 0.975)
-_FORMS = ("risk", "window", "bearing")
+_SINCE_HALF, _UNTIL_LOUDEST = "second half", "until the loudest hop"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class BoardOutcome:
     recording: BoardRecording
     hops: int
     buffers: tuple[int, ...]  # Lost by each channel
-    sides: Mapping[str, str | None]  # Side in the second half by risk, window and bearing
+    sides: Mapping[str, str | None]  # By what they are read from, and in which hops
     rise: float | None  # AUROC of the last two seconds against the first two
     advised: bool
 
@@ -152,7 +152,9 @@ def outcome(
     present = np.array([1.0 - one.state.cues[0].hypotheses.none for one in steps])
     advised = any(cue.advisory is not None for one in steps for cue in one.state.cues)
     late = [one for one, at_s in zip(steps, time_s, strict=True) if at_s > 0.5 * duration_s]
-    sides = dict(zip(_FORMS, (_of_risk(late), _of_window(late), _of_bearing(late)), strict=True))
+    loudness = [one.frame.band_log_energy.mean() for one in steps]
+    spans = {_SINCE_HALF: late, _UNTIL_LOUDEST: steps[: int(np.argmax(loudness)) + 1]}
+    sides = {f"{name}, {span}": read(hops) for span, hops in spans.items() for name, read in _READ.items()}
     ends = time_s > duration_s - _ENDS_S
     kept = ends | (time_s <= _ENDS_S)
     rise = auroc(present[kept], ends[kept]) if duration_s >= _LEAST_S else None
@@ -181,17 +183,24 @@ def _of_bearing(steps: Sequence[Step]) -> str | None:
     return _side(np.sign([one.frame.bearing_rad for one in steps])[surest])
 
 
+_READ = {"risk": _of_risk, "window": _of_window, "bearing": _of_bearing}
+
+
+# What the side is scored by; the others stand beside it.
+_MAIN = f"risk, {_SINCE_HALF}"
+
+
 def run_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> dict[str, Any]:
     """Return the figures of all recordings that were heard."""
     scored = [one for one in outcomes if one.recording.scored]
     cars = [one for one in scored if one.recording.drives_outdoors]
     persons = [one for one in scored if one.recording.kind in _PERSONS]
-    forms = {form: side_figures(cars, form) for form in _FORMS}
+    by_form = {form: side_figures(cars, form) for form in outcomes[0].sides}
     return {
         "by_kind": {name: counts(some) for name, some in _by("kind", scored).items()},
         "by_group": {name: counts(some) for name, some in _by("group", scored).items()},
-        "side": forms[_FORMS[0]],
-        "side_by": forms,
+        "side": by_form[_MAIN],
+        "side_by": by_form,
         "hazard": hazard_figures(cars, rng),
         "persons": {"recordings": len(persons), "advisories": sum(one.advised for one in persons)},
     }
@@ -212,7 +221,7 @@ def counts(outcomes: Sequence[BoardOutcome]) -> Figures:
         "count": len(outcomes),
         "hops": sum(one.hops for one in outcomes),
         "advisories": sum(one.advised for one in outcomes),
-        "side_right": _right(outcomes, _FORMS[0]),
+        "side_right": _right(outcomes, _MAIN),
         "side_of": len(outcomes),
         "hazard_higher": int(np.sum(rises > 0.5)),
         "hazard_of": len(rises),
@@ -266,28 +275,21 @@ def _lines(title: str, figures: Mapping[str, Any]) -> list[str]:
     names = ("count", "advisories", "side_right", "hazard_higher", "hazard_of")
     rows = [(group, *(str(one[name]) for name in names)) for group, one in figures["by_group"].items()]
     hazard, persons = figures["hazard"], figures["persons"]
-    sides = [
-        (form, f"{one['right']} of {one['of']}", _value(one["share"], one), _value(one["balanced"]))
-        for form, one in figures["side_by"].items()
+    return [
+        "",
+        *Table("groups", title, ("by site, side and kind", *names), rows).lines(),
+        *(
+            f"side by {form}: {one['right']} of {one['of']}, {_shown(one, 'share')}"
+            for form, one in figures["side_by"].items()
+        ),
+        f"last 2 s against the first 2 s: AUROC {_shown(hazard, 'auroc')}, {hazard['pairs']} recordings",
+        f"persons with an advisory: {persons['advisories']} of {persons['recordings']}",
     ]
-    ends = (
-        "cars outdoors",
-        str(hazard["pairs"]),
-        _value(hazard["auroc"], hazard),
-        _value(hazard["balanced"]),
-    )
-    tables = (
-        Table("groups", title, ("by site, side and kind", *names), rows),
-        Table("sides", "Side in the second half", ("cars outdoors by", "right", "share", "balanced"), sides),
-        Table("hazard", "Last 2 s against the first 2 s", ("", "recordings", "AUROC", "balanced"), [ends]),
-    )
-    told = f"persons with an advisory: {persons['advisories']} of {persons['recordings']}"
-    return [line for table in tables for line in ("", *table.lines())] + ["", told]
 
 
-def _value(value: float | None, figures: Mapping[str, Any] = MappingProxyType({})) -> Value:
-    low, high = figures.get("interval") or (np.nan, np.nan)
-    return Value(np.nan if value is None else value, low, high)
+def _shown(figures: Mapping[str, Any], name: str) -> str:
+    known = Value(figures[name], *figures["interval"]).text if figures["interval"] else MISSING
+    return f"{known}, balanced {cell_text(figures['balanced'])}"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
