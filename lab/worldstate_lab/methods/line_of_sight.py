@@ -15,7 +15,7 @@ from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.trials.trial import TRACK_COLUMNS, Decide, Decisions, Trial
 
-from .oc_sort import OcSort, TrackedBox
+from .oc_sort import MIN_SCORE, OcSort, TrackedBox
 
 # At 47,998 Hz a hop ends up to 10 us before the image that it belongs to.
 SLACK_S = 1e-3
@@ -66,10 +66,9 @@ def _image_times(boxes: HopTable, until_s: float) -> FloatArray:
     return np.asarray(np.interp(np.arange(corners[-1]), corners, corner_s))
 
 
-def vehicles(boxes: HopTable) -> BoolArray:
-    """Return which boxes count by the filter of OVAD's authors, parked or moving, shape (n,)."""
+def vehicles(boxes: HopTable, keep: DetectionFilter) -> BoolArray:
+    """Return which boxes count by a filter, parked or moving, shape (n,)."""
     # The table says which boxes move, and those that do count already: only parked ones are looked up.
-    keep = DetectionFilter()
     high = boxes.box_px[:, 3] - boxes.box_px[:, 1] > keep.min_height_px
     return np.asarray(np.isin(boxes.class_name, list(keep.labels)) & (boxes.score >= keep.min_score) & high)
 
@@ -189,6 +188,7 @@ class OcSortRecovery:
 
     reading: Reading
     camera: PinholeCamera = field(default_factory=PinholeCamera.ovad)
+    keep: DetectionFilter = field(default_factory=DetectionFilter)  # Of OVAD's authors
 
     @property
     def name(self) -> str:
@@ -203,7 +203,7 @@ class OcSortRecovery:
         images, time_s = Images.of(trial), trial.hops.time_s
         # A box that flashed up once never was a track to coast on.
         counts = attrgetter("certain" if self.reading == "stock" else "known")
-        held = [list(filter(counts, tracks)) for tracks in _moving_tracks(trial, images)]
+        held = [list(filter(counts, tracks)) for tracks in _moving_tracks(trial, images, self.keep)]
         rows = []
         for hop, image in enumerate(images.of_hop):
             for one in held[image] if image >= 0 else ():
@@ -219,12 +219,14 @@ class OcSortRecovery:
         return Decisions.of(time_s, found, side=sides(bearing), bearing_rad=bearing, tracks=tracks)
 
 
-def _moving_tracks(trial: Trial, images: Images) -> Iterator[list[TrackedBox]]:
+def _moving_tracks(trial: Trial, images: Images, keep: DetectionFilter) -> Iterator[list[TrackedBox]]:
     """Yield the tracks of moving vehicles in every image."""
-    boxes, sort, moving = trial.boxes, OcSort(), set[int]()
+    # A detector whose boxes count from a lower score would have hardly one left at the published least one.
+    sort = OcSort(min(keep.min_score, MIN_SCORE))
+    boxes, moving = trial.boxes, set[int]()
     # Parked vehicles are tracked as well and left out afterwards: given moving boxes alone, a parked car
     # would begin a track in the first second, before it is known to stand, and coast into scored time.
-    counted = np.flatnonzero(vehicles(boxes)) if len(boxes) else np.empty(0, np.intp)
+    counted = np.flatnonzero(vehicles(boxes, keep)) if len(boxes) else np.empty(0, np.intp)
     edges = np.searchsorted(boxes.frame[counted], np.arange(len(images.time_s) + 1))
     for image, time_s in enumerate(images.time_s):
         here = counted[edges[image] : edges[image + 1]]

@@ -52,7 +52,8 @@ class OcSort:
     (-1, False, [40.0, 9.0, 140.0, 89.0])
     """
 
-    def __init__(self) -> None:
+    def __init__(self, min_score: float = MIN_SCORE) -> None:
+        self._min_score = min_score
         self._tracks: list[_Track] = []
         self._born = self._steps = 0
 
@@ -61,7 +62,7 @@ class OcSort:
         self._steps += 1
         for track in self._tracks:
             track.predict()
-        used = np.flatnonzero(scores >= MIN_SCORE)
+        used = np.flatnonzero(scores >= self._min_score)
         boxes, taken = boxes_px[used], {}
         pairs = self._associate(boxes, scores[used])
         for i, j in pairs:

@@ -61,15 +61,25 @@ _PASCAL = FULL_SCALE_PA / 32767.0  # Of one step of 16 bit
 
 def level_db(heard: HeardStream) -> FloatArray:
     """Return the level of one microphone in the half second that ends with every hop, shape (n,)."""
-    sections = band_filter(float(heard.hops.about["sample_rate_hz"]))
-    sound = sosfilt(sections, heard.hops.middle.ravel() * _PASCAL)
-    power = np.square(sound).reshape(len(heard.hops), -1).mean(axis=1)
+    pressure_pa = heard.hops.middle.ravel() * _PASCAL
+    return sound_level_db(pressure_pa, float(heard.hops.about["sample_rate_hz"]), len(heard.hops))
+
+
+def sound_level_db(pressure_pa: AnyArray, sample_rate_hz: float, hops: int) -> FloatArray:
+    """Return the level of a sound of so many whole hops in the half second that ends with each of them."""
+    sound = sosfilt(band_filter(sample_rate_hz), pressure_pa)
+    power = np.square(sound).reshape(hops, -1).mean(axis=1)
     return np.asarray(10.0 * np.log10(_half_second(power) / REFERENCE_PA**2 + 1e-9))
 
 
 def above_place_db(heard: HeardStream) -> FloatArray:
     """Return how far the level lies above its 20 % quantile of the stream so far, shape (n,)."""
-    level, past, place = level_db(heard), list[float](), list[float]()
+    return above_quiet_db(level_db(heard))
+
+
+def above_quiet_db(level: FloatArray) -> FloatArray:
+    """Return how far a level lies above its 20 % quantile so far, shape (n,)."""
+    past, place = list[float](), list[float]()
     for one in level.tolist():
         insort(past, one)
         place.append(past[int(QUIET_SHARE * len(past))])
