@@ -1,30 +1,45 @@
 """Recordings, read in blocks and checked when they are opened: one file, a file a microphone, a pipe."""
 
-import io
-import os
-import struct
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, Self, TypeAlias
+from typing import Any, BinaryIO, Self, TypeAlias
 
 import numpy as np
 import soundfile
 
+from worldstate.adapters.files.array_match import by_number
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.checks import one_of
 from worldstate.ground.typing import Float32Array
 
+from .plain_samples import (
+    MAX_CHANNELS,
+    MAX_RATE_HZ,
+    SUBTYPES,
+    Encoding,
+    PlainSamples,
+    decoded,
+    four_byte_form,
+    wave_layout,
+)
+
+_LOG = logging.getLogger(__name__)
+
 CONTAINERS = ("WAV", "WAVEX", "RF64", "W64", "FLAC")
+_EXPECTED = "WAV, RF64, W64 or FLAC"
+_WAYS_ON = {
+    ".bag": "; a bag of ROS 1: `rosbags-convert --src IN.bag --dst OUT` makes one of ROS 2",
+    ".raw": "; samples without a header are read from standard input: pcm:RATE:CHANNELS:FORMAT",
+    ".pcm": "; samples without a header are read from standard input: pcm:RATE:CHANNELS:FORMAT",
+}
 # Lossy codecs keep what the ear needs and lose the phase between microphones.
 FLOATING = ("FLOAT", "DOUBLE")
 ENCODINGS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", *FLOATING)
 SHORTEST_S = 1.0
-UNKNOWN_SIZE = 0xFFFFFFFF
-MAX_CHUNKS = 10_000
-W64_RIFF = bytes.fromhex("726966662e91cf11a5d628db04c10000")
 
 
 class Audio(ABC):
@@ -234,10 +249,6 @@ def open_audio(
 def _opened(path: Path, opened: ExitStack) -> AudioSource:
     """Open a file on the stack that closes it, whatever is silent in it."""
     source = opened.enter_context(AudioSource(path, _open_file(path)))
-    size = data_size(path)
-    if size is not None and size[0] > size[1]:
-        problem = f"cut short: expected {size[0]} bytes of samples by its header, got {size[1]}"
-        raise InputFileError(path, problem)
     if source.frames == 0:
         raise InputFileError(path, "expected samples, the recording is empty")
     source.span(source.frames - 1, 1)  # which a FLAC file that was cut short cannot give
@@ -249,15 +260,34 @@ def _open_file(path: Path) -> Any:
     if not path.is_file():
         problem = "expected an audio file, found a folder" if path.is_dir() else "no such file"
         raise InputFileError(path, problem)
+    if (plain := _open_plain(path)) is not None:
+        return plain
     try:
         file = soundfile.SoundFile(path)
     except (soundfile.SoundFileError, OSError, TypeError) as error:
-        raise InputFileError(path, "expected WAV, RF64, W64 or FLAC audio, found something else") from error
+        way = _WAYS_ON.get(path.suffix.lower(), "")
+        raise InputFileError(path, f"expected {_EXPECTED} audio, found something else{way}") from error
     if file.format not in CONTAINERS or file.subtype not in ENCODINGS:
         kind = f"{file.format} {file.subtype}"
         file.close()
-        raise InputFileError(path, f"expected WAV, RF64, W64 or FLAC with plain samples, got {kind}")
+        problem = f"expected {_EXPECTED} with plain samples, got {kind}"
+        raise InputFileError(path, f"{problem}; `sox {path.name} out.wav` converts what is lossless")
     return file
+
+
+def _open_plain(path: Path) -> PlainSamples | None:
+    """Open a file whose header does not fit what follows it, and say so; refuse one that was cut short."""
+    if (layout := wave_layout(path)) is None:
+        return None
+    declared, there = layout.declared_bytes, layout.there_bytes
+    if layout.n_bytes > there:
+        problem = f"cut short: expected {declared} bytes of samples by its header, got {there}"
+        raise InputFileError(path, f"{problem}; `sox --ignore-length IN OUT` keeps what is there")
+    plain = layout.samples()
+    if plain is not None and layout.n_bytes != declared:
+        told = "%s: its header promises %d bytes of samples, the file holds %d: read to their end"
+        _LOG.warning(told, path, declared, layout.n_bytes)
+    return plain
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:
@@ -277,47 +307,6 @@ def check_finite(path: Path, block: Float32Array, start: int) -> None:
         sample, channel = np.argwhere(~finite)[0]
         where = f"channel {channel + 1}, sample {start + sample}"
         raise InputFileError(path, f"expected finite samples, got {block[sample, channel]} in {where}")
-
-
-def data_size(path: Path) -> tuple[int, int] | None:
-    """Return the bytes of samples of a RIFF, RF64 or W64 file: promised by its header, and there."""
-    with path.open("rb") as file:
-        magic = file.read(16)
-        if magic[:4] in (b"RIFF", b"RF64") and magic[8:12] == b"WAVE":
-            return _data_chunk(file, 12, struct.Struct("<4sI"), counted=0, padded=2)
-        if magic == W64_RIFF:
-            return _data_chunk(file, 40, struct.Struct("<4s12xQ"), counted=24, padded=8)
-    return None
-
-
-def _data_chunk(
-    file: BinaryIO, first: int, header: struct.Struct, counted: int, padded: int
-) -> tuple[int, int] | None:
-    """Find the samples among chunks, of whose header the size counts some bytes, padded to a multiple."""
-    wide_size: int | None = None
-    file.seek(first)
-    for _ in range(MAX_CHUNKS):
-        if len(head := file.read(header.size)) < header.size:
-            return None
-        name, size = header.unpack(head)
-        size -= counted
-        there = os.fstat(file.fileno()).st_size - file.tell()
-        if name == b"data":
-            declared = wide_size if size == UNKNOWN_SIZE else size
-            return None if declared is None else (declared, there)
-        if name == b"ds64":
-            ds64 = file.read(16)
-            wide_size = struct.unpack("<8xQ", ds64)[0] if len(ds64) == 16 else None
-            file.seek(-len(ds64), os.SEEK_CUR)
-        if not 0 <= size <= there:
-            return None
-        file.seek(size + -size % padded, os.SEEK_CUR)
-    return None
-
-
-Encoding = Literal["s16", "s24", "s32", "f32"]
-SUBTYPES: dict[Encoding, str] = {"s16": "PCM_16", "s24": "PCM_24", "s32": "PCM_32", "f32": "FLOAT"}
-MAX_CHANNELS = 1024
 
 
 class SoundStream(ABC):
@@ -349,8 +338,9 @@ class RawPcm(SoundStream):
         Samples per second and channel.
     channels : int
         Number of microphones.
-    encoding : {"s16", "s24", "s32", "f32"}
-        Whole numbers of so many bits, or floats of full scale 1.
+    encoding : {"s16", "s24", "s24_32", "s32", "f32"}
+        Whole numbers of so many bits, or floats of full scale 1; "s24_32" are 24 bits in the lower three of
+        four bytes (ALSA's S24_LE).
     name : str
         For messages.
 
@@ -373,7 +363,7 @@ class RawPcm(SoundStream):
     name: str = "/dev/stdin"
 
     def __post_init__(self) -> None:
-        in_range("sample_rate_hz", self.sample_rate_hz, 1, 10_000_000)
+        in_range("sample_rate_hz", self.sample_rate_hz, 1, MAX_RATE_HZ)
         in_range("channels", self.channels, 1, MAX_CHANNELS)
         one_of("encoding", self.encoding, SUBTYPES)
 
@@ -384,13 +374,23 @@ class RawPcm(SoundStream):
     @property
     def frame_bytes(self) -> int:
         """Bytes of one sample of all channels."""
-        return int(self.encoding[1:]) // 8 * self.channels
+        return int(self.encoding.rpartition("_")[2].lstrip("sf")) // 8 * self.channels
 
     def to_samples(self, data: bytes) -> Float32Array:
         """Return samples of full scale 1, shape (n, channels)."""
-        raw = {"format": "RAW", "subtype": SUBTYPES[self.encoding], "endian": "LITTLE"}
-        about = {"samplerate": self.sample_rate_hz, "channels": self.channels, "always_2d": True}
-        return np.asarray(soundfile.read(io.BytesIO(data), dtype="float32", **raw, **about)[0])
+        return decoded(data, SUBTYPES[self.encoding], self.channels)
+
+    def check_encoding(self, data: bytes) -> None:
+        """Refuse samples that obviously have another encoding; where that is not certain, say so."""
+        form = four_byte_form(data)
+        # A channel of 16 bits that is dead or hardly used looks like whole numbers of four bytes.
+        if form in (None, self.encoding) or (self.encoding == "s16" and form != "f32"):
+            return
+        if (self.encoding, form) == ("s32", "s24_32"):
+            told = "%s: samples of s32 fill 24 of 32 bits; if they are 24 bits in four bytes, name s24_32"
+            _LOG.warning(told, self.name)
+            return
+        raise InputFileError(self.name, f"expected samples of {self.encoding}, got such as those of {form}")
 
 
 # An open recording is one whose samples come from elsewhere, such as microphones that run.
@@ -423,20 +423,22 @@ class PcmAudio(Audio):
         self._raw = raw
         self.path = Path(raw.name)
         self.sample_rate_hz, self.channels, self.frames = raw.sample_rate_hz, raw.channels, 0
-        self._first = self._read(raw.sample_rate_hz)
+        data = self._read_bytes(raw.sample_rate_hz)
+        raw.check_encoding(data)
+        self._first = self._block(data)
         self.silent_channels = constant_channels(self._first)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the samples up to the end of the stream in blocks of `frames`; the last may be shorter."""
         for start in range(0, len(self._first), frames):
             yield self._first[start : start + frames]
-        while len(block := self._read(frames)):
-            yield block
+        while data := self._read_bytes(frames):
+            yield self._block(data)
 
     def close(self) -> None:
         """Leave the stream to its owner."""
 
-    def _read(self, frames: int) -> Float32Array:
+    def _read_bytes(self, frames: int) -> bytes:
         wanted = frames * self._raw.frame_bytes
         parts: list[bytes] = []
         # A pipe gives what it holds, which may be less than a block.
@@ -446,7 +448,10 @@ class PcmAudio(Audio):
         if len(joined) % self._raw.frame_bytes:
             got = f"{len(joined) % self._raw.frame_bytes} bytes too many"
             raise InputFileError(self.path, f"expected whole samples of {self.channels} channels, got {got}")
-        block = self._raw.to_samples(joined)
+        return joined
+
+    def _block(self, data: bytes) -> Float32Array:
+        block = self._raw.to_samples(data)
         if self._raw.encoding == "f32":
             check_finite(self.path, block, self.frames)
         self.frames += len(block)
@@ -565,8 +570,7 @@ def _unchecked(sound: Path | tuple[Path, ...] | SoundStream, opened: ExitStack) 
     """Open what can be read, whatever is silent, on the stack that closes it."""
     if isinstance(sound, SoundStream):
         return opened.enter_context(sound.open())
-    return (
-        MonoFiles([_opened(one, opened) for one in sound])
-        if isinstance(sound, tuple)
-        else _opened(sound, opened)
-    )
+    if isinstance(sound, Path):
+        return _opened(sound, opened)
+    order = by_number(sound[0].parent, [str(one) for one in sound])
+    return MonoFiles([_opened(sound[place], opened) for place in order])

@@ -1,6 +1,10 @@
-"""Compare microphone positions with those of a model or a data set, in whatever order."""
+"""Compare positions with those of a model or a data set, in whatever order; put numbered names in order."""
 
+import logging
+import re
+from collections.abc import Sequence
 from itertools import permutations, product
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +19,7 @@ TRAIN = "Make a model for it (worldstate model make; of recordings model feature
 WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (settings=ListenSettings(uncalibrated=True))"
 _UNITS = {1.0: "", 1e-3: "looks like millimetres", 1e-2: "looks like centimetres"}
 _LEAST_TURN_DEG = 0.5
+_LOG = logging.getLogger(__name__)
 
 
 def microphone_order(expected_m: FloatArray, array: MicrophoneArray) -> IndexArray | None:
@@ -82,6 +87,34 @@ def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: st
         model = f"{made_for.name}, {made_for.n_microphones} microphones"
         raise OutOfDomainError(f"{array.name}: not the array of the model ({model}): {difference}. {way_out}")
     return order
+
+
+def by_number(path: Path, names: Sequence[str]) -> list[int]:
+    """Return the order in which microphones with such names are taken; say so if it is not that of numbers.
+
+    Names that differ in numbers alone and stand as a shell or a spreadsheet sorts them (mic_1, mic_10, mic_2)
+    are taken in the order of the numbers. Any other order counts as deliberate and is kept.
+
+    Examples
+    --------
+    >>> by_number(Path("street"), ["mic_1.wav", "mic_10.wav", "mic_2.wav"])
+    [0, 2, 1]
+    >>> by_number(Path("street"), ["mic_3.wav", "mic_1.wav", "mic_2.wav"])
+    [0, 1, 2]
+    """
+    given, parts = list(range(len(names))), [re.split(r"(\d{1,9})", name) for name in names]
+    numbers = [tuple(map(int, part[1::2])) for part in parts]
+    ranked = sorted(given, key=numbers.__getitem__)
+    if len({tuple(part[::2]) for part in parts}) > 1 or len({*numbers}) < len(names) or ranked == given:
+        return given
+    # Locales sort without regard to punctuation: mic_10.wav before mic_1.wav.
+    bare = [re.sub(r"[\W_]", "", name).lower() for name in names]
+    by_text = sorted(names) == list(names) or sorted(bare) == bare
+    told = "%s: %s, %s, ... are not in the order of their numbers: %s"
+    done = "taken in that of the numbers" if by_text else "kept as they were given"
+    at = next(i for i in given if ranked[i] != i)
+    _LOG.warning(told, path, names[at], names[min(at + 1, len(names) - 1)], done)
+    return ranked if by_text else given
 
 
 def _centred(positions_m: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.audio import sound_file
+from worldstate.adapters.audio.plain_samples import MAX_CHANNELS, MAX_RATE_HZ, Encoding
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.export.log_messages import check_chunks
 from worldstate.adapters.files.array_file import named_arrays
@@ -149,12 +150,11 @@ _LOG = logging.getLogger(__name__)
 
 AUDIO_KINDS = types.AUDIO, types.STAMPED_PCM, types.PCM, types.AUDIO_FRAME, types.RAW_AUDIO
 # Formats by the message that names them; a compressed one has lost the phase between microphones.
-ENCODINGS: dict[str, dict[str, sound_file.Encoding]] = {
+ENCODINGS: dict[str, dict[str, Encoding]] = {
     types.PCM_INFO: {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"},
     types.AUDIO_FRAME: {"signed_16": "s16", "signed_24": "s24", "signed_32": "s32", "float": "f32"},
     types.RAW_AUDIO: {"pcm-s16": "s16"},
 }
-MAX_RATE_HZ = 10_000_000
 # Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
 LONGEST_GAP_S = 2.0
 STATIC_TOPIC = "/tf_static"
@@ -256,8 +256,8 @@ def audio_blocks(bag: BagReader, topic: str) -> Iterator[AudioBlock]:
 
 def _own_block(path: Path, message: Any) -> AudioBlock:
     rate_hz, channels, data = int(message.sample_rate), int(message.channels), message.data
-    if not (1 <= rate_hz <= MAX_RATE_HZ and 1 <= channels <= sound_file.MAX_CHANNELS):
-        expected = f"expected 1 to {MAX_RATE_HZ} samples a second and 1 to {sound_file.MAX_CHANNELS} channels"
+    if not (1 <= rate_hz <= MAX_RATE_HZ and 1 <= channels <= MAX_CHANNELS):
+        expected = f"expected 1 to {MAX_RATE_HZ} samples a second and 1 to {MAX_CHANNELS} channels"
         raise InputFileError(path, f"{expected}, got {rate_hz} and {channels}")
     if len(data) % channels or not len(data):
         raise InputFileError(path, f"expected samples of {channels} channels, got {len(data)} numbers")
@@ -476,8 +476,8 @@ def _array(bag: BagReader) -> MicrophoneArray | None:
     if said is None:
         return None
     places = said[1].positions
-    if len(places) > sound_file.MAX_CHANNELS:
-        raise InputFileError(bag.path, f"{topic}: expected at most {sound_file.MAX_CHANNELS} microphones")
+    if len(places) > MAX_CHANNELS:
+        raise InputFileError(bag.path, f"{topic}: expected at most {MAX_CHANNELS} microphones")
     positions_m = np.array([[one.x, one.y, one.z] for one in places], dtype=np.float64).reshape(-1, 3)
     return MicrophoneArray(positions_m, str(said[1].name or topic))
 

@@ -8,7 +8,7 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.adapters.audio.sound_file import SilentChannelsError, data_size, open_audio, open_sound
+from worldstate.adapters.audio.sound_file import SilentChannelsError, open_audio, open_sound
 from worldstate.ground.errors import InvalidArgumentError
 
 RATE_HZ = 8000
@@ -91,23 +91,6 @@ def test_closes_its_file(long_file: Path) -> None:
 def test_refuses_empty_blocks(long_file: Path, frames: int) -> None:
     with open_audio(long_file) as source, pytest.raises(InvalidArgumentError, match="frames"):
         next(source.blocks(frames))
-
-
-@pytest.mark.parametrize("container", ["WAV", "WAVEX", "RF64", "W64"])
-def test_data_size_is_that_of_the_samples(tmp_path: Path, container: str) -> None:
-    size = data_size(write(tmp_path / "sound", noise(frames=9001, channels=2), container))
-    assert size is not None
-    declared, available = size
-    assert declared == 9001 * 2 * 3
-    assert available >= declared
-
-
-def test_size_left_open_by_a_stream_is_no_cut(tmp_path: Path) -> None:
-    name = write(tmp_path / "piped.wav", noise())
-    data = bytearray(name.read_bytes())
-    data[data.index(b"data") + 4 : data.index(b"data") + 8] = b"\xff" * 4
-    name.write_bytes(data)
-    assert data_size(name) is None
 
 
 def test_a_silent_file_among_those_of_single_microphones_is_a_silent_channel(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from worldstate import adapters, frontend
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.sound_file import Audio, Encoding, SoundInput
+    from worldstate.adapters.audio.plain_samples import Encoding
+    from worldstate.adapters.audio.sound_file import Audio, SoundInput
 
 _EXAMPLE = "  arecord -D hw:1 -t raw -f S32_LE -r 48000 -c 8 | {} pcm:48000:8:s32"
 _RAW = "pcm:"
@@ -35,8 +36,8 @@ def add_sound_options(parser: argparse.ArgumentParser) -> None:
     INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
     (out_multi.wav and, where there is one, camera_baseline_results.json), several files of one channel each
     in the order of the microphones, a bag of ROS 2 (its folder, .mcap or .db3), or raw samples on standard
-    input: pcm:RATE:CHANNELS:FORMAT, with s16, s24, s32 (little-endian whole numbers) or f32 (floats) as
-    FORMAT.
+    input: pcm:RATE:CHANNELS:FORMAT, with s16, s24, s24_32 (24 bits in four bytes, arecord's S24_LE), s32
+    (little-endian whole numbers) or f32 (floats) as FORMAT.
     """
     describe(parser, add_sound_options)
     parser.epilog = f"{parser.epilog}\n{_EXAMPLE.format(parser.prog)}"

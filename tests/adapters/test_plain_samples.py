@@ -1,0 +1,218 @@
+"""Sizes, containers and encodings that contradict the samples: all that was recorded is read, or refused."""
+
+import io
+import logging
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.adapters.audio.plain_samples import SUBTYPES, Encoding, decoded, four_byte_form
+from worldstate.adapters.audio.sound_file import RawPcm, open_audio, open_sound
+from worldstate.ground.errors import InputFileError
+
+RATE_HZ = 8000
+# arecord, SoX and ffmpeg; the last of each pair is rounded to whole samples of three channels.
+OPEN_SIZES = (0, 0x80000000, 0x7FFFFFFE, 0x7FFFFF00, 0x7FFFF000, 0xFFFFFFFF, 0xFFFFFFFC, 0xFFFFF000)
+
+
+def noise(frames: int = 9001, channels: int = 3, scale: float = 0.1) -> np.ndarray:
+    return np.random.default_rng(7).normal(0.0, scale, (frames, channels)).clip(-0.9, 0.9).astype(np.float32)
+
+
+def size_at(data: bytes, container: str) -> tuple[int, str]:
+    """Return where the size of the samples stands in a header, and how it is packed."""
+    if container in ("RF64", "BW64"):
+        return data.index(b"ds64") + 16, "<Q"
+    return data.index(b"data") + (16 if container == "W64" else 4), "<Q" if container == "W64" else "<I"
+
+
+def with_size(path: Path, container: str, size: int, subtype: str = "PCM_16", tail: bytes = b"") -> Path:
+    """Write a file whose header says another size, and perhaps chunks behind the samples."""
+    kind = {"BW64": "RF64"}.get(container, container)
+    soundfile.write(path, noise(), RATE_HZ, format=kind, subtype=subtype)
+    data = bytearray(path.read_bytes() + tail)
+    at, packed = size_at(data, container)
+    struct.pack_into(packed, data, at, size)
+    data[:4] = b"BW64" if container == "BW64" else data[:4]
+    path.write_bytes(data)
+    return path
+
+
+def heard(path: Path) -> np.ndarray:
+    with open_audio(path) as source:
+        return np.concatenate(list(source.blocks(1000)))
+
+
+@pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24", "FLOAT"])
+@pytest.mark.parametrize("container", ["WAV", "WAVEX", "RF64", "BW64", "W64"])
+def test_of_a_recorder_that_was_killed_all_samples_are_read_and_it_is_said(
+    tmp_path: Path, container: str, subtype: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    for size in OPEN_SIZES if container.startswith("WAV") else (0, *OPEN_SIZES[1:5], 2**64 - 1):
+        caplog.clear()
+        found = heard(
+            with_size(tmp_path / "a.wav", container, size + 24 * (container == "W64") & 2**64 - 1, subtype)
+        )
+        np.testing.assert_allclose(found, noise(), atol=2.0**-15)
+        assert "a.wav: its header promises" in caplog.text, size
+
+
+@given(
+    share=st.floats(0.0, 0.999),
+    more=st.integers(1, 2**30),
+    container=st.sampled_from(["WAV", "RF64", "BW64"]),
+)
+@settings(max_examples=40, deadline=None)
+def test_no_size_costs_a_sample_in_silence(
+    tmp_path_factory: pytest.TempPathFactory, share: float, more: int, container: str
+) -> None:
+    path, there = tmp_path_factory.mktemp("size") / "a.wav", 9001 * 6
+    with_size(path, container, int(share * there))
+    assert len(heard(path)) == 9001
+    with pytest.raises(InputFileError, match=r"cut short.*sox --ignore-length"):
+        heard(with_size(path, container, there + more))
+
+
+CHUNK = b"LIST" + struct.pack("<I", 10) + b"INFOISFTab"
+
+
+@pytest.mark.parametrize("tail", [b"", CHUNK, CHUNK + b"id3 " + struct.pack("<I", 3) + b"abc\0", b"\0"])
+@pytest.mark.parametrize("container", ["WAV", "RF64"])
+def test_chunks_behind_the_samples_are_no_samples(
+    tmp_path: Path, container: str, tail: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    np.testing.assert_allclose(
+        heard(with_size(tmp_path / "a.wav", container, 9001 * 6, tail=tail)), noise(), atol=2e-4
+    )
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("tail", [b"", CHUNK])
+def test_a_size_that_has_wrapped_round_is_counted_on(
+    tmp_path: Path, tail: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Eight thousand samples, 4 GiB of nothing that no disk holds, and one more sample."""
+    name, frame = tmp_path / "long.wav", 6
+    frames = (2**32 + 48_000) // frame
+    soundfile.write(name, noise(), RATE_HZ, subtype="PCM_16")
+    data = bytearray(name.read_bytes()[: 44 + 48_000])
+    struct.pack_into("<I", data, 40, frames * frame % 2**32)
+    with name.open("wb") as file:
+        file.write(data)
+        file.seek(44 + (frames - 1) * frame)
+        file.write(b"\x00\x20" * 3 + tail)
+    with open_audio(name) as source:
+        assert source.frames == frames
+        np.testing.assert_array_equal(source.span(frames - 1, 1), 0.25)
+    assert "its header promises" in caplog.text
+
+
+def stored(samples: np.ndarray, encoding: Encoding) -> bytes:
+    """Return samples as a converter gives them, written here by NumPy alone."""
+    if encoding == "f32":
+        return samples.astype("<f4").tobytes()
+    bits = int(encoding[1:3])
+    whole = np.round(samples * (2 ** (bits - 1) - 1)).astype("<i4")
+    if encoding == "s24":
+        return whole.reshape(-1, 1).view(np.uint8)[:, :3].tobytes()
+    return whole.astype("<i2" if bits == 16 else "<i4").tobytes()
+
+
+def wav_of_24_bits(path: Path, data: bytes, channels: int, tag: int = 1) -> Path:
+    """Write 24 bits in four bytes each, as arecord and as the standard have them."""
+    about = struct.pack("<HHIIHH", tag, channels, RATE_HZ, RATE_HZ * 4 * channels, 4 * channels, 24)
+    if tag != 1:
+        about += struct.pack("<HHIH", 22, 24, 0, 1) + b"\0\0\0\0\x10\0\x80\0\0\xaa\0\x38\x9b\x71"
+    body = b"WAVEfmt " + struct.pack("<I", len(about)) + about + b"data" + struct.pack("<I", len(data))
+    path.write_bytes(b"RIFF" + struct.pack("<I", len(body) + len(data)) + body + data)
+    return path
+
+
+@pytest.mark.parametrize("tag", [1, 0xFFFE])
+@pytest.mark.parametrize("upper", ["sign", "zero", "full scale"])
+def test_24_bits_in_four_bytes_of_a_file_have_their_level(tmp_path: Path, upper: str, tag: int) -> None:
+    whole = np.frombuffer(stored(noise(), "s24_32"), "<i4")
+    data = {"sign": whole, "zero": whole & 0xFFFFFF, "full scale": whole << 8}[upper]
+    found = heard(wav_of_24_bits(tmp_path / "a.wav", data.astype("<i4").tobytes(), 3, tag))
+    np.testing.assert_allclose(found, noise(), atol=2e-7)
+
+
+@pytest.mark.parametrize("encoding", SUBTYPES)
+@given(scale=st.floats(1e-3, 0.3), channels=st.integers(1, 9))
+@settings(max_examples=15, deadline=None)
+def test_every_encoding_is_read_as_itself(encoding: Encoding, scale: float, channels: int) -> None:
+    samples = noise(9000, channels, scale)
+    data = stored(samples, encoding)
+    np.testing.assert_allclose(decoded(data, SUBTYPES[encoding], channels), samples, atol=5e-5)
+    with open_sound(RawPcm(io.BytesIO(data), RATE_HZ, channels, encoding)) as audio:
+        assert sum(map(len, audio.blocks())) == 9000
+    assert four_byte_form(data) in (encoding, None)
+
+
+@pytest.mark.parametrize("read_as", SUBTYPES)
+@pytest.mark.parametrize("encoding", ["s24_32", "f32", "s32"])
+@given(scale=st.floats(1e-3, 0.3), channels=st.sampled_from([1, 2, 4, 6, 7, 8, 16]))
+@settings(max_examples=8, deadline=None)
+def test_four_bytes_a_sample_are_never_heard_as_three(
+    encoding: Encoding, read_as: Encoding, scale: float, channels: int
+) -> None:
+    data = stored(noise(12_000, channels, scale), encoding)
+    if encoding == "s32":
+        data = (np.frombuffer(data, "<i4") & ~0xFF).astype("<i4").tobytes()  # of a converter of 24 bits
+    raw = RawPcm(io.BytesIO(data), RATE_HZ, channels, read_as)
+    certain = read_as in ("s24", "f32") or (encoding == "f32" and read_as in ("s16", "s32", "s24_32"))
+    if certain and read_as != encoding:
+        with pytest.raises(InputFileError, match=f"got such as those of {encoding}"):
+            open_sound(raw)
+    elif read_as == encoding:
+        open_sound(raw)
+
+
+def test_a_quiet_recording_of_32_bits_is_read_and_doubted(caplog: pytest.LogCaptureFixture) -> None:
+    quiet = stored(noise(9000, 4, 5e-4), "s32")
+    with caplog.at_level(logging.WARNING), open_sound(RawPcm(io.BytesIO(quiet), RATE_HZ, 4, "s32")) as audio:
+        assert audio.silent_channels == ()
+    assert "name s24_32" in caplog.text
+
+
+NAMES = {
+    "as a shell lists them": ([1, 10, 11, 12, 2, 3, 4, 5, 6, 7, 8, 9], True),
+    "as a shell of another locale": ([10, 11, 12, 1, 2, 3, 4, 5, 6, 7, 8, 9], True),
+    "in order": (list(range(1, 13)), False),
+    "in an order of their own": ([3, 1, 2, 5, 4, 6, 7, 12, 8, 9, 10, 11], None),
+}
+
+
+@pytest.mark.parametrize(
+    "pattern", ["mic_{}.wav", "ch{}.wav", "2024-05-01 street {} left.wav", "m{}/rec.wav"]
+)
+@pytest.mark.parametrize("case", NAMES)
+def test_numbered_files_are_taken_by_number_or_it_is_said(
+    tmp_path: Path, case: str, pattern: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    numbers, by_number = NAMES[case]
+    samples, names = noise(channels=12), [tmp_path / pattern.format(number) for number in numbers]
+    for name, number in zip(names, numbers, strict=True):
+        name.parent.mkdir(exist_ok=True)
+        soundfile.write(name, samples[:, number - 1], RATE_HZ, subtype="FLOAT")
+    with open_sound(tuple(names)) as audio:
+        found = np.concatenate(list(audio.blocks()))
+    order = sorted(numbers) if by_number else numbers
+    np.testing.assert_array_equal(found, samples[:, [number - 1 for number in order]])
+    assert ("not in the order of their numbers" in caplog.text) is (by_number is not False)
+
+
+@pytest.mark.parametrize(
+    ("name", "way"), [("a.bag", "rosbags-convert"), ("a.raw", "pcm:RATE"), ("a.au", "`sox a.au out.wav`")]
+)
+def test_another_form_of_sound_is_refused_with_the_way_on(tmp_path: Path, name: str, way: str) -> None:
+    (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n" + bytes(1000))
+    if name == "a.au":
+        soundfile.write(tmp_path / name, noise(), RATE_HZ)
+    with pytest.raises(InputFileError, match=way):
+        open_audio(tmp_path / name)
