@@ -1,14 +1,15 @@
-"""Microphone positions: files of Acoular XML, CSV and JSON, and boards that are known by name."""
+"""Microphone positions: files of Acoular XML, CSV, JSON and ODAS, and boards that are known by name."""
 
 import csv
 import json
+import logging
 import math
 import re
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 from xml.sax.saxutils import quoteattr
 
 import defusedxml.ElementTree as SafeElementTree
@@ -23,7 +24,10 @@ from worldstate.frontend.array.microphone_array import (
 )
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 
+from .array_match import by_number
 from .file_io import read_bytes, write_text
+
+_LOG = logging.getLogger(__name__)
 
 Axes = Literal["acoular", "base_link"]
 # The coordinates x, y and z of a microphone as a file has them.
@@ -35,21 +39,41 @@ MAX_BYTES = 1 << 20
 MAX_APERTURE_M = 20.0
 MAX_SPACING_M = 3.0
 MIN_SPACING_M = 1e-3
-_HEADER = re.compile(r"(?:pos(?:ition)?[ _]?)?([xyz])(?:[ _]*[\[(]?m[\])]?)?", re.IGNORECASE)
+_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_STATED = "a header x_mm,y_mm,z_mm, or positions_mm in JSON, states them"
+_HEADER = re.compile(r"(?:pos(?:ition)?[ _]?)?([xyz])(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?", re.IGNORECASE)
+_TRANSPOSED = "three rows are a 3 x M matrix, as of MATLAB and pyroomacoustics: write its transpose"
+_DECIMAL_COMMAS = re.compile(r"(-?\d*,\d+|-?\d+)([;\s]+(-?\d*,\d+|-?\d+)){2,3}")
+# Of libconfig: strings stay, comments go; what does not end goes on to the end of the file.
+_COMMENT = re.compile(r'("(?:\\.|[^"\\])*"?)|#[^\n]*|//[^\n]*|/\*(?:.*?\*/|.*)', re.DOTALL)
+_MICS, _MARKS = re.compile(r"\bmics\s*[:=]\s*[(\[]"), re.compile(r"[()\[\]]")
+_MU, _MAP = (re.compile(rf"\b{key}\s*[:=]\s*[(\[]([^()\[\]]*)[)\]]") for key in ("mu", "map"))
+
+
+class _Rows(NamedTuple):
+    """What a file holds, before its numbers are read."""
+
+    rows: list[Row]
+    axes: str = "base_link"
+    channels: tuple[Any, ...] = ()
+    unit_m: float = 1.0
 
 
 def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     r"""Read microphone positions in metres, one microphone a channel, in the order of the channels.
 
-    Three forms are told apart by their first character:
+    Four forms are told apart by what they begin with:
 
     - Acoular XML, ``<MicArray><pos Name="1" x="0.1" y="0" z="0" /> ...``, in the axes of the array plane: x
       to the right, y up, z along the look direction, so that :math:`(x, y, z)_{base} = (z, -x, y)_{file}`.
     - CSV, one microphone a line: x, y, z, with or without a header and a column of names; separated by comma,
-      semicolon, tab or blanks. In `base_link` axes: x forward, y left, z up.
+      semicolon, tab or blanks. In `base_link` axes: x forward, y left, z up. A header may state another unit:
+      ``x_mm,y_mm,z_mm``.
     - JSON, ``[[x, y, z], ...]`` or ``{"positions_m": [[x, y, z], ...], "axes": "base_link"}``, in `base_link`
       axes unless ``"axes"`` is ``"acoular"``; with ``"channels": [2, 3, ...]``, from 1, where the card has
-      more channels than microphones.
+      more channels than microphones; ``"positions_mm"`` and ``"positions_cm"`` in other units.
+    - A configuration of ODAS: ``mics = ( { mu = ( x, y, z ); ... }, ... );``, in `base_link` axes, and
+      ``map: (2, 3, ...)`` as the channels.
 
     Where no such file is, its name may be one of `named_arrays`.
 
@@ -68,7 +92,7 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     Raises
     ------
     InputFileError
-        If the file is missing, too large or none of the three, has a document type or entities, holds fewer
+        If the file is missing, too large or none of the four, has a document type or entities, holds fewer
         than two microphones or two in one place, a coordinate is missing or not finite, the array cannot be
         one in metres, or has no horizontal extent: a vertical line hears every azimuth alike.
 
@@ -92,15 +116,29 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
         board = known[name.name]
         return MicrophoneArray(board["positions_m"], name.name, tuple(board.get("channels", ())))
     data = read_bytes(name, f"an array file or one of {', '.join(known)}", MAX_BYTES)
-    channels: tuple[int, ...] = ()
+    held = _held(name, data)
+    positions = [[held.unit_m * one for one in row] for row in _numbers(name, held.rows)]
+    if len(positions) == 3 and len({*positions[2]}) == 1 < len({row[2] for row in positions}):
+        _LOG.warning("%s: read as three microphones; if %s", name, _TRANSPOSED)
+    return checked_array(name, positions, axes or held.axes, held.channels)
+
+
+def _held(path: Path, data: bytes) -> _Rows:
+    """Return what a file of any form holds."""
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
     if start == b"<":
-        rows, said = _xml_rows(name, data), "acoular"
-    elif start in (b"[", b"{"):
-        rows, said, channels = _json_rows(name, data)
-    else:
-        rows, said = _csv_rows(name, data), "base_link"
-    return checked_array(name, _numbers(name, rows), axes or said, channels)
+        return _Rows(_xml_rows(path, data), "acoular")
+    if start in (b"[", b"{"):
+        return _json_rows(path, data)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        problem = "expected microphones as XML, CSV, JSON or .cfg of ODAS in UTF-8"
+        way_on = "numpy.savetxt and MATLAB's writematrix write CSV of an M x 3 matrix"
+        raise InputFileError(path, f"{problem}; {way_on}") from error
+    plain = _COMMENT.sub(lambda found: found[1] or "", text)
+    mics = _MICS.search(plain)
+    return _csv_rows(path, text) if mics is None else _odas_rows(path, plain, mics.end())
 
 
 @cache
@@ -178,8 +216,8 @@ def _check_size(path: Path, positions_m: FloatArray) -> None:
     small = LEAST_SPACING_M <= least_m < MIN_SPACING_M or 0.0 < mean_m < MIN_SPACING_M
     metres = "expected positions in metres, got"
     for wrong, problem in (
-        (wide_m > MAX_APERTURE_M, f"{metres} an array {wide_m:g} wide: millimetres?"),
-        (mean_m > MAX_SPACING_M, f"{metres} microphones {mean_m:g} apart: centimetres?"),
+        (wide_m > MAX_APERTURE_M, f"{metres} an array {wide_m:g} wide: millimetres? Then {_STATED}"),
+        (mean_m > MAX_SPACING_M, f"{metres} microphones {mean_m:g} apart: centimetres? Then {_STATED}"),
         (small, f"{metres} microphones {least_m:g} apart: divided by 1000?"),
         (upright, "expected a horizontal extent, got a vertical line, which hears every azimuth alike"),
     ):
@@ -195,51 +233,97 @@ def _xml_rows(path: Path, data: bytes) -> list[Row]:
         raise InputFileError(path, problem) from error
     except (SafeElementTree.ParseError, ValueError, LookupError) as error:
         raise InputFileError(path, f"expected array XML, it does not parse: {error}") from error
-    return [[element.get(axis) for axis in "xyz"] for element in root.findall("pos")]
+    found = root.findall("pos")
+    order = by_number(path, [element.get("Name", "") for element in found])
+    return [[found[place].get(axis) for axis in "xyz"] for place in order]
 
 
-def _csv_rows(path: Path, data: bytes) -> list[Row]:
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputFileError(path, "expected microphones as XML, CSV or JSON in UTF-8") from error
-    kept = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+def _csv_rows(path: Path, text: str) -> _Rows:
+    kept = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if any("," in line and _DECIMAL_COMMAS.fullmatch(line) for line in kept):
+        raise InputFileError(path, "expected decimal points, got decimal commas")
     separator = next((mark for mark in ";,\t" if kept and mark in kept[0]), None)
     try:
         rows = [*csv.reader(kept, delimiter=separator)] if separator else [line.split() for line in kept]
     except csv.Error as error:
         raise InputFileError(path, f"expected microphones as XML, CSV or JSON: {error}") from error
     cells = [[cell.strip() for cell in row] for row in rows]
-    columns, has_header = _csv_columns(path, cells[0] if cells else [])
-    return [[row[c] if c < len(row) else None for c in columns] for row in cells[has_header:]]
+    columns, names, unit_m = _csv_columns(path, cells)
+    cells = cells[unit_m is not None :]
+    labels = [row[names] if names is not None and names < len(row) else "" for row in cells]
+    # A gain beside the positions is no name, whatever order it is in.
+    order = range(len(cells)) if any("." in label for label in labels) else by_number(path, labels)
+    taken: list[Row] = [[cells[at][c] if c < len(cells[at]) else None for c in columns] for at in order]
+    return _Rows(taken, unit_m=unit_m or 1.0)
 
 
-def _csv_columns(path: Path, first: list[str]) -> tuple[list[int], bool]:
-    """Return the columns of x, y and z, and whether the first line is a header."""
-    named = {m[1].lower(): i for i, cell in enumerate(first) if (m := _HEADER.fullmatch(cell))}
+def _csv_columns(path: Path, cells: list[list[str]]) -> tuple[list[int], int | None, float | None]:
+    """Return the columns of x, y and z, that of names, and the unit in metres of a header, where one is."""
+    first = cells[0] if cells else []
+    named = {m[1].lower(): (i, m[2]) for i, cell in enumerate(first) if (m := _HEADER.fullmatch(cell))}
     if len(named) == 3:
-        return [named[axis] for axis in "xyz"], True
-    # Without a header a fourth column, in front or behind, holds names.
-    behind = len(first) == 4 and _number(first[3]) is None
-    columns = [0, 1, 2] if len(first) == 3 or behind else [1, 2, 3]
-    if len(first) not in (3, 4) or any(_number(first[column]) is None for column in columns):
-        expected = "microphones as XML, JSON or CSV with the columns x, y, z"
-        raise InputFileError(path, f"expected {expected}, got {','.join(first)!r:.60}")
-    return columns, False
+        columns = [named[axis][0] for axis in "xyz"]
+        units = {(unit or "m").lower() for _, unit in named.values()}
+        if len(units) > 1:
+            raise InputFileError(path, f"expected one unit of x, y and z, got {', '.join(sorted(units))}")
+        names = next((i for i in range(len(first)) if i not in columns), None)
+        return columns, names, _UNITS_M[units.pop()]
+    numbers = [_number(cell) is not None for cell in first]
+    if all(numbers) and len(first) > 3:
+        return _numbered(path, cells)
+    if numbers in ([True] * 3, [True, True, True, False], [False, True, True, True]):
+        names = {3: None, 4: 0 if numbers[-1] else 3}[len(first)]
+        return [i for i in range(len(first)) if i != names], names, None
+    expected = "microphones as XML, JSON or CSV with the columns x, y, z"
+    raise InputFileError(path, f"expected {expected}, got {','.join(first)!r:.60}")
 
 
-def _json_rows(path: Path, data: bytes) -> tuple[list[Row], str, tuple[int, ...]]:
+def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]:
+    """Return the columns of lines of four numbers if one, in front or behind, counts the microphones."""
+    width = len(cells[0])
+    counts = [i for i in (0, 3) if width == 4 and _counts([row[i] if i < len(row) else "" for row in cells])]
+    if len(counts) != 1:
+        problem = f"expected x, y and z, got {width} numbers a line: a header x,y,z,gain states what they are"
+        raise InputFileError(path, f"{problem}; {_TRANSPOSED}" if len(cells) == 3 else problem)
+    return [i for i in range(4) if i != counts[0]], counts[0], None
+
+
+def _counts(column: list[str]) -> bool:
+    return all(cell.isdecimal() for cell in column) and len({*column}) == len(column)
+
+
+def _odas_rows(path: Path, text: str, begin: int) -> _Rows:
+    """Return the microphones of a configuration of ODAS without its comments."""
+    level, end = 1, None
+    for mark in _MARKS.finditer(text, begin):
+        level += 1 if mark[0] in "([" else -1
+        if level == 0:
+            end = mark.start()
+            break
+    block = text[begin:end]
+    rows: list[Row] = [found[1].split(",") for found in _MU.finditer(block)]
+    if end is None or block.count("{") != len(rows) or any(len(row) != 3 for row in rows):
+        raise InputFileError(path, "expected mics = ( { mu = ( x, y, z ); ... }, ... ) as in ODAS")
+    used = _MAP.search(text)
+    numbers = [one.strip() for one in used[1].split(",")] if used else []
+    return _Rows(rows, channels=tuple(int(one) if one.isdecimal() else one for one in numbers))
+
+
+def _json_rows(path: Path, data: bytes) -> _Rows:
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise InputFileError(path, f"expected array JSON, it does not parse: {error}") from error
     held = document if isinstance(document, dict) else {"positions_m": document}
-    rows = held.get("positions_m")
+    unit = next((unit for unit in _UNITS_M if f"positions_{unit}" in held), "m")
+    rows = held.get(f"positions_{unit}")
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
-        raise InputFileError(path, "expected a list of positions [x, y, z], or one as positions_m")
+        problem = "expected a list of positions [x, y, z], or one as positions_m"
+        three = isinstance(rows, list) and len(rows) == 3
+        raise InputFileError(path, f"{problem}; {_TRANSPOSED}" if three else problem)
     channels = held.get("channels", [])
     numbers = tuple(channels) if isinstance(channels, list) else (channels,)
-    return rows, held.get("axes", "base_link"), numbers
+    return _Rows(rows, held.get("axes", "base_link"), numbers, _UNITS_M[unit])
 
 
 def _numbers(path: Path, rows: list[Row]) -> list[list[float]]:

@@ -1,6 +1,7 @@
 """Arrays of users' own: every form says the same places, and nothing right is refused."""
 
 import json
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,108 @@ SAME = {
 }
 
 
+SAME |= {
+    "millimetres.csv": "x_mm,y_mm,z_mm\n500,200,1400\n500,-200,1400\n100,0,1500\n",
+    "centimetres.csv": "X [cm];Y [cm];Z [cm]\n50;20;140\n50;-20;140\n10;0;150\n",
+    "millimetres.json": json.dumps({"positions_mm": [[1000 * one for one in row] for row in PLACES]}),
+    "gain.csv": "x,y,z,gain\n0.5,0.2,1.4,0.9\n0.5,-0.2,1.4,1.1\n0.1,0,1.5,0.10\n",
+    "behind.csv": "0.5,0.2,1.4,7\n0.5,-0.2,1.4,8\n0.1,0,1.5,9\n",
+    "head.csv": "channel,x,y,z\n1,0.5,0.2,1.4\n2,0.5,-0.2,1.4\n3,0.1,0,1.5\n",
+}
+ODAS = """
+version = "2.1"; raw: { path = "http://a /* no comment"; }
+/* mics = ( { mu = ( 9, 9, 9 ); } ); */
+mapping: { map: (MAP); }
+general: {
+    samplerate: { mu = 16000; };   # mu: of the rate (Hz)
+    mics = (
+        # mu: Microphone position coordinates (x, y, z) in meters "with a quote
+        { mu = ( +0.5, +0.2, 1.4 ); sigma2 = ( +0.0, +0.0 ); direction = ( 0.0, 0.0, 1.0 ); angle = ( 80.0, 90.0 );
+        },
+        { mu = ( 5E-1,
+                 -0.2, 1.4 ); },  // { mu = ( 1, 2, 3 ); }
+        { sigma2 = ( 0.0 ); mu = [ 0.1, 0, 1.5 ]; }
+    );
+    spatialfilters = ( { direction = ( 0.0, 0.0, 1.0 ); angle = (80.0, 90.0); } );
+};
+sst: { active = ( { weight = 1.0; mu = 0.3; sigma2 = 0.0025 } ); }
+"""
+SAME |= {
+    "odas.cfg": ODAS.replace("MAP", "1, 2, 3"),
+    "colons.cfg": ODAS.replace("mics =", "mics:").replace("MAP", "1, 2, 3"),
+}
+
+
 @pytest.mark.parametrize("name", SAME)
 def test_every_form_says_the_same_places(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(SAME[name])
-    np.testing.assert_array_equal(read_array(tmp_path / name).positions_m, PLACES)
+    np.testing.assert_allclose(read_array(tmp_path / name).positions_m, PLACES, rtol=1e-15)
+
+
+def test_a_configuration_of_odas_names_its_channels(tmp_path: Path) -> None:
+    (tmp_path / "odas.cfg").write_text(ODAS.replace("MAP", "2, 4, 3"))
+    assert read_array(tmp_path / "odas.cfg").channels == (2, 4, 3)
+
+
+CONTRADICTED = {
+    "a gain": ("0.05,0,0,1.0\n0,0.05,0,0.9\n-0.05,0,0,1.1\n0,-0.05,0,0.95\n", "4 numbers a line"),
+    "index or height": ("1,0,0,5\n2,0,0,6\n3,0,0,7\n4,0,0,8\n", "4 numbers a line"),
+    "five numbers": ("0,0.05,0,0,1\n1,0,0.05,0,1\n2,-0.05,0,0,1\n", "5 numbers a line"),
+    "3 x 4": ("0.05 0 -0.05 0\n0 0.05 0 -0.05\n0 0 0 0\n", "write its transpose"),
+    "3 x 8": ("\n".join([",".join(["0.1"] * 8)] * 3), "write its transpose"),
+    "3 x 4 in JSON": (json.dumps([[0.1, 0, -0.1, 0], [0, 0.1, 0, -0.1], [0] * 4]), "write its transpose"),
+    "millimetres": ("50,0,0\n0,50,0\n-50,0,0\n", "millimetres? Then a header x_mm"),
+    "centimetres": ("5,0,0\n0,5,0\n-5,0,0\n", "centimetres? Then a header x_mm"),
+    "two units": ("x_mm,y_mm,z\n1,2,3\n2,3,4\n", "one unit of x, y and z, got m, mm"),
+    "commas": ("x;y;z\n0,05;0,00;0,00\n0,00;0,05;0,00\n", "decimal commas"),
+    "commas and tabs": ("0,05\t0\t0\n0\t0,05\t0\n", "decimal commas"),
+    "commas and blanks": ("1 0,05 0 -0,1\n2 0 0,05 0\n", "decimal commas"),
+    "NumPy's own": (b"\x93NUMPY\x01\x00v\x00", "numpy.savetxt"),
+    "odas without places": ("mics = ( { mu = ( 0, 0 ); }, { mu = ( 0, 0, 1 ); } );", "as in ODAS"),
+    "odas without end": ("mics = ( { mu = ( 0, 0, 0 ); }, { mu = ( 0, 0, 1 ); }", "as in ODAS"),
+    "odas without mu": ("mics = ( { mu = ( 0, 1, 0 ); }, { angle = ( 0, 0 ); } );", "as in ODAS"),
+    "odas with an expression": (
+        "mics = ( { mu = ( 0, 1, exit ); }, { mu = ( 0, 0, 1 ); } );",
+        "got ' exit '",
+    ),
+    "odas with too many channels": (ODAS.replace("MAP", "1, 2, 3, 4"), "channels: expected 3 different"),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTED)
+def test_numbers_that_may_be_something_else_are_refused_with_the_way_on(case: str, tmp_path: Path) -> None:
+    text, said = CONTRADICTED[case]
+    (tmp_path / "mics").write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputFileError) as refused:
+        read_array(tmp_path / "mics")
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("form", ["csv", "header", "xml"])
+def test_microphones_whose_names_are_sorted_as_text_are_taken_by_number(
+    form: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    places = [[0.1 * number, 0.0, 1.0] for number in range(1, 13)]
+    for order, said in ((sorted(range(1, 13), key=str), True), (range(1, 13), False)):
+        rows = [(f"mic_{number}", *places[number - 1]) for number in order]
+        lines = "".join(f"{name},{x},{y},{z}\n" for name, x, y, z in rows)
+        marks = "".join(f'<pos Name="{name}" x="{-y}" y="{z}" z="{x}"/>' for name, x, y, z in rows)
+        text = {"csv": lines, "header": "name,x,y,z\n" + lines, "xml": f"<MicArray>{marks}</MicArray>"}[form]
+        (tmp_path / "mics").write_text(text)
+        caplog.clear()
+        np.testing.assert_allclose(read_array(tmp_path / "mics").positions_m, places)
+        assert ("not in the order of their numbers" in caplog.text) is said
+
+
+def test_three_microphones_that_look_like_a_matrix_are_doubted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for rows, said in (([[0.1, 0.0, -0.1], [0.0, 0.1, 0.0], [1.4] * 3], True), (PLACES, False)):
+        (tmp_path / "mics.json").write_text(json.dumps(rows))
+        with caplog.at_level(logging.WARNING):
+            assert read_array(tmp_path / "mics.json").n_microphones == 3
+        assert ("write its transpose" in caplog.text) is said
+        caplog.clear()
 
 
 def test_axes_may_be_those_of_the_other_convention(tmp_path: Path) -> None:

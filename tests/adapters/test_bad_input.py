@@ -165,7 +165,7 @@ EXTERNAL = '<!DOCTYPE m [<!ENTITY a SYSTEM "file:///etc/hostname">]><MicArray>&a
         (EXTERNAL.format(TWO), "entities, which are refused"),
         ('<!DOCTYPE MicArray SYSTEM "a.dtd"><MicArray/>', "refused"),
         ("", "as XML, JSON or CSV"),
-        ("x;y;z\n0,1;0;0\n0,2;0;0", "microphone 1: .* finite number as x, got '0,1'"),
+        ("x;y;z\n0,1;0;0\n0,2;0;0", "expected decimal points, got decimal commas"),
         ("name,left,right\na,0,0", "columns x, y, z"),
         ("0,0.1,0\n0,0.2\n", "microphone 2: .* finite number as z, got None"),
         ("0,0,0\n0,0,0.5\n", "vertical line"),

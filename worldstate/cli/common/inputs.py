@@ -64,6 +64,8 @@ def add_array_options(
       CSV   x,y,z a line, with or without header and names: base_link, x forward, y left, z up
       JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too;
             "channels": [2, 3, 4, 5] of a card with more channels than microphones
+      .cfg  a configuration of ODAS: mics = ( { mu = ( x, y, z ); ... }, ... ), its map as the channels
+    (other units: a header x_mm,y_mm,z_mm, or "positions_mm"),
     or is the name of a board that lies flat, x forward: respeaker-4, respeaker-6, respeaker-usb, uma-8, xmos,
     or that stands upright and faces forward: uma-16
     """
