@@ -34,6 +34,7 @@ STUDIES = {
         "four",
         "kinds",
         "place",
+        "sequences",
         "staged",
     )
 }

@@ -1,0 +1,245 @@
+"""Scores of real recordings: figures of made-up ones that are known, and the command on a made-up corner."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up_corner import write_corner
+from made_up_trials import made_up
+from worldstate_lab.cli.main import main
+from worldstate_lab.methods.line_of_sight import OcSortRecovery
+from worldstate_lab.sequences.recordings import NANODET_BOXES, read_recordings
+from worldstate_lab.sequences.scores import (
+    alarm_row,
+    at_false_recordings,
+    at_onsets,
+    calibration,
+    hop_before,
+    leads,
+    sweep,
+)
+
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+
+
+def corner(approaches=4, calm=4, *, t0_s=5.0, hops=81, start_s=0.0):
+    """Approaches from the right and the left in turn at two junctions, and recordings without a vehicle."""
+    labels = [("right", "left")[i % 2] for i in range(approaches)] + ["none"] * calm
+    trials = [
+        made_up(f"r{i}", label, t0_s=t0_s - start_s, hops=hops - round(10 * start_s), site=f"S{i // 2 % 2}")
+        for i, label in enumerate(labels)
+    ]
+    since = {"leads_from_s": t0_s - start_s}
+    return [replace(one, hops=one.hops.replace(about={**one.hops.about, **since})) for one in trials]
+
+
+def before(trial, first_s, last_s=0.0):
+    """Whether a hop of an approach ends from `first_s` to `last_s` before T0."""
+    left_s = trial.t0_s - trial.hops.time_s
+    return (left_s < first_s + 1e-6) & (left_s > last_s - 1e-6) & (not trial.hazard_free)
+
+
+def draw():
+    return np.random.default_rng(0)
+
+
+def test_a_score_that_rises_two_seconds_before_sight_separates_from_there_on() -> None:
+    trials = corner()
+    scores = [before(one, 2.0).astype(float) for one in trials]
+    right = [(one.label == "right") * score for one, score in zip(trials, scores, strict=True)]
+    found = leads(trials, scores, right, draw())
+    for lead in ("0.5", "1", "1.5", "2"):
+        assert found[lead]["auroc"] == found[lead]["side_auroc"] == found[lead]["auroc_all_hops"] == 1.0
+        assert found[lead]["auroc_interval"] == (1.0, 1.0)
+    assert found["3"]["auroc"] == found["3"]["auroc_all_hops"] == found["3"]["side_auroc"] == 0.5
+    assert found["1"]["auroc_by_junction"] == {"S0": 1.0, "S1": 1.0}
+    assert (found["1"]["approaches"], found["1"]["hazard_free"]) == (4, 4)
+
+
+def test_hops_of_hazard_free_recordings_count_as_many_as_they_are() -> None:
+    trials = corner(2, 2)
+    # In a quarter of all hazard-free hops the score is that of an approach, at the compared hop it is not.
+    high = np.arange(81) >= 61
+    scores = [before(one, 1.0).astype(float) if not one.hazard_free else high.astype(float) for one in trials]
+    found = leads(trials, scores, None, draw())["1"]
+    assert found["auroc"] == 1.0
+    assert found["auroc_all_hops"] == pytest.approx(1.0 - 0.5 * high.mean())
+    assert "side_auroc" not in found
+
+
+def test_what_a_cut_start_takes_away_is_not_counted() -> None:
+    whole, cut = (
+        leads(one, [x.hops.time_s for x in one], None, draw()) for one in (corner(), corner(start_s=2))
+    )
+    assert [whole[lead]["approaches"] for lead in ("2", "3")] == [4, 4]
+    assert [cut[lead]["approaches"] for lead in ("2", "3")] == [4, 0]
+    assert cut["3"]["hazard_free"] == 0
+    assert np.isnan(cut["3"]["auroc"])
+
+
+def test_a_recording_that_is_cut_keeps_the_time_before_sight(tmp_path) -> None:
+    one = read_recordings(write_corner(tmp_path / "corner", draw()))[0]
+    later = one.cut(1.0)
+    assert (later.t0_s, later.length_s, later.start_s) == (2.0, 3.0, 1.0)
+
+
+def test_an_alarm_at_the_first_hop_is_an_onset_and_leads_from_there() -> None:
+    trials = corner(2, 2, t0_s=8.0)
+    always = [np.ones(81, bool) for _ in trials]
+    row = alarm_row(trials, [always], draw())
+    assert (row["onsets"], row["false_recordings"], row["advisory_share"]) == (2.0, 2.0, 1.0)
+    assert row["lead_s"] == row["lasting_lead_s"] == pytest.approx(7.0)
+    assert row["leads_beyond_5_s"] == [7.0, 7.0]
+    assert row["text"] == "2 of 2 at 2 false onsets"
+    # From 2 s after T0 at 8.0 s nothing is heard any more: the last hop ends at 9.0 s.
+    assert row["after_pass_share"] is None
+    hours = 2 * 81 * 0.1 / 3600
+    assert row["alarms_per_hour"] == pytest.approx(2 / hours)
+    assert row["interval"][0] < 2 / hours < row["interval"][1]
+
+
+def test_an_alarm_lasts_that_stands_half_a_second_before_sight() -> None:
+    trials = corner(2, 2)
+    # Both begin 3 s before T0; that of the second one falls, and begins again too late.
+    alarms = [before(trials[0], 3.0), before(trials[1], 3.0, 1.0) | before(trials[1], 0.3)]
+    row = alarm_row(trials, [[*alarms, *(np.zeros(81, bool),) * 2]], draw())
+    assert (row["count"], row["lasting_count"], row["onsets"]) == (2.0, 1.0, 0.0)
+    assert row["lead_s"] == row["lead_s_missed_0"] == pytest.approx(3.0)
+    assert row["lasting_lead_s"] == pytest.approx(1.5)
+    again = before(trials[0], 3.0, 2.0) | before(trials[0], 1.0)
+    row = alarm_row(trials, [[again, *(np.zeros(81, bool),) * 3]], draw())
+    assert (row["lead_s"], row["lasting_lead_s"]) == (pytest.approx(3.0), pytest.approx(0.5))
+    assert row["lead_s_missed_0"] == pytest.approx(1.5)
+
+
+def test_passes_are_means_over_the_same_hours() -> None:
+    trials = corner(2, 2)
+    never, always = ([np.full(81, on) for _ in trials] for on in (False, True))
+    row = alarm_row(trials, [never, always], draw())
+    assert (row["warned"], row["onsets"], row["advisory_share"]) == (0.5, 1.0, 0.5)
+    assert row["text"] == "1 of 2 at 1 false onset"
+
+
+def test_a_row_of_the_curve_has_one_threshold() -> None:
+    trials = corner(2, 8)
+    # At 0.5 both are warned of for one onset, at 0.3 both longer for two; at 0.9 one for none, late.
+    scores = [np.where(before(one, 1.0), 0.5, np.where(before(one, 3.0), 0.3, 0.0)) for one in trials]
+    scores[0][before(trials[0], 0.3)] = 0.9
+    scores[2][10], scores[3][20:30] = 0.6, 0.3
+    found = at_onsets(trials, scores, draw())
+    assert [found[n]["threshold"] for n in ("0", "1", "3", "6")] == [0.9, 0.5, 0.3, 0.3]
+    assert [found[n]["count"] for n in ("0", "1", "3")] == [1.0, 2.0, 2.0]
+    assert [round(found[n]["lead_s_missed_0"], 2) for n in ("0", "1", "3")] == [0.15, 1.0, 3.0]
+    by_recording = at_false_recordings(trials, scores, draw())
+    assert [by_recording[n]["threshold"] for n in ("0", "1", "2", "3")] == [0.9, 0.5, 0.3, 0.3]
+
+
+def test_the_sweep_counts_as_the_rows_do() -> None:
+    rng, trials = draw(), corner()
+    scores = [np.round(rng.random(81), 1) for _ in trials]
+    swept = sweep(trials, scores)
+    for i, level in enumerate(swept["level"]):
+        row = alarm_row(trials, [[one >= level for one in scores]], rng)
+        assert (row["onsets"], row["false_recordings"]) == (swept["onsets"][i], swept["false_recordings"][i])
+        assert row["count"] == swept["warned"][i]
+        assert row["lead_s_missed_0"] == pytest.approx(swept["lead_s"][i] / 4)
+
+
+def test_chances_are_held_against_the_side_that_something_comes_from() -> None:
+    trials = corner(2, 2)
+
+    def stated(trial, sure):
+        within = np.zeros((81, 2, len(HORIZONS_S)))
+        side = ("left", "right").index(trial.label) if not trial.hazard_free else 0
+        within[:, side, HORIZONS_S.index(2.0)] = sure * before(trial, 2.0)
+        return replace(trial, hops=trial.hops.replace(within=within))
+
+    true = calibration([stated(one, 1.0) for one in trials], draw())
+    assert (true["ece"], true["brier_skill"]) == (0.0, 1.0)
+    # Before T0 at 5.0 s, from 1.0 s on: 40 hops an approach, 20 of them within 2 s; 81 without a hazard.
+    assert true["base_rate"] == pytest.approx(2 * 20 / (2 * 2 * (40 + 81)))
+    half = calibration([stated(one, 0.5) for one in trials], draw())
+    assert half["ece"] == pytest.approx(0.5 * true["base_rate"])
+    unknown = [replace(one, hops=one.hops.replace(within=np.full((81, 2, 4), np.nan))) for one in trials]
+    assert calibration(unknown, draw())["ece"] is None
+
+
+def test_a_hop_between_two_belongs_to_none() -> None:
+    trial = corner(1, 0)[0]
+    assert trial.hops.time_s[hop_before(trial, 1.5)].tolist() == [3.5]
+    assert hop_before(trial, 4.2).size == 0
+
+
+def test_the_tracker_counts_boxes_by_the_filter_that_it_is_given() -> None:
+    low = made_up("a", "left")
+    boxes = low.boxes.replace(score=np.full(len(low.boxes), 0.4), box_px=low.boxes.box_px * [0, 0, 70, 70])
+    trial = replace(low, boxes=boxes)
+    usual, wide = OcSortRecovery("coasting"), OcSortRecovery("coasting", keep=NANODET_BOXES)
+    assert usual.name == wide.name
+    assert not usual.fit([], draw())(trial).alarm.any()
+    assert wide.fit([], draw())(trial).alarm.any()
+
+
+KEYS = {
+    *("recordings", "rows", "leads", "at_onsets", "at_false_recordings", "horizons", "risk", "calibration"),
+    *("front_end", "identity_kept", "hand_over_delay_s", "bearing_error_deg"),
+}
+
+
+def test_the_command_scores_a_made_up_corner(tmp_path, capsys) -> None:
+    folder = write_corner(tmp_path / "corner", draw())
+    assert main(["sequences", str(folder), "--results", str(tmp_path / "results.json"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    found = report["seven"]
+    assert set(found) >= KEYS
+    assert found["recordings"] == 4
+    assert found["failed"] == {}
+    row = {"warned", "lead_s", "alarms_per_hour", "false_recordings", "advisory_share", "interval"}
+    assert all(set(one) >= row for one in found["rows"].values())
+    assert {"world-state advisory", "Vision-only", "OC-SORT recovery (coasting)"} <= set(found["rows"])
+    assert found["rows"]["Vision-only"]["warned"] == 0.0
+    assert list(found["leads"]) == ["0.5", "1", "1.5", "2", "3", "5", "6"]
+    assert list(found["at_onsets"]) == ["0", "1", "3", "6"]
+    assert found["leads"]["2"]["approaches"] == 2
+    assert found["leads"]["3"]["approaches"] == 0
+    # A vehicle whose sound doubles each half second is told from a quiet street.
+    assert found["scores"]["loudness meter"]["leads"]["0.5"]["auroc"] == 1.0
+    assert found["scores"]["window alone"]["leads"]["0.5"]["auroc"] == 1.0
+    assert "sequences corner" in json.loads((tmp_path / "results.json").read_text())
+
+
+def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) -> None:
+    folder = write_corner(tmp_path / "corner", draw())
+    assert main(["sequences", str(folder), "--boxes", "none", "--start", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "seven: 2 approaches, 2 hazard-free recordings" in printed
+    # Of 3 s that are left T0 is at 2 s: the first hop ends a second before.
+    assert "0 + 0" in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--features", "a.csv"], "--lists"),
+        (["--model", "a.json"], "--path"),
+        (["--path", "seven", "--streams", "a.npz"], "both paths"),
+        (["--start", "9"], "--start"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused(tmp_path, capsys, words, problem) -> None:
+    folder = write_corner(tmp_path / "corner", draw())
+    assert main(["sequences", str(folder), *words]) == 2
+    assert problem in capsys.readouterr().err
+
+
+def test_recordings_of_one_kind_are_refused(tmp_path, capsys) -> None:
+    assert main(["sequences", str(write_corner(tmp_path / "corner", draw(), hazard_free=0))]) == 2
+    assert "found one kind" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_heard_is_refused_by_its_problem(tmp_path, capsys) -> None:
+    folder = write_corner(tmp_path / "corner", draw())
+    (folder / "srp.npz").unlink()
+    assert main(["sequences", str(folder)]) == 2
+    assert "srp.npz" in capsys.readouterr().err

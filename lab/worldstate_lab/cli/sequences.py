@@ -1,0 +1,154 @@
+"""`worldstate-lab sequences`: what the product is worth on real recordings of a corner.
+
+FOLDER holds `truth.csv`, `srp.npz`, `sound/`, `boxes/` and, for the second path, `pair/`. Every recording
+runs through the product's own chain, with the camera and by sound alone: on the path *seven* from the spectra
+of seven microphones and one channel of sound, with the model that ships; on the path *pair* from two
+channels, with a model made for them, whose simulated exam stands beside the figures.
+
+Printed for each path: the hazard AUROC so long before T0, what the alarm warns of and costs beside the rows
+of Table I (thresholds from five folds over recordings), the best thresholds at so many false onsets (a curve:
+they are chosen afterwards), calibration, and the same for parts of the product. Boxes count from a score of
+0.3 and a height of 60 pixels on; those of vehicles that stand through a recording do not.
+
+The published classifier is trained on --features without the windows of all recordings in --lists.
+
+Examples
+--------
+  worldstate-lab sequences ovad-sequences --path seven --jobs 2
+  worldstate-lab sequences ovad-sequences --features extracted_features.csv --lists static.csv dynamic.csv
+  worldstate-lab sequences ovad-sequences --path pair --boxes none --start 1 --json
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.model_file import read_model
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.progress import track
+from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate_lab.report.table import plain
+from worldstate_lab.sequences.front_end_figures import front_end_figures
+from worldstate_lab.sequences.hearing import Chain, PathName, ovad_chain
+from worldstate_lab.sequences.path_figures import (
+    SEEDS,
+    Heard,
+    classifiers_of,
+    exam_figures,
+    heard_every_way,
+    path_figures,
+    score_figures,
+)
+from worldstate_lab.sequences.path_tables import FOLLOWED, path_lines, scores_table
+from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
+from worldstate_lab.sequences.summed_scores import summed_scores
+from worldstate_lab.sequences.tracking import tracking_figures
+from worldstate_lab.trials.pass_cache import Failed, attempted
+
+PAIR, EXAM = Path("pair"), "exam.json"
+_LONGEST_CUT_S = 2.0  # T0 is 7 s in most recordings, 2 s in one: what is left must hold a hop before it
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("folder", type=Path, metavar="FOLDER", help="recordings of a corner")
+    add("--path", choices=("seven", "pair"), help="what hears (default: both, pair if its model is there)")
+    add("--boxes", default="boxes", metavar="NAME", help="folder of boxes, none for no camera (%(default)s)")
+    add("--model", type=Path, metavar="FILE", help="of --path (default: the one that ships, pair/model.json)")
+    add("--exam", type=Path, metavar="FILE", help="simulated exam of the pair's model (default: beside it)")
+    add("--features", type=Path, metavar="CSV", help="windows to train the published classifier on")
+    add("--lists", type=Path, nargs="+", default=[], metavar="CSV", help="recordings left out of them")
+    add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="of the pair, for the summed rows")
+    add("--start", type=float, default=0.0, metavar="S", help="cut off every start (default: %(default)s)")
+    add("--seed", type=int, default=1, help="of folds and intervals (default: %(default)s)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    _check(arguments)
+    arguments.seeds = range(arguments.seed, arguments.seed + SEEDS)
+    start_s = round(in_range("--start", arguments.start, 0.0, _LONGEST_CUT_S), 1)
+    recordings = [one.cut(start_s) for one in read_recordings(arguments.folder)]
+    _check_kinds(recordings, "found one kind")
+    chains = [_chain(arguments, path) for path in _paths(arguments)]
+    report: dict[str, Any] = {"start_s": start_s, "boxes": arguments.boxes}
+    lines, heard = list[str](), dict[PathName, Heard]()
+    for chain in chains:
+        heard[chain.path], failed = _heard(chain, recordings, arguments.jobs)
+        report[chain.path] = _figures(arguments, chain, heard[chain.path]) | {"failed": failed}
+        lines += [*path_lines(chain.path, report[chain.path]), ""]
+    if arguments.streams:
+        report["sums"] = _sums(arguments, heard, chains[0])
+        lines += scores_table(report["sums"], "seven: sums that are not the product, by sound alone").lines()
+    return CommandResult(plain(report), table={}, lines=lines)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    if bool(arguments.features) != bool(arguments.lists):
+        raise InvalidArgumentError("--features: expected together with --lists, so that none is tested on")
+    if arguments.model is not None and arguments.path is None:
+        raise InvalidArgumentError("--model: expected --path, which it was made for")
+    if arguments.streams and arguments.path is not None:
+        raise InvalidArgumentError("--streams: expected both paths, got one")
+
+
+def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:
+    if len({one.hazard_free for one in recordings}) < 2:
+        raise InvalidArgumentError(f"recordings: expected approaches and hazard-free ones; {found}")
+
+
+def _paths(arguments: argparse.Namespace) -> tuple[PathName, ...]:
+    if arguments.path is not None:
+        return (arguments.path,)
+    return ("seven", "pair") if (arguments.folder / PAIR / "model.json").exists() else ("seven",)
+
+
+def _chain(arguments: argparse.Namespace, path: PathName) -> Chain:
+    boxes = None if arguments.boxes == "none" else arguments.boxes
+    if path == "seven":
+        return ovad_chain(read_model(arguments.model), boxes)
+    folder = arguments.folder / PAIR
+    return Chain(
+        path, read_model(arguments.model or folder / "model.json"), read_array(folder / "array.csv"), boxes
+    )
+
+
+def _heard(chain: Chain, recordings: Sequence[CornerRecording], jobs: int) -> tuple[Heard, dict[str, str]]:
+    work = attempted(partial(heard_every_way, chain), recordings, jobs, attrgetter("name"))
+    done = list(track(work, f"listening, {chain.path}", len(recordings)))
+    heard = [(one, *two) for one, two in zip(recordings, done, strict=True) if not isinstance(two, Failed)]
+    failed = {one.name: one.problem for one in done if isinstance(one, Failed)}
+    _check_kinds([one for one, *_ in heard], next(iter(failed.values()), ""))
+    return Heard(*zip(*heard, strict=True)), failed
+
+
+def _figures(arguments: argparse.Namespace, chain: Chain, heard: Heard) -> dict[str, Any]:
+    published = chain.path == "seven" and arguments.features
+    classifiers = classifiers_of(arguments.features, arguments.lists) if published else None
+    found = path_figures(heard, classifiers, arguments.seed)
+    exam = arguments.exam or arguments.folder / PAIR / EXAM
+    if chain.path == "pair" and exam.exists():
+        found["exam"] = exam_figures(exam)
+    # What other modules measure of the same recordings is merged here.
+    rng = np.random.default_rng(arguments.seed)
+    followed = [one for one in heard.followed if one is not None]
+    found |= tracking_figures(followed, rng) if followed else dict.fromkeys(FOLLOWED)
+    return found | {"front_end": front_end_figures(heard.seen, heard.recordings, rng)}
+
+
+def _sums(arguments: argparse.Namespace, heard: Mapping[PathName, Heard], seven: Chain) -> dict[str, Any]:
+    """Return what the sums of parts are worth on recordings that both paths heard."""
+    trials, pair = heard["seven"].alone, heard["pair"].alone
+    sums = summed_scores(trials, pair, [HeardStream.load(one) for one in arguments.streams], seven.model)
+    rng = np.random.default_rng(arguments.seed)
+    return {name: score_figures(trials, scores, None, rng) for name, scores in sums.items()}

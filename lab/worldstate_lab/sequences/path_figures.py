@@ -1,0 +1,276 @@
+"""Every figure of one path over the recordings of a corner, with the camera and by sound alone."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequencePosterior
+from worldstate.adapters.datasets.feature_table import read_features, read_ids
+from worldstate.adapters.files.file_io import read_json
+from worldstate.frontend.settings import HOP_RATE_HZ
+from worldstate.ground.typing import FloatArray
+from worldstate.simulation.dataset.recording import FULL_SCALE_PA
+from worldstate_lab.evaluation.protocols import METHODS, STATIC, ProtocolRun, run_protocol
+from worldstate_lab.evaluation.reduction import HORIZONS_S as WINDOWS_S
+from worldstate_lab.evaluation.scores import Score
+from worldstate_lab.methods.acoustic_rules import CalibratedCue, ShippedChain
+from worldstate_lab.methods.line_of_sight import OcSortRecovery, RadarFieldOfView, VisionOnly
+from worldstate_lab.metrics.intervals import stratified_draws
+from worldstate_lab.passes.pass_outcomes import above_quiet_db, sound_level_db
+from worldstate_lab.trials.classification import SIDE_COLUMNS, Classifiers, posteriors
+from worldstate_lab.trials.trial import Decide, Decisions, Method, Trial
+
+from .hearing import Chain, heard
+from .recordings import NANODET_BOXES, CornerRecording
+from .scores import Row, alarm_row, at_false_recordings, at_onsets, calibration, leads, with_interval
+from .tracking import Tracked, tracked
+
+SEEDS = 5  # As many as those of `table --full`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heard:
+    """Recordings as one path heard them, in the same order."""
+
+    recordings: Sequence[CornerRecording]
+    seen: Sequence[Trial]  # With the camera, where there is one
+    alone: Sequence[Trial]  # By sound alone
+    followed: Sequence[Tracked | None]  # Without a camera no vehicle in view is known
+
+
+def heard_every_way(chain: Chain, recording: CornerRecording) -> tuple[Trial, Trial, Tracked | None]:
+    """Return a recording with the camera, by sound alone, and followed if there is a camera."""
+    seen = _with_meter(heard(chain, recording), recording)
+    if chain.boxes is None:
+        return seen, seen, None
+    alone = _with_meter(heard(replace(chain, boxes=None), recording), recording)
+    return seen, alone, tracked(chain, recording)
+
+
+def _with_meter(trial: Trial, recording: CornerRecording) -> Trial:
+    """Add `meter_db`, how far channel 1 lies above its quiet level so far, and where leads count from."""
+    sound, rate_hz = recording.samples()
+    hops = int(len(sound) / rate_hz * HOP_RATE_HZ)
+    pressure_pa = FULL_SCALE_PA * sound[: round(hops * rate_hz / HOP_RATE_HZ), 0].astype(np.float64)
+    above = above_quiet_db(sound_level_db(pressure_pa, rate_hz, hops))
+    at = np.round(trial.hops.time_s * HOP_RATE_HZ).astype(np.intp) - 1
+    about = {**trial.hops.about, "leads_from_s": recording.t0_s}
+    return replace(trial, hops=trial.hops.replace(meter_db=above[np.minimum(at, hops - 1)], about=about))
+
+
+@dataclass(frozen=True, slots=True)
+class LoudnessMeter:
+    """An alarm while the sound is so much louder than the place was."""
+
+    name: str = "loudness meter .02"
+    alpha: float = 0.02
+
+    def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
+        """Set the decibels on hazard-free calibration recordings."""
+        calm = [one.hops.meter_db for one in calibration if one.hazard_free]
+        least_db = neyman_pearson_threshold(calm, self.alpha)
+
+        def decide(trial: Trial) -> Decisions:
+            above = trial.hops.meter_db
+            return Decisions.of(trial.hops.time_s, above >= least_db, score=above)
+
+        return decide
+
+
+_SHIPPED, _PUBLISHED = "shipped window .02", "proposed .02"
+_OWN: tuple[Method, ...] = (
+    ShippedChain("world-state advisory", "filtered"),
+    ShippedChain("shipped model", "shipped"),
+    CalibratedCue(_SHIPPED, 0.02, evidence="shipped"),
+    LoudnessMeter(),
+)
+_SIGHT: tuple[Method, ...] = (
+    VisionOnly(),
+    RadarFieldOfView(),
+    # By the filter of OVAD's authors hardly a box of NanoDet would count.
+    *(OcSortRecovery(reading, keep=NANODET_BOXES) for reading in ("stock", "coasting")),
+)
+_TABLE = tuple(
+    one
+    for one in METHODS
+    if getattr(one, "evidence", "") == "published" and not getattr(one, "absence", False)
+)
+
+
+def classifiers_of(features: Path, lists: Sequence[Path]) -> Classifiers:
+    """Return the published classifier, trained on released windows without those of listed recordings."""
+    # All recordings that are listed, at hand or not: those that are kept apart are to be tested as well.
+    return Classifiers(read_features(features).without(frozenset().union(*map(read_ids, lists))))
+
+
+@dataclass(slots=True)
+class _Untrained(Classifiers):
+    """No published classifier: trials stay as they were heard."""
+
+    windows: None = field(default=None)
+
+    def classify(
+        self, kind: Any, calibration: Any, tested: Any, seed: int
+    ) -> tuple[list[Trial], list[Trial]]:
+        return list(calibration), list(tested)
+
+
+BySide = Callable[[Trial], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class HopScore:
+    """A score of every hop; of two sides the larger counts, and their difference names the side."""
+
+    name: str
+    seen: bool  # Whether it is heard with the camera
+    of: BySide  # shape (n,) or (n, 2)
+    sides: BySide | None = None  # shape (n, 2): What names the side of a score without sides
+
+    def trials(self, path: Heard) -> Sequence[Trial]:
+        """Return the trials that it is read from."""
+        return path.seen if self.seen else path.alone
+
+    def scores(self, path: Heard) -> list[FloatArray]:
+        """Return the score of each trial, shape (n,)."""
+        found = map(self.of, self.trials(path))
+        return [one if one.ndim == 1 else one.max(axis=1) for one in found]
+
+    def right(self, path: Heard) -> list[FloatArray] | None:
+        """Return by how much the right is likelier than the left, shape (n,) a trial; None without sides."""
+        found = [(self.sides or self.of)(one) for one in self.trials(path)]
+        return None if found[0].ndim == 1 else [one[:, 1] - one[:, 0] for one in found]
+
+    def figures(self, path: Heard, rng: np.random.Generator) -> dict[str, Any]:
+        """Return what the score is worth."""
+        return score_figures(self.trials(path), self.scores(path), self.right(path), rng)
+
+
+def score_figures(
+    trials: Sequence[Trial],
+    scores: Sequence[FloatArray],
+    right: Sequence[FloatArray] | None,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Return leads of a score (n,) a trial, and the curves of its thresholds."""
+    return {
+        "leads": leads(trials, scores, right, rng),
+        "at_onsets": at_onsets(trials, scores, rng),
+        "at_false_recordings": at_false_recordings(trials, scores, rng),
+    }
+
+
+_MEAN_HOPS = 20  # Two seconds
+_LEAST_NATS = -20.0  # Where the window gives no sides
+
+
+def _window(trial: Trial) -> FloatArray:
+    return np.asarray(posteriors(trial, "shipped")[:, SIDE_COLUMNS].sum(axis=1))
+
+
+def _unseen(trial: Trial) -> FloatArray:
+    """Return P(hidden) where a camera has ruled out that the vehicle is in view."""
+    hidden, none = _window(trial), posteriors(trial, "shipped")[:, -1]
+    return hidden / (hidden + none)
+
+
+def _ratios(trial: Trial) -> FloatArray:
+    return np.nan_to_num(trial.hops.side_nats, nan=_LEAST_NATS)
+
+
+def _mean_ratios(trial: Trial) -> FloatArray:
+    sums = np.cumsum(_ratios(trial), axis=0)
+    sums[_MEAN_HOPS:] -= sums[:-_MEAN_HOPS].copy()
+    return np.asarray(sums / np.minimum(np.arange(1, len(sums) + 1), _MEAN_HOPS)[:, None])
+
+
+def _sequence(trial: Trial) -> FloatArray:
+    within = SequencePosterior(trial.hops.groups, 0.0).within()
+    return np.nan_to_num(within[..., HORIZONS_S.index(3.0)])
+
+
+_risk, _decision = attrgetter("hops.risk"), attrgetter("hops.compared_nats")
+PRODUCT, DECISION, DECISION_SEEN = (
+    "product, with camera",
+    "decision value, sound alone",
+    "decision value, with camera",
+)
+SCORES = (
+    HopScore("window alone", False, _window, _ratios),
+    HopScore("window and absence", True, _unseen, _ratios),
+    HopScore("sequence by itself", False, _sequence),
+    HopScore("product, sound alone", False, _risk),
+    HopScore(PRODUCT, True, _risk),
+    HopScore(DECISION, False, _decision),
+    HopScore(DECISION_SEEN, True, _decision),
+    HopScore("side ratio", False, _ratios),
+    HopScore("side ratio, mean of 2 s", False, _mean_ratios),
+    HopScore("loudness meter", False, attrgetter("hops.meter_db")),
+)
+
+
+def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dict[str, Any]:
+    """Return every figure of a path; without classifiers no row of the published one is among them."""
+    rng = np.random.default_rng(seed)
+    methods = (*_OWN, *_SIGHT, *(_TABLE if classifiers else ()))
+    run = run_protocol(STATIC, path.seen, methods, classifiers or _Untrained(), range(seed, seed + SEEDS))
+    scores = {one.name: one.figures(path, rng) for one in SCORES}
+    return {
+        "recordings": len(path.seen),
+        "stands_on": run.stands_on,
+        "rows": _rows(run, path, rng),
+        "leads": scores[PRODUCT]["leads"],
+        "at_onsets": scores[DECISION]["at_onsets"],
+        "at_onsets_with_camera": scores[DECISION_SEEN]["at_onsets"],
+        "at_false_recordings": scores[DECISION]["at_false_recordings"],
+        **_window_figures(run, _SHIPPED, rng),
+        "published": _window_figures(run, _PUBLISHED, rng) if _PUBLISHED in run.decisions else None,
+        "calibration": calibration(path.seen, rng),
+        "calibration_sound_alone": calibration(path.alone, rng),
+        "scores": scores,
+    }
+
+
+def _rows(run: ProtocolRun, path: Heard, rng: np.random.Generator) -> dict[str, Row]:
+    """Return the row of every method, and of the alarm that ships by sound alone."""
+    alone = [[one.chains["filtered"].alarm for one in path.alone]]
+    rows = {"world-state advisory, sound alone": alarm_row(path.alone, alone, rng)}
+    for name, passes in run.decisions.items():
+        rows[name] = alarm_row(run.trials, [[one.alarm for one in said] for said in passes], rng)
+    return rows
+
+
+def _window_figures(run: ProtocolRun, method: str, rng: np.random.Generator) -> dict[str, Row]:
+    """Return AUROC by horizon before T0, and ECE of the score as it is and of the risk of five folds."""
+    score = Score.of(run.trials, run.decisions[method])
+    draws = stratified_draws(score.draw_strata, rng)
+    drawn = score.draws(np.vstack([np.arange(len(run.trials)), draws]))
+    horizons = {name: with_interval(name, drawn[f"auroc_{name}"]) for name in WINDOWS_S}
+    risk = {name: with_interval(name, drawn[name]) for name in ("ece_raw", "ece")}
+    return {"horizons": _merged(horizons), "risk": _merged(risk)}
+
+
+def _merged(rows: Mapping[str, Row]) -> Row:
+    return {key: value for row in rows.values() for key, value in row.items()}
+
+
+# By the name in a path's figures: where the simulated exam of a model has the same.
+_EXAM = {
+    **{f"auroc_{lead}": f"auroc_{lead}s_before" for lead in ("1", "2", "3")},
+    "warned": "detected",
+    "lead_s_missed_0": "lead_missed_as_0_s",
+    "alarms_per_hour": "onsets_per_hour",
+    "brier_skill": "skill_2s",
+    "ece": "ece_2s",
+}
+
+
+def exam_figures(path: Path) -> dict[str, float | None]:
+    """Return what the simulated exam of a model has of the figures of a path."""
+    exam: Any = read_json(path, "exam of a model")
+    return {name: exam.get(other) for name, other in _EXAM.items()}

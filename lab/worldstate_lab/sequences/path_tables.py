@@ -1,0 +1,132 @@
+"""The figures of a path as tables for people, with those of its model's simulated exam beside them."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from worldstate_lab.report.table import Cell, Table, Value
+
+from .scores import Row
+
+FOLLOWED = ("identity_kept", "hand_over_delay_s", "bearing_error_deg")
+_ROW_HEADS = (
+    *("warned", "lead (s)", "missed as 0 (s)", "lasting", "lasting (s)", "alarms (1/h)", "in alarm"),
+    *("advisory", "2-6 s after T0", "over 5 s early"),
+)
+_SHOWN_LEADS, _SHOWN_SIDES, _SHOWN_ONSETS = ("0.5", "1", "2", "3"), ("1", "2"), ("1", "3")
+
+
+def path_lines(path: str, found: Mapping[str, Any]) -> list[str]:
+    """Return every table of a path."""
+    return [line for table in _tables(path, found) for line in (*table.lines(), "")] + _sentences(found)
+
+
+def _tables(path: str, found: Mapping[str, Any]) -> Iterator[Table]:
+    on = found["stands_on"]
+    basis = f"{path}: {on['approaches']} approaches, {on['hazard_free']} hazard-free recordings"
+    exam = found.get("exam")
+    yield _leads(found["leads"], exam, f"{basis}, {on['hazard_free_hours']:.3f} h; risk, with the camera")
+    yield alarm_table(
+        found["rows"], "alarm", "alarms; thresholds of five folds, those of the product untouched"
+    )
+    for name, key in (
+        ("sound alone", "at_onsets"),
+        ("with the camera", "at_onsets_with_camera"),
+    ):
+        yield alarm_table(found[key], "onsets <=", f"curve: decision value, {name}, swept afterwards")
+    yield alarm_table(found["at_false_recordings"], "in alarm <=", "curve: the same by recordings in alarm")
+    yield scores_table(found["scores"], "parts of the product, thresholds swept afterwards")
+
+
+def _leads(rows: Mapping[str, Row], exam: Mapping[str, Any] | None, title: str) -> Table:
+    sites = list(next(iter(rows.values()))["auroc_by_junction"])
+    heads = ("lead (s)", "hazard", "all hops", "side", *sites, "n", *(("simulated exam",) if exam else ()))
+    return Table("leads", title, heads, [_lead_row(name, row, exam) for name, row in rows.items()])
+
+
+def _lead_row(name: str, row: Row, exam: Mapping[str, Any] | None) -> tuple[Cell, ...]:
+    areas = (_spread(row, one) for one in ("auroc", "auroc_all_hops", "side_auroc"))
+    sites = (Value(value) for value in row["auroc_by_junction"].values())
+    simulated = () if exam is None else (_value(exam.get(f"auroc_{name}")),)
+    return name, *areas, *sites, f"{row['approaches']} + {row['hazard_free']}", *simulated
+
+
+def alarm_table(rows: Mapping[str, Row], head: str, title: str) -> Table:
+    """Return a table of alarms, each in a row."""
+    return Table(
+        "alarms", title, (head, *_ROW_HEADS), [(name, *_alarm_row(row)) for name, row in rows.items()]
+    )
+
+
+def _alarm_row(row: Row) -> tuple[Cell, ...]:
+    low, high = row["interval"]
+    return (
+        row["text"],
+        _value(row["lead_s"]),
+        _spread(row, "lead_s_missed_0"),
+        f"{row['lasting_count']:g}",
+        _value(row["lasting_lead_s"]),
+        Value(row["alarms_per_hour"], low, high, digits=0),
+        f"{row['false_recordings']:g}",
+        _value(row["advisory_share"], 3),
+        _value(row["after_pass_share"], 3),
+        " ".join(map(str, row["leads_beyond_5_s"])),
+    )
+
+
+def scores_table(scores: Mapping[str, Any], title: str) -> Table:
+    """Return a table of scores: AUROC before T0, and what their best thresholds warn of."""
+    heads = (
+        "score",
+        *(f"{one} s" for one in _SHOWN_LEADS),
+        *(f"side {one} s" for one in _SHOWN_SIDES),
+        *(f"onsets <= {one}" for one in _SHOWN_ONSETS),
+    )
+    return Table("scores", title, heads, [(name, *_score_row(one)) for name, one in scores.items()])
+
+
+def _score_row(found: Mapping[str, Any]) -> tuple[Cell, ...]:
+    leads, curve = found["leads"], found["at_onsets"]
+    return (
+        *(_spread(leads[one], "auroc") for one in _SHOWN_LEADS),
+        *(_value(leads[one].get("side_auroc")) for one in _SHOWN_SIDES),
+        *(f"{curve[n]['count']:g}, {curve[n]['lead_s_missed_0']:.2f} s" for n in _SHOWN_ONSETS),
+    )
+
+
+def _sentences(found: Mapping[str, Any]) -> list[str]:
+    """Return windows, risk and calibration, each in a line, and the exam's figures."""
+    lines = []
+    for name, some in (("model that ships", found), ("published classifier", found["published"])):
+        if some is not None:
+            parts = [f"{one} {_spread(some['horizons'], one).text}" for one in ("all", "2s", "1s")]
+            parts += [f"{one} {_spread(some['risk'], one).text}" for one in ("ece_raw", "ece")]
+            lines.append(f"windows, {name}: {', '.join(parts)}")
+    for name, key in (("with the camera", "calibration"), ("sound alone", "calibration_sound_alone")):
+        some = found[key]
+        parts = [
+            f"{one} {_spread(some, one).text}" for one in ("ece", "brier_skill") if some[one] is not None
+        ]
+        lines.append(
+            f"in view within 2 s, {name}: {', '.join(parts)}, base rate {_value(some['base_rate']).text}"
+        )
+    lines.append(", ".join(f"{name} {_value(found[name]).text}" for name in FOLLOWED))
+    for name, some in found.get("front_end", {}).items():
+        if isinstance(some, dict) and "value" in some:
+            lines.append(
+                f"front-end, {name}: {Value(some['value'], *some['interval']).text}, paper {some['paper']:g}"
+            )
+    if "exam" in found:
+        parts = [f"{name} {_value(value, 3).text}" for name, value in found["exam"].items()]
+        lines.append(f"simulated exam: {', '.join(parts)}")
+    return lines + [f"not heard: {name}: {why}" for name, why in found["failed"].items()]
+
+
+def _spread(row: Row, name: str) -> Value:
+    """Return a figure with its interval."""
+    value, (low, high) = row.get(name), row.get(f"{name}_interval", (math.nan, math.nan))
+    return Value(math.nan if value is None else value, low, high)
+
+
+def _value(value: float | None, digits: int = 2) -> Value:
+    return Value(math.nan if value is None else value, digits=digits)

@@ -1,0 +1,293 @@
+"""What a score of every hop, or an alarm, is worth on real recordings of a corner.
+
+A recording is warned of at any alarm hop before T0; the lead is that of the first one, more than five seconds
+too. An onset is a rising edge, or an alarm at the first hop. A lasting alarm stands half a second before T0,
+and its lead is from its own onset. Thresholds that are swept afterwards give a curve, never a row of a table.
+
+Trials hold in `about` from what time leads count without a hazard, `leads_from_s`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
+from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
+from worldstate.operations.metrics.approach_table import (
+    AFTER_S,
+    LONGEST_LEAD_S,
+    SLACK_S,
+    ApproachTable,
+    mean_of,
+    poisson_interval,
+    rank_wins,
+    rising_edges,
+    share_interval,
+)
+from worldstate_lab.evaluation.reduction import hop_of
+from worldstate_lab.metrics.intervals import draw_weights, middle, pooled_draws, ratio, stratified_draws
+from worldstate_lab.trials.trial import Trial
+
+LEADS_S = (0.5, 1.0, 1.5, 2.0, 3.0)
+# So long before T0 nothing can be heard of the vehicle: what is found there is the ambience of its recording.
+CONTROLS_S = (5.0, 6.0)
+ONSETS, FALSE_RECORDINGS = (0, 1, 3, 6), (0, 1, 2, 3)
+LASTS_S = 0.5  # Before T0
+PASSED_S = 2.0  # After T0; from then on an advisory is about what has gone
+WITHIN_S = 2.0  # Of the chance that is calibrated
+
+Row = dict[str, Any]
+Alarms = Sequence[BoolArray]  # One a trial, shape (n,)
+
+
+def hop_before(trial: Trial, lead_s: float) -> IndexArray:
+    """Return the hop that ends so long before T0, or before what stands for it; none if there is none.
+
+    Examples
+    --------
+    >>> from worldstate.operations.recordings.hop_table import HopTable
+    >>> trial = Trial(HopTable({"time_s": 1.0 + 0.1 * np.arange(21)}, "a", "left", 3.0))
+    >>> hop_before(trial, 0.5).tolist(), hop_before(trial, 3.0).tolist()
+    ([15], [])
+    """
+    from_s = trial.hops.about["leads_from_s"] if trial.hazard_free else trial.t0_s
+    at = hop_of(np.array([from_s - lead_s]), trial.hops.time_s)
+    return at[at >= 0]
+
+
+def areas(parts: Sequence[FloatArray], positive: BoolArray, weights: FloatArray) -> FloatArray:
+    r"""Return the AUROC where recording r counts weights[d, r] times, NaN without a label, shape (D,).
+
+    .. math:: w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)
+
+    Examples
+    --------
+    >>> parts, positive = [np.array([0.9]), np.array([0.1, 0.9])], np.array([True, False])
+    >>> areas(parts, positive, np.ones((1, 2))).tolist()
+    [0.75]
+    """
+    high, low = weights[:, positive], weights[:, ~positive]
+    near, calm = ([parts[i] for i in np.flatnonzero(of).tolist()] for of in (positive, ~positive))
+    pairs = (high @ [len(one) for one in near]) * (low @ [len(one) for one in calm])
+    return ratio(((high @ rank_wins(near, calm)) * low).sum(axis=1), pairs)
+
+
+def strata(trials: Sequence[Trial]) -> list[tuple[str, str]]:
+    """Return label and junction of each trial: what draws keep the numbers of."""
+    return [(one.label, one.site) for one in trials]
+
+
+def leads(
+    trials: Sequence[Trial],
+    scores: Sequence[FloatArray],
+    sides: Sequence[FloatArray] | None,
+    rng: np.random.Generator,
+) -> dict[str, Row]:
+    """Return by lead how the hop of approaches compares with that of hazard-free recordings, and all hops.
+
+    Shapes: scores and sides (n,) a trial; a side score is larger where the right is likelier. Intervals are
+    the middle 95 % over draws of recordings, within each label at each junction.
+    """
+    draws = draw_weights(stratified_draws(strata(trials), rng), len(trials))
+    weights = np.vstack([np.ones(len(trials)), draws])
+    return {f"{one:g}": _lead(trials, scores, sides, weights, one) for one in (*LEADS_S, *CONTROLS_S)}
+
+
+def _lead(
+    trials: Sequence[Trial],
+    scores: Sequence[FloatArray],
+    sides: Sequence[FloatArray] | None,
+    weights: FloatArray,
+    lead_s: float,
+) -> Row:
+    hops, free = [hop_before(one, lead_s) for one in trials], np.array([one.hazard_free for one in trials])
+    sites = np.array([one.site for one in trials])
+    chosen = [score[hop] for score, hop in zip(scores, hops, strict=True)]
+    every = [
+        score if one.hazard_free else part for one, score, part in zip(trials, scores, chosen, strict=True)
+    ]
+    there = np.array([hop.size for hop in hops])
+    by_site = {site: areas(chosen, ~free, weights * (sites == site)) for site in np.unique(sites).tolist()}
+    found = with_interval("auroc", areas(chosen, ~free, weights))
+    found |= with_interval("auroc_all_hops", areas(every, ~free, weights))
+    found["auroc_by_junction"] = {site: float(values[0]) for site, values in by_site.items()}
+    found["auroc_by_junction_interval"] = {site: middle(values[1:]) for site, values in by_site.items()}
+    if sides is not None:
+        parts = [sides[i][hops[i]] for i in np.flatnonzero(~free).tolist()]
+        right = np.array([one.label == "right" for one in trials])[~free]
+        found |= with_interval("side_auroc", areas(parts, right, weights[:, ~free]))
+    return found | {"approaches": int(there[~free].sum()), "hazard_free": int(there[free].sum())}
+
+
+def with_interval(name: str, values: FloatArray) -> Row:
+    """Return the first value and the middle of the draws behind it."""
+    return {name: float(values[0]), f"{name}_interval": middle(values[1:])}
+
+
+def first_lead_s(trial: Trial, alarm: BoolArray) -> float:
+    """Return how long before T0 the first alarm hop is; 0 if none is."""
+    lead_s = trial.t0_s - trial.hops.time_s
+    return float(lead_s.max(initial=0.0, where=alarm & (lead_s > SLACK_S)))
+
+
+def lasting_lead_s(trial: Trial, alarm: BoolArray) -> float:
+    """Return how long before T0 the alarm began that stands `LASTS_S` before it; 0 if none stands."""
+    onsets, times_s = rising_edges(alarm), trial.hops.time_s
+    began = [onsets[onsets <= hop][-1] for hop in hop_before(trial, LASTS_S) if alarm[hop]]
+    return float(trial.t0_s - times_s[began[0]]) if began else 0.0
+
+
+def alarm_row(trials: Sequence[Trial], passes: Sequence[Alarms], rng: np.random.Generator) -> Row:
+    """Return what alarms warn of and what they cost, mean over passes such as seeds.
+
+    `advisory_share` is of hazard-free hops, `after_pass_share` of hops from `PASSED_S` to `AFTER_S` after T0,
+    `interval` is the exact one of alarms an hour.
+
+    Examples
+    --------
+    >>> from worldstate.operations.recordings.hop_table import HopTable
+    >>> hops = HopTable({"time_s": 1.0 + 0.1 * np.arange(40)}, "a", "left", 3.0, {"site": "SA1"})
+    >>> trials = [Trial(hops), Trial(hops.replace(label="none"))]
+    >>> alarm = hops.time_s > 2.05
+    >>> found = alarm_row(trials, [[alarm, alarm]], np.random.default_rng(0))
+    >>> found["text"], round(found["lead_s"], 2), round(found["lasting_lead_s"], 2), found["after_pass_share"]
+    ('1 of 1 at 1 false onset', 0.9, 0.9, None)
+    """
+    near = [i for i, one in enumerate(trials) if not one.hazard_free]
+    approaches, calm = [trials[i] for i in near], [i for i, one in enumerate(trials) if one.hazard_free]
+    first, lasting = (
+        np.array([[of(trials[i], alarms[i]) for i in near] for alarms in passes])
+        for of in (first_lead_s, lasting_lead_s)
+    )
+    tables = [ApproachTable([], [alarms[i] for i in calm]) for alarms in passes]
+    found = _warned(first, lasting) | _false_alarms(tables)
+    passed = [alarms[i][_passed(trials[i])] for alarms in passes for i in near]
+    found["after_pass_share"] = mean_of(np.concatenate(passed))
+    drawn = first.mean(axis=0)[stratified_draws(strata(approaches), rng)].mean(axis=1)
+    found["lead_s_missed_0_interval"] = middle(drawn)
+    onsets = f"{found['onsets']:g} false onset{'s' * (found['onsets'] != 1)}"
+    return {"text": f"{found['count']:g} of {len(near)} at {onsets}"} | found
+
+
+def _passed(trial: Trial) -> BoolArray:
+    after_s = trial.hops.time_s - trial.t0_s
+    return np.asarray((after_s > PASSED_S - SLACK_S) & (after_s < AFTER_S + SLACK_S))
+
+
+def _warned(first: FloatArray, lasting: FloatArray) -> Row:
+    """Return the part of a row that is about approaches; shapes (passes, approaches)."""
+    warned, stand = first > 0.0, lasting > 0.0
+    count, n = float(warned.sum(axis=1).mean()), first.shape[1]
+    return {
+        "warned": mean_of(warned.ravel()),
+        "warned_interval": share_interval(round(count), n),
+        "count": count,
+        "lead_s": mean_of(first[warned]),
+        "lead_s_missed_0": mean_of(first.ravel()),
+        "lasting": mean_of(stand.ravel()),
+        "lasting_count": float(stand.sum(axis=1).mean()),
+        "lasting_lead_s": mean_of(lasting.ravel()),
+        "leads_beyond_5_s": np.sort(first[0][first[0] > LONGEST_LEAD_S + SLACK_S]).round(1).tolist(),
+    }
+
+
+def _false_alarms(tables: Sequence[ApproachTable]) -> Row:
+    """Return the part of a row that is about hazard-free time, of a table a pass."""
+    onsets, hours = float(np.mean([one.onsets for one in tables])), tables[0].hours
+    calm = [one for table in tables for one in table.hazard_free]
+    return {
+        "onsets": onsets,
+        "alarms_per_hour": onsets / hours,
+        # Passes are about the same hours: their mean count is one count.
+        "interval": poisson_interval(round(onsets), hours),
+        "false_recordings": sum(bool(one.any()) for one in calm) / len(tables),
+        "advisory_share": mean_of(np.concatenate(calm)),
+    }
+
+
+def at_onsets(
+    trials: Sequence[Trial], scores: Sequence[FloatArray], rng: np.random.Generator
+) -> dict[str, Row]:
+    """Return the row of the best threshold at no more than so many onsets, by their number: a curve.
+
+    One threshold a row: that with the most warned; of equals that with the longest mean lead.
+    """
+    return _curve(trials, scores, "onsets", ONSETS, rng)
+
+
+def at_false_recordings(
+    trials: Sequence[Trial], scores: Sequence[FloatArray], rng: np.random.Generator
+) -> dict[str, Row]:
+    """Return the same at no more than so many hazard-free recordings in alarm."""
+    return _curve(trials, scores, "false_recordings", FALSE_RECORDINGS, rng)
+
+
+def _curve(
+    trials: Sequence[Trial],
+    scores: Sequence[FloatArray],
+    limited: str,
+    most: Sequence[int],
+    rng: np.random.Generator,
+) -> dict[str, Row]:
+    swept, rows = sweep(trials, scores), {}
+    order = np.lexsort((swept["level"], swept["lead_s"], swept["warned"]))
+    for n in most:
+        level = float(swept["level"][order[swept[limited][order] <= n][-1]])
+        alarms = [score >= level for score in scores]
+        rows[f"{n}"] = alarm_row(trials, [alarms], rng) | {"threshold": level}
+    return rows
+
+
+def sweep(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> Mapping[str, FloatArray]:
+    """Return onsets, false recordings, warned and summed lead of every threshold, shape (levels,) each."""
+    levels = np.append(np.unique(np.concatenate(scores)), np.inf)
+    found = {name: np.zeros(len(levels)) for name in ("onsets", "false_recordings", "warned", "lead_s")}
+    for trial, score in zip(trials, scores, strict=True):
+        alarm = score >= levels[:, None]
+        if trial.hazard_free:
+            found["onsets"] += (alarm & ~np.pad(alarm, ((0, 0), (1, 0)))[:, :-1]).sum(axis=1)
+            found["false_recordings"] += alarm.any(axis=1)
+        else:
+            lead_s = np.maximum(trial.t0_s - trial.hops.time_s, 0.0)
+            # Whole milliseconds: thresholds with equal leads are equal, whatever the order of the sum.
+            first = np.where(alarm & (lead_s > SLACK_S), lead_s, 0.0).max(axis=1).round(3)
+            found["warned"] += first > 0.0
+            found["lead_s"] += first
+    return found | {"level": levels}
+
+
+def calibration(trials: Sequence[Trial], rng: np.random.Generator) -> Row:
+    """Return how true the chances are that something comes into view within 2 s on a side, and their skill.
+
+    Of both sides, at hops before T0 of approaches and at all hops of hazard-free recordings.
+    """
+    parts = [_chances(one) for one in trials]
+    if not sum(map(len, parts)):
+        return {"ece": None, "brier_skill": None, "base_rate": None, "hops": 0}
+    every = np.concatenate(parts)
+    drawn = [_calibrated(one) for one in pooled_draws(parts, strata(trials), rng)]
+    found: Row = _calibrated(every) | {
+        "base_rate": float(every[:, 1].mean()),
+        "hops": len(every) // len(SIDES),
+    }
+    spread = {f"{name}_interval": middle(np.array([one[name] for one in drawn], float)) for name in drawn[0]}
+    return found | spread
+
+
+def _calibrated(pairs: AnyArray) -> dict[str, float | None]:
+    """Return the figures of stated chances and what came true, shape (n, 2)."""
+    said, true = pairs[:, 0], pairs[:, 1]
+    return {"ece": expected_calibration_error(said, true), "brier_skill": brier_skill(said, true)}
+
+
+def _chances(trial: Trial) -> FloatArray:
+    """Return the chance of each side and whether it came true, shape (2 n, 2)."""
+    said = trial.hops.within[:, :, HORIZONS_S.index(WITHIN_S)]
+    coming_s = (trial.t0_s - trial.hops.time_s)[:, None] + np.zeros(len(SIDES))
+    own = np.array([side == trial.label for side in SIDES])
+    true = own & (coming_s <= WITHIN_S + SLACK_S)
+    scored = np.isfinite(said) & (trial.hazard_free | (coming_s > SLACK_S))
+    return np.stack([said[scored], true[scored]], axis=-1)
