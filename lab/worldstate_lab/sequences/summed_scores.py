@@ -1,9 +1,10 @@
-"""A row that is not the product: sequence, window and the levels of the sound, as log-odds that are added.
+"""A row that is not the product: log-odds of sequence, window and sound levels, added.
 
-The sequence that ships is weighed with the larger side ratio of the window and with a logistic regression
-over those inputs of a sequence that are not window evidence. The regression is learned on the simulated
-streams of two microphones, whether a vehicle comes into view within 3 s on a side; nothing real is learned.
-The spectra of seven microphones come without sound: levels are those of the pair, heard beside them.
+The row is the sum of the log-odds of the sequence that ships, the larger side ratio of the window, and a
+logistic regression over the inputs of a sequence that are not window evidence. The regression is learned on
+simulated streams of two microphones, with the label "a vehicle comes into view within 3 s on this side";
+nothing real is learned. The spectra of seven microphones come without their sound, so the levels are those of
+the path of two microphones on the same recording.
 """
 
 import re
@@ -58,7 +59,7 @@ class LevelReading:
     @classmethod
     def learned(cls, streams: Sequence[HeardStream], model: Model) -> "LevelReading":
         """Learn from every third hop of streams, weighted as in the training of a sequence."""
-        # The window evidence of the model is formed and left out: no window model moves what is learned.
+        # Window evidence is formed and left out again, so the window model changes nothing that is learned.
         rows = [_others(stream_evidence(parts_of(model)[0], one))[::EVERY_HOPS] for one in streams]
         truths = [stream_truth(one).coming_s[::EVERY_HOPS] <= COMING_S for one in streams]
         weights = np.repeat(stream_weights(streams), [one.size for one in truths])
@@ -78,9 +79,9 @@ def summed_scores(
 ) -> Scores:
     """Return the sums and their parts at every hop of recordings, each shape (n,), by the name of a row.
 
-    `seven` and `pair` are the same recordings on both paths of `hearing.heard`, `model` is the one that the
-    seven were heard with, `streams` are simulated ones of the pair. All but what is said to be of one hop
-    and what the product publishes are means over 0.3 s, of the side that each part finds likelier.
+    `seven` and `pair` are the same recordings on both paths of `hearing.heard`, `model` is that of the path
+    `seven`, `streams` are simulated ones of the pair. Of the two sides the larger value counts. Values are
+    means over 0.3 s, except for rows "one hop" and the decision value that the product publishes.
     """
     reading, (_, sequence) = LevelReading.learned(streams, model), parts_of(model)
     parts = [_parts(*one, reading, sequence) for one in zip(seven, pair, strict=True)]
@@ -95,7 +96,7 @@ def _parts(
     mixed[:, _LEVELS] = beside[:, _LEVELS]
     one, both = (_coming(each, sequence).max(axis=1) for each in (columns, mixed))
     levels, window = reading.log_odds(beside).max(axis=1), _window_nats(seven)
-    # A window that the guard refused speaks for no side.
+    # A window that the guard refused is evidence for no side.
     ratio = np.nan_to_num(seven.hops.side_nats).max(axis=1)
     published = seven.hops.compared_nats.max(axis=1)
     smoothed = {
@@ -136,7 +137,7 @@ def _log_odds(posterior: SequencePosterior) -> FloatArray:
 
 def _known(columns: FloatArray, read: Callable[[FloatArray], FloatArray], usual: float) -> FloatArray:
     """Return what is read of the hops that have columns, the usual value at the others, shape (n, 2)."""
-    # The guard may refuse the first hops of a recording, before anything stands in the history.
+    # The guard may refuse the first hops of a recording: the history is empty until it accepts one.
     found, known = np.full((len(columns), len(SIDES)), usual), np.isfinite(columns).all(axis=1)
     if known.any():
         found[known] = read(columns[known])
