@@ -32,6 +32,7 @@ STUDIES = {
         "clips",
         "foreign",
         "four",
+        "junctions",
         "kinds",
         "place",
         "sequences",
