@@ -9,6 +9,8 @@ from made_up_corner import write_corner
 from made_up_trials import made_up
 from worldstate_lab.cli.main import main
 from worldstate_lab.methods.line_of_sight import OcSortRecovery
+from worldstate_lab.sequences.path_figures import exam_figures
+from worldstate_lab.sequences.path_tables import alarm_table
 from worldstate_lab.sequences.recordings import NANODET_BOXES, read_recordings
 from worldstate_lab.sequences.scores import (
     alarm_row,
@@ -243,3 +245,14 @@ def test_a_folder_that_cannot_be_heard_is_refused_by_its_problem(tmp_path, capsy
     (folder / "srp.npz").unlink()
     assert main(["sequences", str(folder)]) == 2
     assert "srp.npz" in capsys.readouterr().err
+
+
+def test_the_simulated_exam_stands_beside_what_it_has_a_figure_of(tmp_path) -> None:
+    file = tmp_path / "exam.json"
+    file.write_text(json.dumps({"auroc_1s_before": 0.98, "detected": 0.79, "onsets_per_hour": 6.0}))
+    exam = exam_figures(file)
+    assert (exam["auroc_1"], exam["auroc_2"], exam["warned"]) == (0.98, None, 0.79)
+    row = alarm_row(corner(2, 2), [[np.ones(81, bool)] * 4], draw())
+    last = alarm_table({"ours": row}, "alarm", "alarms", exam).lines()[-1]
+    assert "0.79" in last
+    assert "6.00" in last

@@ -26,9 +26,8 @@ def _tables(path: str, found: Mapping[str, Any]) -> Iterator[Table]:
     basis = f"{path}: {on['approaches']} approaches, {on['hazard_free']} hazard-free recordings"
     exam = found.get("exam")
     yield _leads(found["leads"], exam, f"{basis}, {on['hazard_free_hours']:.3f} h; risk, with the camera")
-    yield alarm_table(
-        found["rows"], "alarm", "alarms; thresholds of five folds, those of the product untouched"
-    )
+    untouched = "alarms; thresholds of five folds, those of the product untouched"
+    yield alarm_table(found["rows"], "alarm", untouched, exam)
     for name, key in (
         ("sound alone", "at_onsets"),
         ("with the camera", "at_onsets_with_camera"),
@@ -51,11 +50,15 @@ def _lead_row(name: str, row: Row, exam: Mapping[str, Any] | None) -> tuple[Cell
     return name, *areas, *sites, f"{row['approaches']} + {row['hazard_free']}", *simulated
 
 
-def alarm_table(rows: Mapping[str, Row], head: str, title: str) -> Table:
-    """Return a table of alarms, each in a row."""
-    return Table(
-        "alarms", title, (head, *_ROW_HEADS), [(name, *_alarm_row(row)) for name, row in rows.items()]
-    )
+def alarm_table(
+    rows: Mapping[str, Row], head: str, title: str, exam: Mapping[str, Any] | None = None
+) -> Table:
+    """Return a table of alarms, each in a row, and of what the simulated exam of a model has of them."""
+    cells = [(name, *_alarm_row(row)) for name, row in rows.items()]
+    if exam is not None:
+        warned, lead, rate = (_value(exam[one]) for one in ("warned", "lead_s_missed_0", "alarms_per_hour"))
+        cells.append(("its simulated exam", warned, None, lead, None, None, rate, *[None] * 4))
+    return Table("alarms", title, (head, *_ROW_HEADS), cells)
 
 
 def _alarm_row(row: Row) -> tuple[Cell, ...]:
