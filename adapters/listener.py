@@ -1,6 +1,7 @@
 """The whole chain over blocks of sound: one world-state a hop out."""
 
 import heapq
+import logging
 from bisect import insort
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy, deepcopy
@@ -15,11 +16,11 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.adapters.audio.sound_file import SoundInput, open_sound
+from worldstate.adapters.audio.sound_file import Audio, RawPcm, SoundInput, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras, VisionQuery
 from worldstate.adapters.files.checkpoint_file import Checkpoint
-from worldstate.core.fixed_lag import Timed
+from worldstate.core.fixed_lag import LAG_NS, Timed
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.given_spectra import GivenSpectra, SpectrumFrontEnd
 from worldstate.frontend.settings import HOP_RATE_HZ
@@ -27,14 +28,15 @@ from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError
 from worldstate.ground.checks import one_of
 from worldstate.ground.typing import Float32Array
-from worldstate.ground.values import seconds
+from worldstate.ground.values import nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
 from .own_parts import OtherModality
-from .source import ListenerParts, Source, SourceParts, check_mounting, open_source
+from .source import ListenerParts, Source, SourceParts, check_clocks, check_mounting, open_source
 
+_LOG = logging.getLogger(__name__)
 # Stands for the file where sound is pushed.
 PUSHED = "pushed sound"
 # Half a hop.
@@ -182,6 +184,7 @@ class Listener:
         self._since_ns = source.start_ns - 1 if source.before is None else self.world.stamp_ns
         self._waiting = _Waiting(source.others, self._since_ns)
         self._part = max(int(sample_rate_hz / PARTS_PER_SECOND), 1)
+        self._first_ns, self._samples, self._warned = source.start_ns, 0, set[str]()
         senses = None if source.before is None else source.before.senses
         if isinstance(senses, Senses) and start_s is None:
             self._go_on(senses)
@@ -193,6 +196,7 @@ class Listener:
         if one != other or not np.array_equal(hear.array.positions_m, before.array.positions_m):
             raise InvalidArgumentError("resume: expected the array, rate, bands and azimuths of its listener")
         self._adapter.front_end = deepcopy(before)
+        self._first_ns = self.world.stamp_ns
         for name, query in self._cameras.items():
             if name in senses.eyes:
                 query.go_on(senses.eyes[name])
@@ -219,8 +223,11 @@ class Listener:
         return [step.state for step in self.steps(block)]
 
     def add(self, *told: Timed) -> None:
-        """Take odometry, positions or measurements of other sensors; each counts from its own stamp on."""
-        self._waiting.add(told)
+        """Take odometry, positions or measurements of other sensors; each counts from its own stamp on.
+
+        What is stamped more than two seconds from the sound is refused and counted.
+        """
+        self._waiting.add([one for one in told if self._is_near(one.stamp_ns, one.source)])
 
     def skip(self, lost_ns: int) -> None:
         """Let time go on by sound that was lost and is not pushed as silence.
@@ -248,6 +255,7 @@ class Listener:
         [3.1]
         """
         self._adapter.front_end.skip(lost_ns)
+        self._first_ns += lost_ns
         if isinstance(self._reader, SequenceReader):
             self._reader.miss(round(seconds(lost_ns) * HOP_RATE_HZ))
 
@@ -257,6 +265,9 @@ class Listener:
 
     def look(self, stamp_ns: int, frame: DetectionFrame, camera: str = SENSOR) -> None:
         """Take what a running detector found in an image; of several cameras the one is named.
+
+        One that was taken more than two seconds from the sound is refused, and so are boxes outside the
+        image; `WorldState.delivery` counts them.
 
         Parameters
         ----------
@@ -272,12 +283,28 @@ class Listener:
         InvalidArgumentError
             If there is no such camera, or none was given, where the array is not OVAD's.
         InputFileError
-            If a box lies outside the image.
+            If all boxes lie outside the image.
         """
         if self._blind:
             check_mounting(self._source.array)
             self._blind = False
-        self._cameras[one_of("camera", camera, self._cameras)].see(stamp_ns, frame)
+        query = self._cameras[one_of("camera", camera, self._cameras)]
+        if self._is_near(query.taken_ns(stamp_ns), camera):
+            before = query.outside
+            query.see(stamp_ns, frame)
+            self.refuse(query.outside - before)
+
+    def _is_near(self, stamp_ns: int, name: str) -> bool:
+        """Return whether a stamp is near the sound that was pushed; else count it, and warn of the first."""
+        now_ns = self._first_ns + nanoseconds(self._samples / self._rate_hz)
+        if abs(stamp_ns - now_ns) <= LAG_NS:
+            return True
+        self.refuse(1)
+        if name not in self._warned:
+            told = "%s: what is stamped %.1f s from the sound is refused, and all that is more than %.0f s"
+            _LOG.warning(told, name, seconds(stamp_ns - now_ns), seconds(LAG_NS))
+        self._warned.add(name)
+        return False
 
     def checkpoint(self) -> Checkpoint:
         """Return what another listener goes on from at the next sample, to the bit.
@@ -323,6 +350,7 @@ class Listener:
     def measured(self, block: Float32Array | None) -> Iterator[tuple[AcousticFrame, Measurement]]:
         """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
         hear = self._adapter.front_end
+        self._samples += 0 if block is None else len(block)
         for frames in [hear.finish()] if block is None else map(hear.process, self._parts(block)):
             for frame in frames:
                 # What the belief to go on from has taken in already only fills the windows.
@@ -453,6 +481,8 @@ def listened(source: Source) -> Iterator[tuple[Listener, Float32Array | None]]:
     """Yield the sound of `source` block by block, None last, each beside the one listener to take it."""
     strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
     with open_sound(source.sound, n_microphones, channels=source.array.channels, strict=strict) as audio:
+        endless = isinstance(source.sound, RawPcm | Audio)
+        check_clocks(source, None if endless else audio.duration_s)
         listener = Listener(source, audio.sample_rate_hz)
         for block in audio.blocks(max(audio.sample_rate_hz // PARTS_PER_SECOND, 1)):
             yield listener, block

@@ -34,7 +34,9 @@ class ImageHealth:
         return self.level
 
 
-def seen_in(video: Video, detector: Detector, rates: MissRates | None) -> tuple[DetectionLog, DegradationLog]:
+def seen_in(
+    video: Video, detector: Detector, rates: MissRates | None, start_ns: int = 0
+) -> tuple[DetectionLog, DegradationLog]:
     """Return what a new detector finds in a video, each image decoded once, and d as last read from it.
 
     Rates are those measured for this detector and camera; without the scale of its health d is 0.
@@ -45,19 +47,19 @@ def seen_in(video: Video, detector: Detector, rates: MissRates | None) -> tuple[
         found.append(detector.detect(image))
         return health.read(stamp_ns, image)
 
-    degradation = _levels(video, look)
+    degradation = _levels(video, look, start_ns)
     return DetectionLog(tuple(found), degradation.stamps_ns, str(video.path)), degradation
 
 
-def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
+def video_degradation(video: Video, rates: MissRates, start_ns: int = 0) -> DegradationLog:
     """Estimate d from every image of a video that starts with the recording."""
-    return _levels(video, ImageHealth(rates, period_ns=0).read)
+    return _levels(video, ImageHealth(rates, period_ns=0).read, start_ns)
 
 
-def _levels(video: Video, read: Callable[[int, ImageArray], float]) -> DegradationLog:
+def _levels(video: Video, read: Callable[[int, ImageArray], float], start_ns: int) -> DegradationLog:
     stamps_ns, levels = list[int](), list[float]()
     for number, image in enumerate(video.frames()):
-        stamps_ns.append(nanoseconds(number / video.frame_rate_hz))
+        stamps_ns.append(start_ns + nanoseconds(number / video.frame_rate_hz))
         levels.append(read(stamps_ns[-1], image))
     return DegradationLog(np.array(stamps_ns, dtype=np.int64), np.array(levels))
 

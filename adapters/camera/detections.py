@@ -1,24 +1,30 @@
 """Detections of a camera image by image: the detector's interface, OVAD, COCO, YOLO, MOTChallenge files."""
 
+import logging
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Protocol
 
 import numpy as np
 
-from worldstate.adapters.files.file_io import read_json, read_text, refused_as_file
+from worldstate.adapters.files.file_io import in_order, read_json, read_text, refused_as_file
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
 from worldstate.ground.checks import check_shape
 from worldstate.ground.serialisation import Check, Count, Probability, decode
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 
+_LOG = logging.getLogger(__name__)
 MAX_BYTES = 64 << 20
-MAX_FRAMES = 100_000
+MAX_FRAMES, MAX_BOXES = 250_000, 1_000_000  # two hours at 30 images a second
 MAX_BOXES_A_FRAME = 1000
 MAX_FRAME_RATE_HZ = 1000.0
+# Detectors round boxes outwards: so far beyond the border of an image they are left as they are.
+BORDER_PX = 1.0
+# Images a second, where neither their stamps nor the user state it: OVAD's.
+IMAGE_RATE_HZ = 10.0
 # Decisions at 47,998 Hz fall up to half a sample (10 us) before the frame that they belong to.
 STAMP_SLACK_NS = 1_000_000
 # The road users among COCO's categories, by the number that results files carry, and by their place in the
@@ -32,7 +38,13 @@ YOLO_CLASSES: Mapping[int, str] = {
 # Of MOTChallenge's ground truth; -1 stands for what a line does not state.
 MOT_CLASSES: Mapping[float, str] = {-1: "car", 1: "person", 3: "car", 4: "bicycle", 5: "motorcycle"}
 MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
-_FRAME_NUMBER = re.compile(r"(\d{1,9})\.txt$", re.ASCII)
+# Roboflow puts a hash of the image behind its name.
+_HASH = re.compile(r"(_(jpe?g|png|bmp))?\.rf\.\w+$")
+_NUMBERED = re.compile(r"(.*?)(\d{1,18})", re.ASCII)
+# What exporters put beside labels.
+_NO_LABELS = frozenset({"classes.txt", "README.txt", "README.dataset.txt", "README.roboflow.txt"})
+# Fewer numbers than these may have a common step by chance.
+_LEAST_NUMBERS = 3
 
 # A box is parked when a box stood at its place, every edge within so many pixels, in this share of the images
 # of so many seconds; below 1 because detectors miss now and then.
@@ -89,6 +101,27 @@ class DetectionFrame:
     def __len__(self) -> int:
         return len(self.labels)
 
+    def cut(self, size_px: tuple[int, int]) -> tuple["DetectionFrame", int, int]:
+        """Return the boxes within an image, how many were cut at its border, and how many lie outside.
+
+        Examples
+        --------
+        >>> boxes = np.array([[500.0, 20.0, 645.0, 140.0], [700.0, 20.0, 760.0, 140.0]])
+        >>> frame, *counts = DetectionFrame(boxes, np.array([0.9, 0.8]), ("car", "car")).cut((640, 480))
+        >>> frame.boxes_px.tolist(), counts
+        ([[500.0, 20.0, 640.0, 140.0]], [1, 1])
+        """
+        size = np.tile(size_px, 2)
+        within: FloatArray = np.clip(self.boxes_px, 0.0, size)
+        beyond: BoolArray = np.any(np.abs(self.boxes_px - within) > BORDER_PX, axis=1)
+        if not beyond.any():
+            return self, 0, 0
+        outside = beyond & np.any(within[:, 2:] <= within[:, :2], axis=1)
+        kept = np.flatnonzero(~outside)
+        boxes = np.where(beyond[:, None], within, self.boxes_px)[kept]
+        frame = DetectionFrame(boxes, self.scores[kept], tuple(self.labels[i] for i in kept))
+        return frame, int((beyond & ~outside).sum()), int(outside.sum())
+
     def select(self, keep: "DetectionFilter") -> IntArray:
         """Return the indices of the boxes that `keep` lets through."""
         heights_px = self.boxes_px[:, 3] - self.boxes_px[:, 1]
@@ -141,6 +174,10 @@ class DetectionLog:
         Shape (n,), int64, strictly increasing, nanoseconds on the stream's clock.
     source : str
         Where it comes from, for messages: the file's name.
+    counted_hz : float or None
+        Images a second, where they carry no stamp and are counted from the first sample of the sound.
+    assumed : bool
+        Whether nobody stated that rate.
 
     Raises
     ------
@@ -158,6 +195,8 @@ class DetectionLog:
     frames: tuple[DetectionFrame, ...]
     stamps_ns: IntArray
     source: str = "detections"
+    counted_hz: float | None = None
+    assumed: bool = False
 
     def __post_init__(self) -> None:
         if len(self.frames) != len(self.stamps_ns):
@@ -172,26 +211,57 @@ class DetectionLog:
     def at_rate(
         cls,
         frames: Collection[DetectionFrame],
-        frame_rate_hz: float,
+        frame_rate_hz: float | None,
         source: str = "detections",
+        numbers: Sequence[int] | None = None,
     ) -> "DetectionLog":
-        """Stamp frame i with i / rate, counted from the start of the recording.
+        """Stamp frame i with i / rate, or its number / rate, counted from the start of the recording.
+
+        Without a rate it is 10, which is then held against the length of the sound.
 
         Raises
         ------
         InvalidArgumentError
             If the rate is not above 0 and at most 1000.
         """
-        in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
-        stamps = [nanoseconds(i / frame_rate_hz) for i in range(len(frames))]
-        return cls(tuple(frames), np.array(stamps, dtype=np.int64), source)
+        rate_hz = _rate_hz(frame_rate_hz)
+        stamps = [nanoseconds(i / rate_hz) for i in (range(len(frames)) if numbers is None else numbers)]
+        return cls(tuple(frames), np.array(stamps, dtype=np.int64), source, rate_hz, frame_rate_hz is None)
+
+    @classmethod
+    def in_order(
+        cls, frames: Sequence[DetectionFrame], stamps_ns: Sequence[int], source: str = "detections"
+    ) -> "DetectionLog":
+        """Sort images by their stamps; of several with one stamp the last counts, and a warning counts them.
+
+        Examples
+        --------
+        >>> empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+        >>> DetectionLog.in_order([empty] * 3, [200, 100, 200]).stamps_ns.tolist()
+        [100, 200]
+        """
+        places = in_order(stamps_ns, source)
+        stamps = np.array([stamps_ns[i] for i in places], dtype=np.int64)
+        return cls(tuple(frames[i] for i in places), stamps, source)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def shifted(self, offset_s: float) -> "DetectionLog":
         """Return the same frames with stamps that are later by so many seconds."""
-        return DetectionLog(self.frames, self.stamps_ns + nanoseconds(offset_s), self.source)
+        return replace(self, stamps_ns=self.stamps_ns + nanoseconds(offset_s))
+
+    def on_clock(self, start_ns: int, offset_s: float) -> "DetectionLog":
+        """Return it on the clock of a sound that starts then: stamps are moved by the offset of the camera.
+
+        Examples
+        --------
+        >>> empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+        >>> DetectionLog.at_rate([empty] * 2, 10.0).on_clock(7_000_000_000, 0.5).stamps_ns.tolist()
+        [7500000000, 7600000000]
+        """
+        counted_from_ns = 0 if self.counted_hz is None else start_ns
+        return replace(self, stamps_ns=self.stamps_ns + counted_from_ns).shifted(offset_s)
 
     def latest(self, stamp_ns: int, max_age_ns: int) -> int | None:
         """Return the number of the last frame taken at or before `stamp_ns`, None if too old or not there."""
@@ -199,6 +269,11 @@ class DetectionLog:
         if index < 0 or stamp_ns - int(self.stamps_ns[index]) > max_age_ns:
             return None
         return index
+
+
+def _rate_hz(stated: float | None) -> float:
+    rate_hz = IMAGE_RATE_HZ if stated is None else stated
+    return in_range("frame_rate_hz", rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
 
 
 def parked(log: DetectionLog, frame: int, boxes_px: FloatArray) -> BoolArray:
@@ -270,7 +345,7 @@ class Detector(Protocol):
         """
 
 
-def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionLog:
+def read_detections(path: str | Path, frame_rate_hz: float | None = None) -> DetectionLog:
     """Read per-frame detections in OVAD's JSON.
 
     ``{"detections_per_frame": [{"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...]},
@@ -280,9 +355,9 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionL
     Parameters
     ----------
     path : str or Path
-        The file; at most 64 MiB, 100,000 frames, 1000 boxes a frame.
-    frame_rate_hz : float
-        Frames a second where the frames carry no stamp.
+        The file; at most 64 MiB, 250,000 frames, 1000 boxes a frame.
+    frame_rate_hz : float, optional
+        Frames a second where the frames carry no stamp; 10 where not given.
 
     Returns
     -------
@@ -293,8 +368,7 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionL
     ------
     InputFileError
         Names the file and the frame: missing, too large, no JSON, keys missing, other types, lengths that
-        differ, numbers that are not finite, boxes turned inside out, scores outside [0, 1], stamps out of
-        order.
+        differ, numbers that are not finite, boxes turned inside out, scores outside [0, 1].
     InvalidArgumentError
         If the rate is not above 0 and at most 1000.
 
@@ -308,12 +382,12 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionL
     ...     read_detections(name).frames[0].labels
     ('car',)
     """
-    in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
     name = Path(path)
+    _rate_hz(frame_rate_hz)  # before a long file is read
     return _ovad_log(name, read_json(name, "a detections file", MAX_BYTES), frame_rate_hz)
 
 
-def _ovad_log(name: Path, document: object, frame_rate_hz: float) -> DetectionLog:
+def _ovad_log(name: Path, document: object, frame_rate_hz: float | None) -> DetectionLog:
     rows = document.get("detections_per_frame") if isinstance(document, dict) else None
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
@@ -321,11 +395,12 @@ def _ovad_log(name: Path, document: object, frame_rate_hz: float) -> DetectionLo
     with refused_as_file(name):
         read = [decode(_OvadFrame, row, f"frame {number}") for number, row in enumerate(rows)]
         frames, stamps = [one.frame() for one in read], [one.stamp_ns for one in read]
-        if all(stamp is None for stamp in stamps):
-            return DetectionLog.at_rate(frames, frame_rate_hz, source=str(name))
-        if None in stamps:
-            raise InvalidArgumentError(f"frame {stamps.index(None)}: expected stamp_ns, as in other frames")
-        return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), str(name))
+    stamped = [stamp for stamp in stamps if stamp is not None]
+    if not stamped:
+        return DetectionLog.at_rate(frames, frame_rate_hz, source=str(name))
+    if len(stamped) < len(stamps):
+        raise InputFileError(name, f"frame {stamps.index(None)}: expected stamp_ns, as in other frames")
+    return DetectionLog.in_order(frames, stamped, str(name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,7 +435,7 @@ class _CocoResult:
     image_id: int
     category_id: int
     bbox: tuple[Place, Place, Extent, Extent]
-    score: Probability
+    score: Probability | None = None  # Labels have none
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,6 +444,7 @@ class _CocoId:
 
     id: int
     name: str | None = None
+    file_name: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,14 +457,14 @@ class _CocoFile:
 
     def __post_init__(self) -> None:
         boxes, images = len(self.annotations), len(self.images or ())
-        if boxes > MAX_FRAMES * 10 or images > MAX_FRAMES:
-            problem = f"expected at most {MAX_FRAMES * 10} boxes and {MAX_FRAMES} images"
+        if boxes > MAX_BOXES or images > MAX_FRAMES:
+            problem = f"expected at most {MAX_BOXES} boxes and {MAX_FRAMES} images"
             raise InvalidArgumentError(f"{problem}, got {boxes} and {images}")
 
 
 def read_any_detections(
     path: str | Path,
-    frame_rate_hz: float = 10.0,
+    frame_rate_hz: float | None = None,
     size_px: tuple[int, int] | None = None,
     n_images: int | None = None,
 ) -> DetectionLog:
@@ -402,8 +478,8 @@ def read_any_detections(
     ----------
     path : str or Path
         File or folder.
-    frame_rate_hz : float
-        Frames a second, where the frames carry no stamp.
+    frame_rate_hz : float, optional
+        Frames a second, where the frames carry no stamp; 10 where not given.
     size_px : tuple of int, optional
         Width and height of the image, which YOLO text is relative to.
     n_images : int, optional
@@ -445,49 +521,103 @@ def read_any_detections(
 
 
 def coco_log(
-    path: Path, document: object, frame_rate_hz: float = 10.0, n_images: int | None = None
+    path: Path, document: object, frame_rate_hz: float | None = None, n_images: int | None = None
 ) -> DetectionLog:
     """Return the log of COCO results, or of an object of ``"images"`` and results as ``"annotations"``.
 
     A result is ``{"image_id", "category_id", "bbox": [x, y, w, h], "score"}``; image i is taken i / rate
-    after the start.
+    after the start, and without a score it counts as 1. Listed images whose ids count from 1 or are arbitrary
+    stand in the order of the numbers that their ``"file_name"`` end in.
     """
     with refused_as_file(path):
         held = document if isinstance(document, dict) else {"annotations": document}
         listed, read = "images" in held, decode(_CocoFile, held, "COCO")
         named = {one.id: one.name for one in read.categories or () if one.name is not None}
         names = {**COCO_CATEGORIES, **named}
-        rows: dict[int, list[Row]] = {one.id: [] for one in read.images or ()}
+        numbers = _listed_numbers(read.images or ())
+        rows: dict[int, list[Row]] = {number: [] for number in numbers.values()}
         for result in read.annotations:
-            if listed and result.image_id not in rows:
+            if listed and result.image_id not in numbers:
                 problem = f"expected the images of all boxes listed, {result.image_id} is not"
                 raise InvalidArgumentError(problem)
             left, top, width, height = result.bbox
             label = names.get(result.category_id, str(result.category_id))
-            row = (left, top, left + width, top + height), result.score, label
-            rows.setdefault(result.image_id, []).append(row)
+            score = 1.0 if result.score is None else result.score
+            row = (left, top, left + width, top + height), score, label
+            rows.setdefault(numbers.get(result.image_id, result.image_id), []).append(row)
+    if unscored := sum(one.score is None for one in read.annotations):
+        _LOG.warning("%s: %d boxes without a score count with 1.0", path, unscored)
     if listed and n_images is not None:
         raise InputFileError(path, "expected no number of images (--images): the file lists its images")
     return _log(path, rows, frame_rate_hz, sorted(rows) if listed else n_images)
 
 
+def _listed_numbers(images: Sequence[_CocoId]) -> dict[int, int]:
+    """Return which image after the start each listed id is."""
+    ids = [one.id for one in images]
+    numbers = image_numbers([one.file_name or "" for one in images])
+    if numbers is None or 0 in ids or numbers == ids:
+        return {one: one - _first(ids) for one in ids}
+    places = {number: place for place, number in enumerate(sorted(numbers))}
+    # A list with gaps is of some images of a video, whose numbers then are those in it; or they are times.
+    whole = len(_between(numbers)) == len(ids) or max(numbers) >= MAX_FRAMES
+    return {one: places[number] if whole else number for one, number in zip(ids, numbers, strict=True)}
+
+
+def _first(numbers: Collection[int]) -> int:
+    """Return the number of the first image, 1 where all are listed and counted from 1, as COCO does."""
+    return int(sorted(numbers) == [*range(1, len(numbers) + 1)])
+
+
+def image_numbers(names: Sequence[str]) -> list[int] | None:
+    """Return the numbers that names of images end in; None where they form no sequence.
+
+    Then one name stands before all numbers, and no number comes twice. What Roboflow adds does not count.
+
+    Examples
+    --------
+    >>> image_numbers(["cam_0002_jpg.rf.4f1e77aa0b3c.jpg", "cam_0010_jpg.rf.08c5d2219e7f.jpg"])
+    [2, 10]
+    >>> image_numbers(["4f1e77aa0b3c.txt", "08c5d2219e71.txt"]) is None
+    True
+    """
+    matches = [_NUMBERED.fullmatch(_HASH.sub("", Path(name).stem)) for name in names]
+    found = [(match[1], int(match[2])) for match in matches if match is not None]
+    sequence = len(set(found)) == len(names) and len({before for before, _ in found}) == 1
+    return [number for _, number in found] if sequence else None
+
+
+def _between(numbers: Collection[int]) -> range:
+    """Return the numbers from the first to the last in the largest steps that reach all of them."""
+    first, last = min(numbers), max(numbers)
+    return range(first, last + 1, math.gcd(*(number - first for number in numbers)) or 1)
+
+
 def read_yolo_text(
-    path: str | Path, size_px: tuple[int, int], frame_rate_hz: float = 10.0, n_images: int | None = None
+    path: str | Path,
+    size_px: tuple[int, int],
+    frame_rate_hz: float | None = None,
+    n_images: int | None = None,
 ) -> DetectionLog:
     """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image."""
     folder = Path(path)
-    numbered = [(file, match) for file in folder.glob("*.txt") if (match := _FRAME_NUMBER.search(file.name))]
-    if not numbered or len(numbered) > MAX_FRAMES:
-        problem = f"expected 1 to {MAX_FRAMES} files that end in a frame number and .txt, got {len(numbered)}"
-        raise InputFileError(folder, problem)
+    files = sorted(file for file in folder.glob("*.txt") if file.name not in _NO_LABELS)
+    numbers = image_numbers([file.name for file in files[: MAX_FRAMES + 1]])
+    if numbers is None or len(files) > MAX_FRAMES:
+        some = ", ".join(file.name for file in files[:2]) or "none"
+        expected = f"1 to {MAX_FRAMES} files of one name with the number of their image behind it"
+        way_on = 'name them so, or list "images" with "file_name" in a COCO object'
+        raise InputFileError(folder, f"expected {expected} (street_000017.txt), got {some:.120}: {way_on}")
     rows: dict[int, list[Row]] = {}
-    for file, match in numbered:
-        number = int(match.group(1))
-        if number in rows:
-            raise InputFileError(file, "expected every frame once, another file has the same number")
+    for file, number in zip(files, numbers, strict=True):
         with refused_as_file(file):
             lines = read_text(file, "a text file", MAX_TEXT_BYTES).splitlines()
             rows[number] = [_yolo_row(line, size_px) for line in lines if line.strip()]
+    # Who writes empty files, or a data set, writes one for every image: what has none was not looked at.
+    if n_images is None and (not all(rows.values()) or any(_HASH.search(file.stem) for file in files)):
+        first = _first(rows)
+        rows = {number - first: found for number, found in rows.items()}
+        return _log(folder, rows, frame_rate_hz, sorted(rows))
     return _log(folder, rows, frame_rate_hz, n_images)
 
 
@@ -512,7 +642,9 @@ def _in_bounds(x: float, y: float, width: float, height: float, score: float) ->
     return small and min(width, height) >= 0.0 and 0.0 <= score <= 1.0
 
 
-def read_mot_text(path: str | Path, frame_rate_hz: float = 10.0, n_images: int | None = None) -> DetectionLog:
+def read_mot_text(
+    path: str | Path, frame_rate_hz: float | None = None, n_images: int | None = None
+) -> DetectionLog:
     """Read MOTChallenge text: lines ``frame, id, left, top, width, height, conf, x, y, z``, frames from 1.
 
     What follows `conf` may be left out; `id`, x, y, z are not used. A `conf` of -1 is not stated and counts
@@ -530,8 +662,8 @@ def read_mot_text(path: str | Path, frame_rate_hz: float = 10.0, n_images: int |
     """
     name = Path(path)
     text = read_text(name, "MOTChallenge text", MAX_BYTES)
-    if text.count("\n") > MAX_FRAMES * 10:
-        raise InputFileError(name, f"expected at most {MAX_FRAMES * 10} lines")
+    if text.count("\n") > MAX_BOXES:
+        raise InputFileError(name, f"expected at most {MAX_BOXES} lines")
     rows: dict[int, list[Row]] = {}
     with refused_as_file(name):
         for number, line in enumerate(text.split("\n"), 1):
@@ -559,21 +691,38 @@ def _mot_row(line: str, where: str) -> tuple[int, Row]:
 
 
 def _log(
-    path: Path, rows: Mapping[int, list[Row]], frame_rate_hz: float, looked: Sequence[int] | int | None
+    path: Path,
+    rows: Mapping[int, list[Row]],
+    frame_rate_hz: float | None,
+    looked: Sequence[int] | int | None,
 ) -> DetectionLog:
     """Stamp the images that were looked at: those of these numbers, so many, or up to the last with a box."""
-    in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
     count = max(rows, default=-1) + 1
     if count > MAX_FRAMES or min(rows, default=0) < 0:
-        raise InputFileError(path, f"expected frame numbers from 0 to {min(count, MAX_FRAMES) - 1}")
+        got = count - 1 if count > MAX_FRAMES else min(rows)
+        way_on = 'times belong in "stamp_ns" of detections_per_frame'
+        raise InputFileError(path, f"expected frame numbers from 0 to {MAX_FRAMES - 1}, got {got}: {way_on}")
     if isinstance(looked, int) and not count <= looked <= MAX_FRAMES:
         raise InputFileError(path, f"expected {count} to {MAX_FRAMES} images by its boxes, got {looked}")
-    numbers = looked if isinstance(looked, Sequence) else range(count if looked is None else looked)
+    numbers = looked if isinstance(looked, Sequence) else range(looked or 0)
+    if looked is None and rows:
+        numbers = _numbers_up_to_the_last(path, rows, stated=frame_rate_hz is not None)
     if max(map(len, rows.values()), default=0) > MAX_BOXES_A_FRAME:
         raise InputFileError(path, f"expected at most {MAX_BOXES_A_FRAME} boxes a frame")
     found = tuple(frame_of_rows(rows.get(number, [])) for number in numbers)
-    stamps = [nanoseconds(number / frame_rate_hz) for number in numbers]
-    return DetectionLog(found, np.array(stamps, dtype=np.int64), str(path))
+    return DetectionLog.at_rate(found, frame_rate_hz, str(path), numbers)
+
+
+def _numbers_up_to_the_last(path: Path, named: Collection[int], *, stated: bool) -> range:
+    """Return the images up to the last that is named; refuse numbers in steps, where no rate is stated."""
+    steps = _between(named)
+    if len(named) < _LEAST_NUMBERS or steps.step == 1:
+        return range(steps.stop)
+    if not stated:
+        problem = f"expected images that are numbered by ones, these rise by {steps.step}, as times do"
+        way_on = "state how many of these numbers a second has (--image-rate, image_rate_hz, frame_rate_hz)"
+        raise InputFileError(path, f"{problem}: {way_on}, or the number of images (--images)")
+    return range(steps.start % steps.step, steps.stop, steps.step)
 
 
 def frame_of_rows(rows: Sequence[Row]) -> DetectionFrame:

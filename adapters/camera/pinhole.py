@@ -13,6 +13,10 @@ from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finit
 from worldstate.ground.serialisation import ADDED
 from worldstate.measurement.measurement import Sighting
 
+# What nanoseconds of 64 bits hold, and a yaw that counts on.
+MOST_OFFSET_S, MOST_TURNS_RAD = 9e9, 1e6
+NOMINAL_RANGE_M = 10.0
+
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
@@ -39,11 +43,12 @@ class PinholeCamera:
     roll_rad : float
         Turn about the optical axis, in (-pi/2, pi/2); positive lifts the left side.
     stamp_offset_s : float
-        What brings the stamps of its images to the clock of the sound, seconds, in [-10, 10].
+        What brings the stamps of its images to the clock of the sound, seconds, of any size.
     position_m : tuple of float
         Of the camera in `base_link`, (x, y, z).
     yaw_rad, pitch_rad : float
-        Direction of the optical axis: azimuth, left positive, and elevation, up positive, in (-pi/2, pi/2).
+        Direction of the optical axis: azimuth, left positive, wrapped into (-pi, pi] where it is beyond; and
+        elevation, up positive, in (-pi/2, pi/2).
     nominal_range_m : float
         Distance from the camera at which azimuths are exact; larger than the offset.
     range_spread : float
@@ -70,7 +75,7 @@ class PinholeCamera:
     position_m: tuple[float, float, float]
     yaw_rad: float = 0.0
     pitch_rad: float = 0.0
-    nominal_range_m: float = 10.0
+    nominal_range_m: float = NOMINAL_RANGE_M
     range_spread: float = 0.5
     principal_px: float | None = None
     roll_rad: float = 0.0
@@ -80,10 +85,11 @@ class PinholeCamera:
         in_range("width_px", self.width_px, 1, 1 << 16)
         in_range("height_px", self.height_px, 1, 1 << 16)
         in_range("half_angle_rad", self.half_angle_rad, 0.0, math.pi / 2, open_low=True, open_high=True)
-        in_range("yaw_rad", self.yaw_rad, -math.pi, math.pi)
+        if abs(in_range("yaw_rad", self.yaw_rad, -MOST_TURNS_RAD, MOST_TURNS_RAD)) > math.pi:
+            object.__setattr__(self, "yaw_rad", wrap_angle(float(self.yaw_rad)))
         in_range("pitch_rad", self.pitch_rad, -math.pi / 2, math.pi / 2, open_low=True, open_high=True)
         in_range("roll_rad", self.roll_rad, -math.pi / 2, math.pi / 2, open_low=True, open_high=True)
-        in_range("stamp_offset_s", self.stamp_offset_s, -10.0, 10.0)
+        in_range("stamp_offset_s", self.stamp_offset_s, -MOST_OFFSET_S, MOST_OFFSET_S)
         in_range("range_spread", self.range_spread, 0.0, math.inf)
         if self.principal_px is not None:
             in_range("principal_px", self.principal_px, 0.0, self.width_px)
@@ -295,6 +301,7 @@ class CameraRecord:
         """Return the camera."""
         if (self.horizontal_fov_deg is None) == (self.fx is None):
             raise InvalidArgumentError("camera: expected either horizontal_fov_deg or fx")
+        self._check_units()
         half_angle = 0.5 * math.radians(self.horizontal_fov_deg or 0.0)
         if self.fx is not None:
             fx = in_range("camera.fx", self.fx, 0.0, math.inf, open_low=True)
@@ -313,3 +320,14 @@ class CameraRecord:
             roll_rad=math.radians(self.roll_deg or 0.0),
             stamp_offset_s=self.stamp_offset_s or 0.0,
         )
+
+    def _check_units(self) -> None:
+        """Refuse numbers by the names and in the units of the file."""
+        for name, low in (("horizontal_fov_deg", 0.0), ("pitch_deg", -90.0), ("roll_deg", -90.0)):
+            if (given := getattr(self, name)) is not None:
+                in_range(f"camera.{name}", given, low, low + 180.0, open_low=True, open_high=True)
+        if self.cx is not None:
+            in_range("camera.cx", self.cx, 0.0, self.width_px)
+        if self.position_m is not None and math.hypot(*self.position_m[:2]) >= NOMINAL_RANGE_M:
+            expected = f"expected less than {NOMINAL_RANGE_M:g} m from the array along x and y, metres"
+            raise InvalidArgumentError(f"camera.position_m: {expected}, got {list(self.position_m)}")

@@ -1,6 +1,7 @@
 """Camera detections as co-evidence: present, absent or unqueried in a sector."""
 
 import itertools
+import logging
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -17,21 +18,21 @@ from worldstate.abduction.co_evidence import (
     default_miss_rates,
 )
 from worldstate.core.filter import MOST_BOXES
-from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
+from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, NotUsable
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
-from .detections import PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
+from .detections import BORDER_PX, PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
 # Points at which a miss rate is averaged over the part of the sector that is in view.
 # The table is piecewise linear over tens of degrees: more points do not change the mean.
 SAMPLES = 8
-# Detectors round boxes outwards; more than a pixel outside the image means another camera.
-BORDER_PX = 1.0
-
-
+# Trackers and boxes of whole objects reach beyond an image. Of the boxes of larger images a larger share than
+# this lies outside, or half of them reach beyond, some by more than this share of the width.
+_MOST_OUTSIDE, _FAR_BEYOND, _FEW_BOXES = 0.1, 0.01, 4
+_LOG = logging.getLogger(__name__)
 # Looks of a running camera that are remembered: whether a box stands still is asked over the last second, and
 # more than 60 images a second bring nothing to a decision every 0.1 s. So what comes sooner is left out.
 REMEMBERED = 64
@@ -88,7 +89,12 @@ class VisionQuery:
     Raises
     ------
     InputFileError
-        If a box lies outside the image: the detections come from another camera.
+        If more than a tenth of the boxes lies outside the image: they come from another camera.
+
+    Attributes
+    ----------
+    cut, outside : int
+        Boxes of a running camera that were cut at the border of the image, and left out as outside of it.
 
     Examples
     --------
@@ -120,8 +126,8 @@ class VisionQuery:
         self._line_of_sight = line_of_sight
         self._clutter = clutter or (lambda d: _CLUTTER_RATE)
         self._asked = detections is not None
-        log = NO_LOOKS if detections is None else detections
-        _check_size(camera, log)
+        self.cut = self.outside = 0
+        log = within_images(camera, NO_LOOKS if detections is None else detections)
         self._other_ns: int | None = None
         self._take(replace(log, frames=tuple(_most_likely(frame, self.keep) for frame in log.frames)))
 
@@ -141,19 +147,19 @@ class VisionQuery:
         self._take(before.detections)
 
     def see(self, stamp_ns: int, frame: DetectionFrame) -> None:
-        """Take what a running detector found in an image; one less than 16 ms after the last is left out.
+        """Take what a running detector found in an image; one less than 16 ms from another is left out.
 
         Parameters
         ----------
         stamp_ns : int
             When the image was taken by the stamps of the camera, nanoseconds.
         frame : DetectionFrame
-            All of its boxes.
+            All of its boxes; those that reach beyond the image are cut at its border.
 
         Raises
         ------
         InputFileError
-            If a box lies outside the image.
+            If all boxes lie outside the image: they come from another camera.
 
         Examples
         --------
@@ -163,14 +169,23 @@ class VisionQuery:
         >>> type(query.ask(nanoseconds(1.0), Bearing(0.0, 0.05))).__name__
         'Absent'
         """
-        before, taken_ns = self.detections, stamp_ns + nanoseconds(self.camera.stamp_offset_s)
-        _check_size(self.camera, DetectionLog((frame,), np.array([taken_ns]), before.source))
-        if len(before) and taken_ns < before.stamps_ns[-1] + LEAST_APART_NS:
+        before, taken_ns = self.detections, self.taken_ns(stamp_ns)
+        found, cut, outside = frame.cut(_size_px(self.camera))
+        if outside and not len(found):
+            raise InputFileError(before.source, _other_size(self.camera, frame))
+        self.cut, self.outside = self.cut + cut, self.outside + outside
+        # A look that comes late is put in its place: one that is stamped ahead keeps no other out.
+        at = int(np.searchsorted(before.stamps_ns, taken_ns))
+        if (np.abs(before.stamps_ns[max(at - 1, 0) : at + 1] - taken_ns) < LEAST_APART_NS).any():
             return
         self._asked = True
-        frames = (*before.frames, _most_likely(frame, self.keep))[-REMEMBERED:]
-        stamps_ns = np.append(before.stamps_ns, taken_ns)[-REMEMBERED:]
+        frames = (*before.frames[:at], _most_likely(found, self.keep), *before.frames[at:])[-REMEMBERED:]
+        stamps_ns = np.insert(before.stamps_ns, at, taken_ns)[-REMEMBERED:]
         self._take(DetectionLog(frames, stamps_ns, before.source))
+
+    def taken_ns(self, stamp_ns: int) -> int:
+        """Return when an image was taken, on the clock of the sound, from its stamp by the camera's clock."""
+        return stamp_ns + nanoseconds(self.camera.stamp_offset_s)
 
     def ask(
         self,
@@ -332,16 +347,44 @@ def _most_likely(frame: DetectionFrame, keep: DetectionFilter) -> DetectionFrame
     return replace(frame, boxes_px=frame.boxes_px[likeliest], scores=frame.scores[likeliest], labels=labels)
 
 
-def _check_size(camera: PinholeCamera, log: DetectionLog) -> None:
-    size = np.array([camera.width_px, camera.height_px])
-    for number, frame in enumerate(log.frames):
-        corners = frame.boxes_px.reshape(-1, 2)
-        outside = ((corners < -BORDER_PX) | (corners > size + BORDER_PX)).any(axis=1)
-        if outside.any():
-            x, y = corners[outside][0]
-            image = f"the camera's {camera.width_px} x {camera.height_px} px"
-            problem = f"frame {number}: expected boxes within {image}, got a corner at ({x:g}, {y:g})"
-            raise InputFileError(log.source, problem)
+def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
+    """Return a log with its boxes cut at the border of the images; those outside are left out and counted.
+
+    An image of which all boxes lie outside counts as not looked at.
+    """
+    parts = [frame.cut(_size_px(camera)) for frame in log.frames]
+    cut, outside = sum(part[1] for part in parts), sum(part[2] for part in parts)
+    if not cut + outside:
+        return log
+    beyond_px = np.concatenate([_beyond_px(camera, frame) for frame in log.frames])
+    few = len(beyond_px) < _FEW_BOXES
+    mostly = not few and np.median(beyond_px) > BORDER_PX and beyond_px.max() > _FAR_BEYOND * camera.width_px
+    if mostly or outside > max(_MOST_OUTSIDE * len(beyond_px), 1.0):
+        number = next(i for i, part in enumerate(parts) if part[1] + part[2])
+        raise InputFileError(log.source, f"frame {number}: {_other_size(camera, log.frames[number])}")
+    told = "%s: %d boxes reach beyond the image and are cut at its border, %d lie outside and are left out"
+    _LOG.warning(told, log.source, cut, outside)
+    kept = [i for i, (frame, _, out) in enumerate(parts) if len(frame) or not out]
+    return replace(log, frames=tuple(parts[i][0] for i in kept), stamps_ns=log.stamps_ns[kept])
+
+
+def _size_px(camera: PinholeCamera) -> tuple[int, int]:
+    return camera.width_px, camera.height_px
+
+
+def _beyond_px(camera: PinholeCamera, frame: DetectionFrame) -> FloatArray:
+    """Return by how much each box reaches beyond the image, shape (n,); below 0 within."""
+    corners = frame.boxes_px.reshape(-1, 2, 2)
+    return np.asarray(np.maximum(corners - _size_px(camera), -corners).max(axis=(1, 2)))
+
+
+def _other_size(camera: PinholeCamera, frame: DetectionFrame) -> str:
+    """Return what is wrong with boxes outside the images of a camera."""
+    box = frame.boxes_px[_beyond_px(camera, frame).argmax()]
+    corners = box.reshape(2, 2)
+    x, y = corners[np.maximum(corners - _size_px(camera), -corners).max(axis=1).argmax()]
+    image = f"the camera's {camera.width_px} x {camera.height_px} px"
+    return f"expected boxes within {image}, got a corner at ({x:g}, {y:g})"
 
 
 _NARROWEST_RAD = 1e-9  # Of a part of a sector: thinner ones are rounding

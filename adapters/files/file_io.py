@@ -7,7 +7,9 @@ points to is replaced, and the link stays. Devices, pipes and folders are never 
 
 import csv
 import io
+import itertools
 import json
+import logging
 import math
 import os
 import shutil
@@ -23,6 +25,8 @@ import numpy as np
 
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.serialisation import decode, decode_json
+
+_LOG = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -267,7 +271,11 @@ def refused_as_file(path: object, where: str = "") -> Iterator[None]:
 
 
 def read_rows(
-    path: Path, columns: Collection[str], optional: Collection[str] = ()
+    path: Path,
+    columns: Collection[str],
+    optional: Collection[str] = (),
+    most_bytes: int = MAX_BYTES,
+    most_rows: int = MAX_ROWS,
 ) -> Iterator[tuple[int, dict[str, str]]]:
     r"""Yield the wanted columns of a CSV file with a header, and the optional ones that it has, by line.
 
@@ -279,17 +287,21 @@ def read_rows(
     ...     list(read_rows(Path(folder) / "list.csv", ["ID"]))
     [(2, {'ID': '1_00_0002'})]
     """
-    reader = csv.reader(io.StringIO(read_text(path, "a CSV file", MAX_BYTES), newline=""))
+    # Decoded as it is read: `StringIO` takes four bytes a character.
+    data = io.BytesIO(read_bytes(path, "a CSV file", most_bytes))
+    reader = csv.reader(io.TextIOWrapper(data, encoding="utf-8-sig", newline=""))
     try:
         places = _places(path, next(reader, []), columns, optional)
         for number, cells in enumerate(filter(None, reader)):
-            if number >= MAX_ROWS:
-                raise InputFileError(path, f"expected at most {MAX_ROWS} lines")
+            if number >= most_rows:
+                raise InputFileError(path, f"expected at most {most_rows} lines")
             row = {name: cells[at].strip() if at < len(cells) else "" for name, at in places.items()}
             if max(map(len, row.values())) > MAX_CELL:
                 problem = f"expected at most {MAX_CELL} characters between two commas"
                 raise InputFileError(path, f"line {reader.line_num}: {problem}")
             yield reader.line_num, row
+    except UnicodeDecodeError as error:
+        raise InputFileError(path, "expected a CSV file in UTF-8") from error
     except csv.Error as error:
         raise InputFileError(path, f"line {reader.line_num}: expected CSV: {error}") from error
 
@@ -317,6 +329,22 @@ def _places(
         problem = f"expected columns {', '.join(columns)}, missing {', '.join(missing)}"
         raise InputFileError(path, problem)
     return {name: header.index(name) for name in (*columns, *optional) if name in header}
+
+
+def in_order(stamps_ns: Sequence[int], source: str) -> list[int]:
+    """Return the places of increasing stamps, of equal ones the last; a warning counts what was not so.
+
+    Examples
+    --------
+    >>> in_order([0, 200, 100, 200], "camera")
+    [0, 2, 3]
+    """
+    last = {stamp_ns: place for place, stamp_ns in enumerate(stamps_ns)}
+    late = sum(b < a for a, b in itertools.pairwise(stamps_ns))
+    if late or len(last) < len(stamps_ns):
+        told = "%s: %d stamps came after later ones and are sorted, %d came again, of which the last counts"
+        _LOG.warning(told, source, late, len(stamps_ns) - len(last))
+    return [last[stamp_ns] for stamp_ns in sorted(last)]
 
 
 Result = TypeVar("Result")

@@ -1,17 +1,21 @@
 """Odometry of a drive, from CSV."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 from worldstate.ground import InvalidArgumentError, nanoseconds
+from worldstate.ground.checks import check_ranges
 from worldstate.ground.serialisation import ADDED
-from worldstate.measurement.odometry import EgoPose, Odometry
+from worldstate.measurement.odometry import FARTHEST_M, EgoPose, Odometry
 
-from .file_io import number, read_rows, refused_as_file
+from .file_io import in_order, number, read_rows, refused_as_file
 
 # Odometry of a standing vehicle scatters by some centimetres a second.
 STANDING_MPS = 0.2
+# Three hours at 100 Hz, with a pose.
+MAX_BYTES, MAX_ROWS = 128 << 20, 1_080_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,11 @@ class OdometryLog:
         stamps = [one.stamp_ns for one in self.told]
         if not stamps or any(b <= a for a, b in pairwise(stamps)):
             raise InvalidArgumentError("odometry: expected at least one line, at increasing times")
+
+    @classmethod
+    def in_order(cls, told: Sequence[Odometry], source: str) -> "OdometryLog":
+        """Sort by stamps; of several with one stamp the last counts, and a warning counts them."""
+        return cls(tuple(told[i] for i in in_order([one.stamp_ns for one in told], source)))
 
     @property
     def moves(self) -> bool:
@@ -56,16 +65,19 @@ class OdometryRecord:
             return None
         if self.x_m is None or self.y_m is None or self.yaw_rad is None:
             raise InvalidArgumentError("odometry: expected x_m, y_m and yaw_rad together")
+        check_ranges(self, x_m=(-FARTHEST_M, FARTHEST_M), y_m=(-FARTHEST_M, FARTHEST_M))
         return EgoPose((self.x_m, self.y_m), self.yaw_rad)
 
 
 def read_odometry(path: Path | str) -> OdometryLog:
     r"""Read CSV: time_s, speed_mps; optional yaw_rate_rad_s, and x_m, y_m, yaw_rad in the map.
 
+    Lines are sorted by their times; of several with one time the last counts. An optional cell may be empty.
+
     Raises
     ------
     InputFileError
-        If columns are missing, a number is none or out of range, or the times do not increase.
+        If columns are missing, or a number is none or out of range; the message names the line.
 
     Examples
     --------
@@ -76,10 +88,12 @@ def read_odometry(path: Path | str) -> OdometryLog:
     0.1
     """
     name, told = Path(path), []
-    for line, row in read_rows(name, ("time_s", "speed_mps"), ("yaw_rate_rad_s", "x_m", "y_m", "yaw_rad")):
-        known = {column: number(name, line, row, column) for column in row}
+    optional = "yaw_rate_rad_s", "x_m", "y_m", "yaw_rad"
+    for line, row in read_rows(name, ("time_s", "speed_mps"), optional, MAX_BYTES, MAX_ROWS):
+        given = (column for column in row if row[column] or column not in optional)
+        known = {column: number(name, line, row, column) for column in given}
         with refused_as_file(name, f"line {line}: "):
             stamp_ns = nanoseconds(known.pop("time_s"))
             told.append(OdometryRecord(**known).at(stamp_ns))
     with refused_as_file(name):
-        return OdometryLog(tuple(told))
+        return OdometryLog.in_order(told, str(name))

@@ -1,5 +1,6 @@
 """The sensors of a vehicle in one file: its array, its cameras and what they reported, odometry, model."""
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,7 @@ from worldstate.ground.serialisation import ADDED
 
 # No vehicle carries a sensor farther from its origin; such a number was written in millimetres.
 MAX_OFFSET_M = 30.0
+MOST_TURNS_DEG = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +51,9 @@ class Mounting:
     def __post_init__(self) -> None:
         for axis, value in zip("xyz", self.position_m, strict=True):
             in_range(f"position_m.{axis}", value, -MAX_OFFSET_M, MAX_OFFSET_M)
-        in_range("yaw_deg", self.yaw_deg, -180.0, 180.0)
         in_range("pitch_deg", self.pitch_deg, -90.0, 90.0)
-        in_range("roll_deg", self.roll_deg, -180.0, 180.0)
+        for name in ("yaw_deg", "roll_deg"):  # which go round
+            in_range(name, getattr(self, name), -MOST_TURNS_DEG, MOST_TURNS_DEG)
 
     @property
     def rotation(self) -> FloatArray:
@@ -286,6 +288,8 @@ def _setup(record: CameraRecord, folder: Path) -> CameraSetup:
     if (rate_hz := record.image_rate_hz) is not None:
         in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True)
     detections, rates = (_beside(folder, file) for file in (record.detections, record.miss_rates))
+    in_range("camera.min_box_px", record.min_box_px, 0.0, math.inf)
+    in_range("camera.min_score", record.min_score, 0.0, 1.0)
     boxes = DetectionFilter(frozenset(record.classes), record.min_score, record.min_box_px)
     return CameraSetup(detections, rate_hz, rates, boxes, record.labels)
 

@@ -222,7 +222,7 @@ def test_several_cameras_are_asked_and_a_box_outside_an_image_is_refused(street,
     car.write_text(json.dumps({"array": {"positions_m": positions_m}, "cameras": cameras}))
     ports = [free_port(), free_port()]
     empty = json.dumps({"boxes": [], "scores": [], "classes_str": []}).encode()
-    outside = {"boxes": [[600, 100, 700, 300]], "scores": [0.9], "classes_str": ["car"]}
+    outside = {"boxes": [[5000, 100, 5120, 300]], "scores": [0.9], "classes_str": ["car"]}
     told = [word for name, port in zip(("front", "aside"), ports, strict=True)
             for word in ("--detections", f"{name}=127.0.0.1:{port}")]  # fmt: skip
     words = ["live", "--play", street / "street.wav", "--car", car, "--uncalibrated", *told, "--out", states]

@@ -103,9 +103,9 @@ def changed(part: str, **keys: object) -> object:
         (changed("front", name=None), r"car.cameras\[0\].name: expected one of its own"),
         (changed("front", fx=500.0), r"car.cameras\[0\]: expected either horizontal_fov_deg or fx"),
         (changed("front", fov=60.0), r"car.cameras\[0\]: expected keys among .*, got \['fov'\]"),
-        (changed("front", stamp_offset_s=40.0), r"car.cameras\[0\]: stamp_offset_s: .* got 40.0"),
+        (changed("front", stamp_offset_s=1e10), r"car.cameras\[0\]: stamp_offset_s: .* got 1"),
         (changed("front", position_m=None), r"car.cameras\[0\]: .*position_m: expected where it stands"),
-        (changed("front", roll_deg=90.0), r"car.cameras\[0\]: roll_rad: expected a number in"),
+        (changed("front", roll_deg=90.0), r"car.cameras\[0\]: camera.roll_deg: expected a number in \(-90"),
     ],
 )
 def test_every_wrong_field_is_named(tmp_path, car, said):

@@ -3,10 +3,11 @@
 import math
 from dataclasses import dataclass
 
-from worldstate.ground import integer_ns, named
+from worldstate.ground import integer_ns, named, wrap_angle
 from worldstate.ground.checks import check_fields, pair
 
-_FARTHEST_M = 1e6
+FARTHEST_M = 1e8  # UTM's northings go up to 1e7
+_MOST_TURNS_RAD = 1e6  # Of a localiser that counts on
 _ABOVE_ZERO = math.ulp(0.0)
 _RANGES = {
     "speed_mps": (-100.0, 100.0),
@@ -25,7 +26,7 @@ class EgoPose:
     position_m : (float, float)
         Of `base_link`, m.
     yaw_rad : float
-        Its x axis, counter-clockwise from that of the map.
+        Its x axis, counter-clockwise from that of the map; wrapped into (-pi, pi] where it is beyond.
     position_std_m, yaw_std_rad : float
         Standard deviations, of the position along either axis.
 
@@ -41,8 +42,10 @@ class EgoPose:
     yaw_std_rad: float = 0.01
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position_m", pair("position_m", self.position_m, _FARTHEST_M))
-        check_fields(self, yaw_rad=(-math.pi, math.pi))
+        object.__setattr__(self, "position_m", pair("position_m", self.position_m, FARTHEST_M))
+        check_fields(self, yaw_rad=(-_MOST_TURNS_RAD, _MOST_TURNS_RAD))
+        if abs(self.yaw_rad) > math.pi:
+            object.__setattr__(self, "yaw_rad", wrap_angle(self.yaw_rad))
         check_fields(self, position_std_m=(_ABOVE_ZERO, 1e3), yaw_std_rad=(_ABOVE_ZERO, math.pi))
 
 

@@ -32,7 +32,8 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     file ends in) counts from 0, MOTChallenge's from 1, at the first sample of the sound, ten a second;
     classes have COCO's numbers (car is 3) and YOLO's (car is 2), and MOTChallenge's boxes are cars. Up to
     the last image with a box, one that lists nothing was searched in vain; of later ones --images tells,
-    or the "images" of a COCO object {"images": [{"id": 0}, ...], "annotations": [results]}.
+    or the "images" of a COCO object {"images": [{"id": 0}, ...], "annotations": [results]}. Another rate than
+    ten a second is stated by --image-rate, or by "image_rate_hz" of the camera.
     """
     add_array_options(parser)
     add_car_option(parser)
@@ -42,6 +43,8 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--detections", type=Path, action="append", default=[], metavar="PATH", help=told)
     told = "the detector looked at so many images, those without a box included (COCO results, text)"
     group.add_argument("--images", type=int, metavar="N", help=told)
+    told = "images a second of --detections, where they carry no stamp (default: of the camera, else 10)"
+    group.add_argument("--image-rate", type=float, metavar="HZ", help=told)
     add_lens_options(parser, group)
 
 
@@ -99,8 +102,10 @@ class GivenSensors:
 
     def __post_init__(self) -> None:
         boxes = self.arguments.detections or self.setup.detections
-        if getattr(self.arguments, "images", None) is not None and (not boxes or self.several()):
-            raise InvalidArgumentError("--images: expected --detections with it, of one camera")
+        for option in ("images", "image_rate"):
+            if getattr(self.arguments, option, None) is not None and (not boxes or self.several()):
+                name = option.replace("_", "-")
+                raise InvalidArgumentError(f"--{name}: expected --detections with it, of one camera")
 
     @property
     def model(self) -> Path | None:
@@ -153,9 +158,11 @@ class GivenSensors:
         """Return what the one camera that is asked reported, read where its images do not come at 10 Hz."""
         given, n_images = self.arguments.detections, self.arguments.images
         path = given[0] if given else self.setup.detections
-        if path is None or (n_images or self.setup.image_rate_hz) is None:
+        stated_hz = self.arguments.image_rate
+        rate_hz = self.setup.image_rate_hz if stated_hz is None else stated_hz
+        if path is None or (n_images, rate_hz) == (None, None):
             return path
-        lens, rate_hz = self.camera or adapters.PinholeCamera.ovad(), self.setup.image_rate_hz or 10.0
+        lens = self.camera or adapters.PinholeCamera.ovad()
         return adapters.read_any_detections(path, rate_hz, (lens.width_px, lens.height_px), n_images)
 
 

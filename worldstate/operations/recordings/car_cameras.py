@@ -46,10 +46,10 @@ def _channel(
 ) -> VisionQuery:
     if isinstance(reported, Path):
         size_px = (camera.width_px, camera.height_px)
-        reported = read_any_detections(reported, setup.image_rate_hz or 10.0, size_px)
+        reported = read_any_detections(reported, setup.image_rate_hz, size_px)
     rates = source.miss_rates if setup.miss_rates is None else load_miss_rates(setup.miss_rates)
     told = setup.boxes != DetectionFilter()
     settings = replace(source.settings, boxes=setup.boxes) if told else source.settings
-    log = reported.shifted(camera.stamp_offset_s)
+    log = reported.on_clock(source.start_ns, camera.stamp_offset_s)
     asked = replace(source, camera=camera, detections=log, miss_rates=rates, settings=settings)
     return asked.camera_channel()

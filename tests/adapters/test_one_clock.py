@@ -1,0 +1,299 @@
+"""What was recorded beside the sound is on its clock, or is refused with the way on."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate import Listener
+from worldstate.abduction.co_evidence import Absent
+from worldstate.adapters import ListenSettings, PinholeCamera, Source, open_source
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_any_detections
+from worldstate.adapters.files.odometry_file import OdometryLog, read_odometry
+from worldstate.adapters.listener import listened
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.values import nanoseconds, seconds
+from worldstate.measurement import Bearing, Odometry
+
+ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
+ANYTHING, LENGTH_S = ListenSettings(uncalibrated=True), 20.0
+NONE = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+BOX = {"boxes": [[100.0, 200.0, 300.0, 400.0]], "scores": [0.9], "classes_str": ["car"]}
+EMPTY = {"boxes": [], "scores": [], "classes_str": []}
+STARTS_S = (0.0, 60.0, 1.7e9)
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sound") / "noise.wav"
+    noise = np.random.default_rng(0).uniform(-0.01, 0.01, (round(8000 * LENGTH_S), 3))
+    soundfile.write(path, noise, 8000)
+    return path
+
+
+def heard(sound: Path, start_s: float = 0.0, offset_s: float = 0.0, **beside: object) -> Source:
+    """Return a source whose clocks were checked."""
+    camera = PinholeCamera.ovad(stamp_offset_s=offset_s)
+    source = open_source(sound, array=ARRAY, settings=ANYTHING, camera=camera, start_s=start_s, **beside)  # type: ignore[arg-type]
+    next(listened(source))
+    return source
+
+
+@pytest.mark.parametrize("start_s", STARTS_S)
+def test_images_without_stamps_count_from_the_first_sample(sound: Path, start_s: float) -> None:
+    log = DetectionLog.at_rate([NONE] * 200, 10.0)
+    query = heard(sound, start_s, detections=log).camera_channel()
+    for at_s in (0.0, 7.0, 19.95):
+        assert isinstance(query.ask(nanoseconds(start_s + at_s), Bearing(0.0, 0.05)), Absent)
+
+
+# Of clocks by which one sensor was stamped and not the other: epoch, TAI, GPS, an hour, a day, a minute.
+OFF_S = (1.7e9, 37.0, -37.0, 18.0, 19.0, 3600.0, -86_400.0, 60.0)
+
+
+@pytest.mark.parametrize("off_s", OFF_S)
+@pytest.mark.parametrize("start_s", STARTS_S)
+def test_stamps_on_another_clock_are_refused_and_the_offset_brings_them_back(
+    sound: Path, off_s: float, start_s: float
+) -> None:
+    stamps = np.array([nanoseconds(start_s + off_s + 0.1 * i) for i in range(200)])
+    log = DetectionLog((NONE,) * 200, stamps, "boxes.json")
+    with pytest.raises(InputFileError, match=r"boxes\.json: .*\"stamp_offset_s\": ") as refused:
+        heard(sound, start_s, detections=log)
+    named = float(str(refused.value).split('"stamp_offset_s": ')[1].split()[0])
+    assert named == pytest.approx(-off_s, abs=0.1)
+    assert len(heard(sound, start_s, offset_s=named, detections=log).detections or ()) == 200
+
+
+@pytest.mark.parametrize("off_s", OFF_S)
+def test_odometry_on_another_clock_is_refused(sound: Path, off_s: float) -> None:
+    told = tuple(Odometry("wheels", nanoseconds(off_s + 0.1 * i), 0.1) for i in range(201))
+    with pytest.raises(InputFileError, match=r"wheels: expected stamps on the clock of the sound.*--start"):
+        heard(sound, ego=OdometryLog(told))
+    if off_s > 0.0:
+        heard(sound, off_s, ego=OdometryLog(told))
+
+
+def test_what_overlaps_is_taken_as_it_is(sound: Path) -> None:
+    """A camera that was switched on later, ran longer, or both, is no clock of its own."""
+    for first_s, last_s in ((5.0, 25.0), (-30.0, 60.0), (19.0, 400.0), (-37.0, 57.0), (3.0, 4.0)):
+        stamps = np.array([nanoseconds(s) for s in np.arange(first_s, last_s, 0.1)])
+        log = DetectionLog((NONE,) * len(stamps), stamps)
+        assert heard(sound, detections=log).detections is not None
+    for told in ((Odometry("wheels", 0, 0.1),), ()):
+        heard(sound, others=[told.__iter__])
+
+
+def ovad_json(folder: Path, images: int) -> Path:
+    frames = [BOX if 60 <= i < 70 else EMPTY for i in range(images)]
+    (folder / "ovad.json").write_text(json.dumps({"detections_per_frame": frames}))
+    return folder / "ovad.json"
+
+
+def coco_json(folder: Path, images: int) -> Path:
+    listed = [{"id": i} for i in range(images)]
+    boxes = [{"image_id": i, "category_id": 3, "bbox": [100, 200, 200, 200], "score": 0.9} for i in range(9)]
+    (folder / "coco.json").write_text(json.dumps({"images": listed, "annotations": boxes}))
+    return folder / "coco.json"
+
+
+def yolo_text(folder: Path, images: int) -> Path:
+    (folder / "yolo").mkdir()
+    for i in range(images):
+        (folder / "yolo" / f"street_{i:06d}.txt").write_text("2 0.5 0.5 0.1 0.2 0.9\n" if i == 9 else "")
+    return folder / "yolo"
+
+
+def mot_text(folder: Path, images: int) -> Path:
+    rows = (f"{i},-1,100,200,200,200,0.9,-1,-1,-1\n" for i in (1, 2, images))
+    (folder / "mot.txt").write_text("".join(rows))
+    return folder / "mot.txt"
+
+
+@pytest.mark.parametrize("written", [ovad_json, coco_json, yolo_text, mot_text])
+@pytest.mark.parametrize("rate_hz", [12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 60.0, 7.5, 5.0, 1.0])
+def test_a_rate_that_nobody_stated_has_to_fit_the_sound(
+    sound: Path, tmp_path: Path, written: Callable[[Path, int], Path], rate_hz: float
+) -> None:
+    images = round(rate_hz * LENGTH_S)
+    path = written(tmp_path, images)
+    if written is mot_text and rate_hz < 10.0:
+        heard(sound, detections=path)  # Lines do not end with the images
+        return
+    with pytest.raises(InputFileError, match="--image-rate, image_rate_hz"):
+        heard(sound, detections=path)
+    log = read_any_detections(path, rate_hz, (1936, 1216))
+    last_s = seconds(int((heard(sound, detections=log).detections or log).stamps_ns[-1]))
+    assert last_s == pytest.approx(LENGTH_S, abs=1.01 / rate_hz)
+
+
+@pytest.mark.parametrize("written", [ovad_json, coco_json, yolo_text, mot_text])
+@pytest.mark.parametrize("images", [190, 200, 205, 130])
+def test_ten_a_second_and_a_camera_that_stopped_earlier_are_read(
+    sound: Path, tmp_path: Path, written: Callable[[Path, int], Path], images: int
+) -> None:
+    assert len(heard(sound, detections=written(tmp_path, images)).detections or ()) == images
+
+
+def test_the_rate_is_an_option_and_a_key_of_the_camera(tmp_path: Path) -> None:
+    from worldstate.cli.common.sensors import given_sensors
+    from worldstate.cli.main import PROGRAM
+
+    path = str(ovad_json(tmp_path, 60))
+    lens = {"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68, "position_m": [0, 0, 0]}
+    (tmp_path / "c.json").write_text(json.dumps(lens | {"image_rate_hz": 15}))
+
+    def read(*more: str) -> tuple[float | None, bool]:
+        words = ["run", "a.wav", "--detections", path, *more]
+        log = given_sensors(PROGRAM.parser("run").parse_args(words[1:])).detections()
+        log = log if isinstance(log, DetectionLog) else read_any_detections(str(log))
+        return log.counted_hz, log.assumed
+
+    assert read() == (10.0, True)
+    assert read("--image-rate", "10") == (10.0, False)
+    assert read("--camera", str(tmp_path / "c.json")) == (15.0, False)
+    assert read("--camera", str(tmp_path / "c.json"), "--image-rate", "30") == (30.0, False)
+
+
+# Names of label files as exporters write them, each with the tenths of a second at which the images were
+# taken, None for names that state no order.
+NAMES: dict[str, tuple[Sequence[str], Sequence[int] | None]] = {
+    "one name and a number": (("street_0", "street_1", "street_3"), (0, 1, 2, 3)),
+    "numbers alone": (("000000", "000001", "000002"), (0, 1, 2)),
+    "without leading zeros": (("f8", "f9", "f10"), range(11)),
+    "Roboflow": ([f"cam_000{i}_jpg.rf.{n}" for i, n in ((1, "4f1e77"), (2, "08c5"), (3, "1"))], (0, 1, 2)),
+    "Roboflow, of a part": ([f"cam_{i:04d}_png.rf.{n}" for i, n in ((3, "4f1e"), (5, "08c5"))], (3, 5)),
+    "hashes": (("4f1e77aa0b3c", "08c5d2219e71"), None),
+    "two cameras": (("left_0001", "right_0001"), None),
+    "dates": (("2024-05-01_10-00-00", "2024-05-01_10-00-01", "2024-05-01_10-01-00"), None),
+    "nanoseconds": (("1700000000000000000", "1700000000100000000"), None),
+    "milliseconds of the epoch": (("1700000000000", "1700000000100", "1700000000200"), None),
+    "seconds and milliseconds": (("1700000000.100", "1700000000.200", "1700000000.300"), None),
+    "milliseconds": (("000000", "000100", "000200"), None),
+    "every third": (("frame_0", "frame_3", "frame_6", "frame_9"), None),
+    "no number": (("first", "second"), None),
+    "one number twice": (("a_01", "a_1"), None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_labels_are_numbers_only_where_they_form_a_sequence(tmp_path: Path, name: str) -> None:
+    names, expected = NAMES[name]
+    for one in names:
+        (tmp_path / f"{one}.txt").write_text("2 0.5 0.5 0.1 0.2 0.9\n")
+    if expected is None:
+        with pytest.raises(InputFileError, match=r"--image-rate|file_name|stamp_ns"):
+            read_any_detections(tmp_path, size_px=(640, 480))
+        return
+    log = read_any_detections(tmp_path, size_px=(640, 480))
+    assert [stamp // 10**8 for stamp in log.stamps_ns.tolist()] == [*expected]
+    assert sum(map(len, log.frames)) == len(names)
+
+
+def test_every_so_many_th_image_exists_where_the_rate_is_stated(tmp_path: Path) -> None:
+    for i in (0, 3, 9, 12):
+        (tmp_path / f"frame_{i}.txt").write_text("2 0.5 0.5 0.1 0.2 0.9\n")
+    log = read_any_detections(tmp_path, 30.0, (640, 480))
+    assert [len(frame) for frame in log.frames] == [1, 1, 0, 1, 1]
+    assert log.stamps_ns.tolist() == [0, 100_000_000, 200_000_000, 300_000_000, 400_000_000]
+
+
+def test_a_folder_with_empty_files_has_a_file_for_every_image(tmp_path: Path) -> None:
+    for i, text in enumerate(("2 0.5 0.5 0.1 0.2 0.9\n", "", "", "2 0.5 0.5 0.1 0.2 0.9\n")):
+        (tmp_path / f"frame_{i * i:02d}.txt").write_text(text)
+    log = read_any_detections(tmp_path, size_px=(640, 480))
+    assert (log.stamps_ns // 10**8).tolist() == [0, 1, 4, 9]
+
+
+FRAMES = [f"frame_{i:04d}.jpg" for i in range(20)]
+# Ids and file names of a list of images, and the tenths of a second at which these were taken.
+LISTED: dict[str, tuple[Sequence[int], Sequence[str | None], Sequence[int]]] = {
+    "from 0": (range(4), [None] * 4, range(4)),
+    "from 0, some": ((0, 2, 3), [None] * 3, (0, 2, 3)),
+    "from 1": (range(1, 5), [None] * 4, range(4)),
+    "from 1, named": (range(1, 5), FRAMES[:4], range(4)),
+    "from 1, named from 1": (range(1, 5), FRAMES[1:5], range(4)),
+    "from 1, listed backwards": (range(1, 5), FRAMES[3::-1], (3, 2, 1, 0)),
+    "arbitrary": ((4711, 13, 99, 500_000), FRAMES[:4], range(4)),
+    "arbitrary, in another order": ((1, 700, 3), [FRAMES[2], FRAMES[0], FRAMES[1]], (2, 0, 1)),
+    "arbitrary, cut from a longer video": ((7, 9, 8), FRAMES[10:13], range(3)),
+    "arbitrary, some of a video": ((7, 9, 8), (FRAMES[0], FRAMES[4], FRAMES[9]), (0, 4, 9)),
+    "named by times": ((3, 2, 1), ("1700000000.jpg", "1700000012.jpg", "1700000025.jpg"), range(3)),
+    "Roboflow": ((5, 6), ("a_0002_jpg.rf.ff.jpg", "a_0001_jpg.rf.0e.jpg"), (1, 0)),
+}
+
+
+@pytest.mark.parametrize("name", LISTED)
+def test_listed_images_stand_in_the_order_of_their_names(tmp_path: Path, name: str) -> None:
+    ids, names, expected = LISTED[name]
+    images = [{"id": i} | ({} if n is None else {"file_name": n}) for i, n in zip(ids, names, strict=True)]
+    # The left edge of a box tells to which image it belongs.
+    boxes = [
+        {"image_id": i, "category_id": 3, "bbox": [place, 0, 9, 9], "score": 0.9}
+        for place, i in enumerate(ids)
+    ]
+    (tmp_path / "coco.json").write_text(json.dumps({"images": images, "annotations": boxes}))
+    log = read_any_detections(tmp_path / "coco.json")
+    places = [int(frame.boxes_px[0, 0]) for frame in log.frames]
+    taken = dict(zip(places, (log.stamps_ns // 10**8).tolist(), strict=True))
+    assert [taken[place] for place in range(len(ids))] == [*expected]
+
+
+def test_boxes_without_scores_count_with_one_and_that_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    box = {"image_id": 0, "category_id": 3, "bbox": [0, 0, 9, 9]}
+    (tmp_path / "c.json").write_text(json.dumps([box, box | {"score": 0.25}, box | {"score": None}]))
+    assert read_any_detections(tmp_path / "c.json").frames[0].scores.tolist() == [1.0, 0.25, 1.0]
+    assert "2 boxes without a score count with 1.0" in caplog.text
+
+
+@given(stamps=st.lists(st.integers(0, 9), min_size=1, max_size=12))
+def test_images_and_odometry_are_sorted_and_of_one_stamp_the_last_counts(
+    stamps: list[int], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    frames = [
+        BOX | {"scores": [place / 100], "stamp_ns": stamp * 10**8} for place, stamp in enumerate(stamps)
+    ]
+    (folder / "d.json").write_text(json.dumps({"detections_per_frame": frames}))
+    lines = (f"{stamp / 10},{place}\n" for place, stamp in enumerate(stamps))
+    (folder / "o.csv").write_text("time_s,speed_mps\n" + "".join(lines))
+    last = {stamp: place for place, stamp in enumerate(stamps)}
+    log, told = read_any_detections(folder / "d.json"), read_odometry(folder / "o.csv").told
+    assert (log.stamps_ns // 10**8).tolist() == sorted(last) == [one.stamp_ns // 10**8 for one in told]
+    assert [round(100 * frame.scores[0]) for frame in log.frames] == [last[stamp] for stamp in sorted(last)]
+    assert [one.speed_mps for one in told] == [last[stamp] for stamp in sorted(last)]
+
+
+NOISE = np.random.default_rng(0).uniform(-0.01, 0.01, (4800, 56))
+
+
+@pytest.mark.parametrize("off_s", [1.7e9, 3600.0, 2.5, -2.5, -3600.0, 1.9, -1.9])
+def test_a_look_far_from_the_sound_is_refused_and_counted_and_the_camera_works_on(off_s: float) -> None:
+    listener = Listener(ovad_array(), 48_000)
+    for k in range(16):
+        if k == 12:
+            listener.look(nanoseconds(max(0.1 * k, 0.0) + off_s), NONE)
+            listener.add(Odometry("wheels", nanoseconds(0.1 * k + off_s), 0.0))
+        listener.look(nanoseconds(0.1 * k), NONE)
+        states = listener.push(NOISE)
+    state = states[-1]
+    assert state.delivery.refused == (2 if abs(off_s) > 2.0 else 0)
+    assert {one.sensor: one.condition for one in state.sensors}["camera"] == "working"
+    assert max(view.stamp_ns for view in state.searched) == nanoseconds(1.5)
+
+
+def test_the_sound_that_looks_are_held_against_starts_and_skips_as_stated() -> None:
+    listener = Listener(ovad_array(), 48_000, start_s=1000.0)
+    listener.push(NOISE)
+    listener.skip(nanoseconds(500.0))
+    for at_s in (1000.1, 1500.1):
+        listener.look(nanoseconds(at_s), NONE)
+    assert listener.world.state.delivery.refused == 1
