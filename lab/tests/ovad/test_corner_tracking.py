@@ -1,0 +1,249 @@
+"""What a user of tracks relies on at a corner: on made-up recordings, and on the real ones if they are there.
+
+OVAD_SEQUENCES names the folder of real ones, which else lies beside the repository; OVAD_ROOT names the whole
+data set in its own layout.
+"""
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_up_corner import write_corner
+from worldstate_lab.sequences.hearing import Chain, ovad_chain
+from worldstate_lab.sequences.recordings import TRUTH, read_recordings
+from worldstate_lab.sequences.tracking import NEAR_RAD, OC_SORT, WORLD, tracked, tracking_figures
+from worldstate_lab.trials.listening import LIKELY
+from worldstate_lab.trials.pass_cache import Hearer
+from worldstate_lab.trials.trial import find_takes
+
+from worldstate.adapters import read_array, read_model
+from worldstate.state import Entity
+
+SEQUENCES = Path(os.environ.get("OVAD_SEQUENCES") or Path(__file__).parents[4] / "shared" / "ovad-sequences")
+ROOT = os.environ.get("OVAD_ROOT")
+# Of GOSPA at 60 degrees: what one vehicle costs that no track stands for.
+MISS_DEG = 30.0
+
+
+def figures(found):
+    return tracking_figures(found, np.random.default_rng(0))
+
+
+def believed_s(chain, recording):
+    """Return when vehicles are believed hidden and when in view, seconds."""
+    found = {"hidden": [], "visible": [], "emerged": []}
+    for step in chain.steps(recording):
+        for one in step.state.entities:
+            if one.moving and one.existence_probability >= LIKELY:
+                found[one.status].append(step.state.stamp_ns * 1e-9)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Scripted(Chain):
+    """A chain whose vehicle in view has a name, and that believes in a hidden one before it, or in none."""
+
+    hidden: str | None = None
+
+    def steps(self, recording):
+        for step in Chain.steps(self, recording):
+            state = self.scripted(step.state, recording)
+            yield SimpleNamespace(frame=step.frame, measurement=step.measurement, state=state)
+
+    def scripted(self, state, recording):
+        if state.stamp_ns * 1e-9 > recording.t0_s - 0.05:
+            return replace(state, entities=tuple(replace(one, id="same") for one in state.entities))
+        ids, side, at_ns = [self.hidden] * (self.hidden is not None), recording.side, state.stamp_ns
+        hidden = (Entity(one, "hidden", 0.9, 0.9, 0.8, 0.3, at_ns, at_ns, direction=side) for one in ids)
+        return replace(state, entities=tuple(hidden))
+
+
+# Four vehicles of a second each in view, and two streets without one; at SB1 a car is parked.
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("corner") / "made-up"
+    return read_recordings(write_corner(folder, np.random.default_rng(0), approaches=4, hazard_free=2))
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return ovad_chain(read_model(None))
+
+
+@pytest.fixture(scope="module")
+def approaches(chain, recordings):
+    return [tracked(chain, one) for one in recordings if not one.hazard_free]
+
+
+def test_an_empty_street_has_no_vehicle_and_none_is_in_view_before_sight(chain, recordings):
+    for one in (recordings[1], recordings[-1], recordings[-2]):
+        found = believed_s(chain, one)
+        if one.hazard_free:
+            assert not any(found.values())
+        else:
+            assert found["visible"] and min(found["visible"]) > one.t0_s - 0.05
+
+
+def test_a_vehicle_in_view_is_an_entity_of_its_side_within_a_tenth_of_a_second(approaches):
+    for one in approaches:
+        assert one.delay_s < 0.15
+        assert one.side == one.recording.side
+
+
+def test_a_bearing_in_view_is_that_of_the_vehicle_and_no_camera_enters_it(chain, approaches):
+    found = figures(approaches)["tracking"]["bearing"]["all"]
+    # The vehicle moves by 3 degrees from an image to the next one.
+    assert found["median_deg"] < 3.0
+    assert found["nees_mean"] < 1.0
+    assert min(found["images_later_s"].items(), key=lambda one: one[1])[0] in ("0", "0.1")
+    recording = approaches[0].recording
+    pairs = zip(chain.steps(recording), replace(chain, boxes=None).steps(recording), strict=True)
+    assert all(seen.measurement.bearing == alone.measurement.bearing for seen, alone in pairs)
+
+
+def test_tracks_last_through_images_that_are_withheld(approaches):
+    found = figures(approaches)["tracking"]["gospa_deg"]["all"]
+    assert found[WORLD]["total"] < 0.2 * MISS_DEG
+    # It links boxes by their overlap, of which 0.2 s leave too little here.
+    assert found[WORLD]["total"] < found[OC_SORT]["total"] <= MISS_DEG + 1e-9
+
+
+def test_figures_are_ready_for_json_and_have_a_row_for_each_junction(approaches):
+    found = json.loads(json.dumps(figures(approaches), allow_nan=False))
+    assert found["hand_over_delay_s"] < 0.15
+    for name in ("identity", "bearing", "gospa_deg"):
+        assert set(found["tracking"][name]) == {"all", "SA1", "SB1"}
+
+
+@pytest.mark.parametrize(
+    ("hidden", "expected"), [("same", "kept"), ("other", "another"), (None, "none hidden")]
+)
+def test_identity_is_that_of_the_entity_that_was_hidden(chain, recordings, hidden, expected):
+    scripted = Scripted(chain.path, chain.model, chain.array, hidden=hidden)
+    assert tracked(scripted, recordings[0]).identity == expected
+
+
+@pytest.fixture(scope="module", params=["seven", "pair"])
+def real(request):
+    """The chain of one path, the real recordings, and the figures of the approaches among them."""
+    if not (SEQUENCES / TRUTH).is_file():
+        pytest.skip(f"no real recordings in {SEQUENCES.name}: set OVAD_SEQUENCES")
+    path = ovad_chain(read_model(None))
+    if request.param == "pair":
+        pair = SEQUENCES / "pair"
+        if not (pair / "model.json").is_file():
+            pytest.skip("no model for two microphones beside the recordings")
+        path = Chain("pair", read_model(pair / "model.json"), read_array(pair / "array.csv"))
+    every = read_recordings(SEQUENCES)
+    return path, every, figures([tracked(path, one) for one in every if not one.hazard_free])
+
+
+# Floors that a break falls below. Beside each stands what was measured on the 45: seven microphones, two.
+
+
+@pytest.mark.long
+def test_identity_is_kept_from_hidden_into_view(real):
+    found = real[2]["tracking"]["identity"]
+    # 10 and 9 of 23; the lower ends of the intervals are 0.23 and 0.20.
+    assert found["all"]["kept"] > 0.19
+    assert not found["all"]["no box"]
+
+
+@pytest.mark.long
+def test_vehicles_are_handed_over_at_once(real):
+    found = real[2]["tracking"]["hand_over"]
+    # All, at 0.0 s in the median and 0.1 s at the 90 % quantile, on both.
+    assert found["found"] > 0.85
+    assert found["median_s"] < 0.15 and found["late_s"] < 0.35
+
+
+@pytest.mark.long
+def test_the_side_of_a_vehicle_in_view_is_right(real):
+    assert real[2]["tracking"]["hand_over"]["right_side"] > 0.85  # All
+
+
+@pytest.mark.long
+def test_a_time_to_visible_holds_what_it_states(real):
+    found = real[2]["tracking"]["before_t0"]
+    assert found["stated"] > 0.3  # 13 and 10 of 23
+    assert found["time_error_s"] < 1.5  # 0.67, 0.91 s
+    assert found["time_coverage"] > 0.75  # 0.97 and 0.93, where 0.9 is stated
+
+
+@pytest.mark.long
+def test_acoustic_bearings_in_view_are_near_moving_boxes(real):
+    found = real[2]["tracking"]["bearing"]["all"]
+    # 11.6 and 6.4 degrees; 3.3 of the seven against images 0.5 s later: the rows of their spectra are early.
+    assert found["median_deg"] < 15.0
+    assert min(found["images_later_s"].values()) < 8.0
+    assert found["nees_mean"] < 3.0  # 1.3, 0.5
+
+
+@pytest.mark.long
+def test_tracks_beat_oc_sort_where_every_second_image_is_withheld(real):
+    found = real[2]["tracking"]["gospa_deg"]["all"]
+    assert found[WORLD]["total"] < min(found[OC_SORT]["total"], 20.0)  # 13.8 and 14.1; 21.8
+
+
+@pytest.mark.long
+def test_there_are_few_vehicles_where_none_is(real):
+    path, every, _ = real
+    calm = [one for one in every if one.hazard_free][::4]
+    found = [believed_s(path, one) for one in calm]
+    # Of the snapshots of all 22, 0.05 have one in view by the camera, 0.003 a hidden one.
+    assert np.sum([len(one["visible"]) for one in found]) < 0.2 * 90 * len(calm)
+    assert np.sum([len(one["hidden"]) for one in found]) < 0.05 * 90 * len(calm)
+
+
+@pytest.fixture(scope="module")
+def takes():
+    if ROOT is None:
+        pytest.skip("no data set in OVAD's own layout: set OVAD_ROOT")
+    return find_takes(Path(ROOT))
+
+
+@pytest.fixture(scope="module")
+def heard(takes, tmp_path_factory):
+    """The static approaches as the whole array hears them."""
+    hearing = Hearer(tmp_path_factory.mktemp("heard"))
+    return [hearing(one) for one in takes.static if not one.hazard_free]
+
+
+@pytest.mark.long
+def test_of_all_microphones_the_entity_in_view_was_there_before(heard):
+    warned = [one for one in heard if one.chains["filtered"].alarm[one.hops.before_sight()].any()]
+    assert warned
+    assert np.mean([_was_there_before(one) for one in warned]) > 0.2
+
+
+@pytest.mark.long
+def test_of_all_microphones_bearings_in_view_are_near_moving_boxes(heard):
+    errors = np.concatenate([one.hops.srp_rad - one.hops.reference_rad for one in heard])
+    assert np.degrees(np.nanmedian(np.abs(errors))) < 7.0  # The paper's is 3.4
+
+
+@pytest.mark.long
+def test_of_all_microphones_the_dynamic_list_is_heard_if_it_is_there(takes, tmp_path_factory):
+    if not takes.dynamic:
+        pytest.skip("no dynamic recordings in the data set: not run")
+    hearing = Hearer(tmp_path_factory.mktemp("dynamic"))
+    assert all(one.hops.about["moving"] and len(one.hops) for one in map(hearing, takes.dynamic))
+
+
+def _was_there_before(trial):
+    """Whether the track that is nearest to the vehicle, in most images of it, began before T0."""
+    tracks, nearest = trial.chains["filtered"].tracks, []
+    seen = trial.truth.in_view.astype(bool) & (trial.truth.vehicle == 0)
+    for time_s, azimuth_rad in zip(trial.truth.time_s[seen], trial.truth.azimuth_rad[seen], strict=True):
+        now = np.flatnonzero(np.abs(tracks.time_s - time_s) < 0.05)
+        apart = np.abs(tracks.azimuth_rad[now] - azimuth_rad)
+        if apart.min(initial=np.inf) < NEAR_RAD:
+            nearest.append(tracks.track[now[apart.argmin()]])
+    if not nearest:
+        return False
+    numbers, counts = np.unique(nearest, return_counts=True)
+    return bool(tracks.time_s[tracks.track == numbers[counts.argmax()]].min() < trial.t0_s - 0.05)
