@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -243,7 +244,7 @@ def mcap_file(path: Path, opener: FileOpener = whole_file) -> Iterator[LogSink]:
     """Lend a function that writes messages to an MCAP file.
 
     It takes its name when the block ends; of a `GrowingFile`, which has it before, a killed run loses half a
-    second.
+    second. One that could not be written ends with its last whole chunk: its index counts bytes.
     """
     check_extra("mcap")
     with opener(path) as file:
@@ -261,7 +262,6 @@ def mcap_file(path: Path, opener: FileOpener = whole_file) -> Iterator[LogSink]:
         try:
             yield write
         finally:
-            # Where there is no room the error that says so is on its way, or is raised here.
             messages.finish()
 
 
@@ -313,7 +313,7 @@ _LARGEST_RECORD = 1 << 28
 def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
     """Yield stamp, topic and text of messages of an MCAP file, in the order of their writing.
 
-    Of a file that was not finished those are read whose chunk is whole.
+    Of a file that was cut short, anywhere, those are read whose chunk is whole.
     """
     reader, cut_short = optional("mcap.reader").NonSeekingReader, optional("mcap.exceptions").EndOfFile
     check_chunks(path)
@@ -331,8 +331,18 @@ def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
         except (
             Exception
         ) as error:  # zstandard, lz4 and struct each have errors of their own for damaged bytes
-            if not (found and isinstance(error, cut_short)):
-                raise InputFileError(path, f"expected an MCAP file of snapshots ({error})") from error
+            if not (found and isinstance(error, (cut_short, struct.error)) and _is_cut(path)):
+                said = str(error) or "it ends before its first whole chunk"
+                raise InputFileError(path, f"expected an MCAP file of snapshots ({said})") from error
+
+
+def _is_cut(path: Path) -> bool:
+    """Return whether an MCAP file does not end as one, with its magic number behind the last record."""
+    with path.open("rb") as file:
+        magic = file.read(_MAGIC_BYTES)
+        while len(head := file.read(_RECORD.size)) == _RECORD.size:
+            file.seek(_RECORD.unpack(head)[1], os.SEEK_CUR)
+        return head != magic
 
 
 # Of an MCAP file: its magic number, the head of every record, and that of a chunk up to its compression.
@@ -367,7 +377,7 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
             begin = at
             kind, length = _RECORD.unpack(file.read(_RECORD.size))
             at += _RECORD.size + length
-            if kind == _INDEX and _INDEX_HEAD.size < length <= _LARGEST_RECORD:
+            if kind == _INDEX and _INDEX_HEAD.size < length <= _LARGEST_RECORD and at <= end:
                 index = file.read(length)
                 (first, last, place), sizes = _INDEX_HEAD.unpack_from(index), _INDEX_SIZES.unpack(index[-16:])
                 known, span = chunks.get(place, (None, ()))

@@ -316,8 +316,9 @@ def osi_trace(path: Path, crossing_m: float, opener: FileOpener) -> Iterator[Cal
     opened = _osi_mcap if many else _osi_lengths
     with opener(path) as file, opened(file) as write:
         yield lambda state: write(osi_sensor_data(state, crossing_m), next(states))
-    if many:
-        path.rename(path.with_name(_osi_name(path.name, next(states))))
+    with suppress(FileNotFoundError):  # a trace that grows may have been removed, which is logged
+        if many:
+            path.rename(path.with_name(_osi_name(path.name, next(states))))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import shutil
 import uuid
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TypeAlias, TypeVar, get_args, get_type_hints
@@ -25,6 +25,11 @@ import numpy as np
 
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.serialisation import decode, decode_json
+
+try:
+    import fcntl
+except ImportError:  # Windows, which lets no other program write to an open file anyway
+    fcntl = None  # type: ignore[assignment]
 
 _LOG = logging.getLogger(__name__)
 
@@ -96,6 +101,7 @@ def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence
         writer.writerows(rows)
 
 
+_GONE = "expected the file that was begun, it was moved or removed"
 FileOpener: TypeAlias = Callable[[Path], "AbstractContextManager[BinaryIO | GrowingFile]"]
 
 
@@ -108,8 +114,8 @@ def line_writer(path: Path | None, opener: FileOpener = whole_file) -> Iterator[
     with opener(path) as file:
 
         def write(line: str) -> None:
-            if isinstance(file, GrowingFile) and file.full:
-                file.begin()
+            if isinstance(file, GrowingFile):
+                file.go_on()
             file.write(f"{line}\n".encode())
 
         yield write
@@ -118,7 +124,9 @@ def line_writer(path: Path | None, opener: FileOpener = whole_file) -> Iterator[
 class GrowingFile:
     """File of a run without an end: under its own name from the start, every record in it when written.
 
-    What was there before becomes NAME.1.SUFFIX, and so does a file that is full; one such file is kept.
+    What was there before becomes NAME.N.SUFFIX, the first number that is free, and so does a file that is
+    full; of this run one such file is kept. What cannot be written, or would go to a file that was removed,
+    is logged once and counted: a log is not what a run is for.
 
     Parameters
     ----------
@@ -127,10 +135,17 @@ class GrowingFile:
     most_bytes : int, optional
         When a file is full. Without it none is.
 
+    Attributes
+    ----------
+    lost : int
+        Records that were not written.
+    whole : bool
+        Whether the file has every record up to now; it takes no more of them until `begin` or `go_on`.
+
     Raises
     ------
     InputFileError
-        If it cannot be written. What is in the file then ends with a whole record.
+        If it cannot be opened, or another run writes to it.
 
     Examples
     --------
@@ -145,18 +160,42 @@ class GrowingFile:
     """
 
     def __init__(self, path: str | Path, most_bytes: int | None = None) -> None:
-        self.path, self._most = Path(path), most_bytes
-        self._file, self._bytes = set_aside(path).open("wb", buffering=0), 0
+        self.path, self._most, self.lost, self.whole = Path(path), most_bytes, 0, True
+        self._file, self._bytes, self._said = claimed_file(path), 0, set[str]()
+        self._aside: tuple[Path, os.stat_result] | None = None
 
     def begin(self) -> None:
         """Begin a new file."""
-        self._file.close()
-        self._file, self._bytes = set_aside(self.path).open("wb", buffering=0), 0
+        try:
+            if is_named(self._file, self.path):
+                self._make_way()
+            else:
+                self._lose(_GONE)
+            self._file.close()
+            self._file, self._bytes, self.whole = claimed_file(self.path), 0, True
+            self._said.clear()
+        except (OSError, InputFileError) as error:
+            self._lose(str(error))
+
+    def _make_way(self) -> None:
+        """Give this file the name of the one before it, unless that is gone or another's by now."""
+        here, before = os.fstat(self._file.fileno()), self._aside
+        _let_go(self._file)
+        if before is None or not (before[0].exists() and os.path.samestat(before[0].stat(), before[1])):
+            self._aside = set_aside(check_target(self.path)), here
+        else:
+            self._aside = check_target(self.path).replace(before[0]), here
+
+    def go_on(self) -> None:
+        """Begin a new file if this one is full or gone; else take records again after one that was lost."""
+        if self.full:
+            self.begin()
+        self.whole = not self._file.closed
 
     @property
     def full(self) -> bool:
-        """Whether the file has its size."""
-        return self._most is not None and self._bytes >= self._most
+        """Whether the file has its size, or its name is no longer its own."""
+        return (self._most is not None and self._bytes >= self._most) or not is_named(self._file, self.path)
 
     def tell(self) -> int:
         """Return how long the file is, bytes."""
@@ -165,29 +204,90 @@ class GrowingFile:
     def write(self, record: bytes) -> int:
         """Write a record, whole or not at all."""
         left = memoryview(record)
+        if not is_named(self._file, self.path):
+            self._lose(_GONE)
         try:
-            while left:
+            while left and self.whole:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            self._file.seek(self._bytes)  # else what comes next would follow a hole
-            self._file.truncate()
-            raise InputFileError(self.path, f"expected room to write ({error.strerror})") from error
-        self._bytes += len(record)
+            with suppress(OSError):  # else what comes next would follow a hole
+                self._file.seek(self._bytes)
+                self._file.truncate()
+            self._lose(f"expected room to write ({error.strerror})")
+        self._bytes += len(record) if self.whole else 0
+        self.lost += not self.whole
         return len(record)
+
+    def _lose(self, problem: str) -> None:
+        self.whole = False
+        if problem not in self._said:
+            _LOG.warning("%s: %s", self.path, problem.removeprefix(f"{self.path}: "))
+            self._said.add(problem)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
+        if self.lost:
+            _LOG.warning("%s: %d records were lost", self.path, self.lost)
 
 
-def set_aside(path: str | Path) -> Path:
-    """Return where output to `path` goes; what is there becomes NAME.1.SUFFIX."""
+def claimed_file(path: str | Path) -> io.FileIO:
+    """Open a new file at `path` that no other run writes to; what is there becomes NAME.N.SUFFIX.
+
+    Raises
+    ------
+    InputFileError
+        If it cannot be opened, or another run writes to it.
+    """
     target = check_target(path)
-    if target.exists() and target.stat().st_size:
-        target.replace(target.with_name(f"{target.stem}.1{target.suffix}"))
-    return target
+    while True:
+        file = io.FileIO(os.open(target, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+")
+        _lock(file, path)
+        if is_named(file, target) and not os.fstat(file.fileno()).st_size:
+            return file
+        if is_named(file, target):
+            _let_go(file)
+            set_aside(target)
+        file.close()
+
+
+def is_named(file: io.FileIO, path: Path) -> bool:
+    """Whether a path still names an open file."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except (OSError, ValueError):  # it was removed; it is closed
+        return False
+
+
+def _lock(file: io.FileIO, path: str | Path) -> None:
+    """Claim a file until it is closed, where the system has such locks."""
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise InputFileError(path, "expected a file of its own, another run writes to it") from error
+    except OSError:  # a file system without locks
+        return
+
+
+def _let_go(file: io.FileIO) -> None:
+    """Close a file that shall be renamed where the system needs that; elsewhere its lock keeps others out."""
+    if fcntl is None:
+        file.close()
+
+
+def set_aside(target: Path) -> Path:
+    """Rename a file to NAME.N.SUFFIX, the first number that is free; return that name."""
+    for number in itertools.count(1):
+        aside = target.with_name(f"{target.stem}.{number}{target.suffix}")
+        with suppress(FileExistsError):
+            aside.touch(exist_ok=False)  # so that no other run takes the same number
+            return target.replace(aside)
+    raise AssertionError
 
 
 def _remove(path: Path) -> None:

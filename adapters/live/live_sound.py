@@ -1,5 +1,6 @@
 """Sound as it comes, from microphones or a recording played in their place; lost blocks become zeros."""
 
+import logging
 import threading
 import time
 from collections import deque
@@ -13,12 +14,13 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.audio.sound_file import Audio
-from worldstate.adapters.files.file_io import set_aside
+from worldstate.adapters.files.file_io import claimed_file, is_named
 from worldstate.frontend.settings import HOP_RATE_HZ
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range, nanoseconds
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array
 
+_LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
@@ -345,18 +347,30 @@ def kept_sound(
         return
     if path.suffix.lower() not in (".wav", ".rf64"):
         raise InputFileError(path, "expected a name that ends in .wav or .rf64")
-    with soundfile.SoundFile(
-        set_aside(path), "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT
-    ) as file:
+    with (
+        claimed_file(path) as raw,
+        soundfile.SoundFile(
+            raw.fileno(), "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT, closefd=False
+        ) as file,
+    ):
         # The length in the header follows every block: soundfile has no function of its own for it.
         soundfile._snd.sf_command(file._file, _UPDATE_HEADER, soundfile._ffi.NULL, 1)
 
+        whole = True
+
         def write(samples: Float32Array) -> None:
+            nonlocal whole
             try:
-                file.write(samples)
-            except (soundfile.LibsndfileError, AssertionError) as error:
-                problem = f"expected room to write after {file.tell() / sample_rate_hz:.1f} s"
-                raise InputFileError(path, problem) from error
+                if whole and is_named(raw, path):
+                    file.write(samples)
+                    return
+                problem = "it was moved or removed"
+            except (soundfile.LibsndfileError, AssertionError):
+                problem = "no room to write"
+            if whole:
+                kept_s = file.tell() / sample_rate_hz
+                _LOG.warning("%s: nothing is kept after %.1f s: %s", path, kept_s, problem)
+            whole = False
 
         yield write
 

@@ -117,7 +117,8 @@ def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
 
 def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch):
     page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "live_details.md"
-    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    programs = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    program = next(one for one in programs if "ImageLooks" in one)
     (tmp_path / "mics.csv").write_text((street / "mics.csv").read_text())
     lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
     (tmp_path / "camera.json").write_text(json.dumps(lens))

@@ -6,7 +6,9 @@ world-state; --help-all shows every option.
 States are kept where asked for. The sound is not, unless --keep-sound says so: microphones in public hear
 people. What the machine was too slow for is counted as an overrun, said when it happens, and heard as
 silence. Ctrl-C ends the run, and what it wrote is complete. Snapshots, MCAP and sound grow under their own
-name, and read at any time: a killed run loses half a second. What was there before becomes NAME.1.SUFFIX.
+name, and read at any time: a killed run loses half a second. What was there before becomes NAME.N.SUFFIX, the
+first number that is free; two runs cannot write one file. A log that cannot be written, or was removed, does
+not end the run: it is said on standard error.
 
 --detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
   {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
@@ -105,7 +107,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(detector=None)
     add = exports.add_output_options(parser).add_argument
     add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
-    told = "begin a new JSONL and MCAP at so many MiB, and keep the one before as NAME.1.SUFFIX"
+    told = "begin a new JSONL and MCAP at so many MiB, and keep the one before as NAME.N.SUFFIX"
     add("--rotate-mib", type=int, metavar="N", help=told)
     view = "show bearing, risk and entities (default: where standard error is a terminal)"
     add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
@@ -346,17 +348,19 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
     path, last, saved_ns = arguments.save_state, None, None
 
     def save() -> None:
-        nonlocal saved_ns
         if path is not None and last is not None:
             adapters.save_checkpoint(path, ports.kept(last))
-            saved_ns = last.state.stamp_ns
 
     def keep(step: "adapters.Step") -> None:
         nonlocal last, saved_ns
         last, stamp_ns = step, step.state.stamp_ns
         saved_ns = stamp_ns if saved_ns is None else saved_ns
         if stamp_ns - saved_ns >= SAVED_EVERY_NS:
-            save()
+            saved_ns = stamp_ns
+            try:
+                save()
+            except (ground.WorldstateError, OSError) as error:  # the next minute may have room
+                print(f"worldstate: {error}", file=sys.stderr)
 
     try:
         yield keep
