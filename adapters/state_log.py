@@ -53,8 +53,8 @@ def _is_own_mcap(path: Path) -> bool:
         return _ROS_PROFILE not in file.read(_HEADER_BYTES)
 
 
-def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:
-    """Return the snapshot of a file that is nearest to a time, which must not lie outside the file's."""
+def read_state_near(path: Path, stamp_ns: int, *, anywhere: bool = False) -> WorldState:
+    """Return the snapshot of a log that is nearest to a time, which lies within the log's or anywhere."""
     with refused_as_file(path):
         # Only the one that is asked for is read whole: an hour has 36,000.
         first_ns = last_ns = nearest = None
@@ -66,19 +66,22 @@ def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:
                 break
         if nearest is None or first_ns is None or last_ns is None:
             raise InputFileError(path, _EMPTY)
-        if not first_ns - _SLACK_NS <= stamp_ns <= last_ns + _SLACK_NS:
+        if not (anywhere or first_ns - _SLACK_NS <= stamp_ns <= last_ns + _SLACK_NS):
             span = f"{seconds(first_ns):.1f} to {seconds(last_ns):.1f} s"
             got = f"got {seconds(stamp_ns):.1f} s"
             raise InputFileError(path, f"expected a time from {span}, in which it has snapshots, {got}")
         return WorldState.from_dict(nearest[1])
 
 
-def _json_lines(path: str | Path) -> Iterator[str]:
-    """Yield every line of the file, without its end; a last one that was cut short is left out."""
-    with Path(path).open("rb") as file:
+def _json_lines(path: Path) -> Iterator[str]:
+    """Yield every line of the file, without its end; a first or last one that was cut is left out."""
+    with path.open("rb") as file:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
             if number > 1 and len(line) < MOST_CHARACTERS and not line.endswith(b"\n") and _is_cut(line):
                 return
+            # What keeps the last bytes of a log begins within a line.
+            if number == 1 and line.endswith(b"}\n") and not line.startswith(b'{"') and _is_cut(line):
+                continue
             try:
                 yield line.decode().rstrip("\n")
             except UnicodeDecodeError as error:
@@ -93,9 +96,9 @@ def _is_cut(line: bytes) -> bool:
     return False
 
 
-def _records(path: str | Path) -> Iterator[tuple[int, object]]:
-    """Yield stamp and content of every line."""
-    for number, line in enumerate(_json_lines(path), start=1):
+def _records(path: Path) -> Iterator[tuple[int, object]]:
+    """Yield stamp and content of every snapshot."""
+    for number, line in enumerate(_lines(path), start=1):
         value = decode_json(line, f"line {number}")
         stamp_ns = value.get("stamp_ns") if isinstance(value, dict) else None
         # What has no stamp is refused by the reader of snapshots, which says what is missing.

@@ -142,3 +142,32 @@ def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, t
     file.write_text("")
     assert main(["explain", str(file), "--time", "1"]) == 2
     assert "worldstate run --out" in capsys.readouterr().err
+
+
+def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, tmp_path, capsys):
+    """What was rotated, or cut at a line or within one, at its beginning or its end."""
+    whole, log = states.read_bytes(), tmp_path / "rotated.jsonl"
+    lines = whole.splitlines(keepends=True)
+    for first in range(14):
+        for extra in (b"", lines[first - 1][-200:] if first else b""):
+            log.write_bytes(extra + b"".join(lines[first:]) + lines[0][:100])
+            assert main(["explain", str(log), "--json"]) == 0
+            told = json.loads(capsys.readouterr().out)
+            advised = told["advisories"]
+            assert [one["since_ns"] for one in advised] == [700_000_000]
+            assert told["time_s"] == pytest.approx(max(0.7, 0.1 * (first + 1)))
+            at_onset = told["sides"]["left"]["evidence_at_onset"]
+            assert (at_onset is None) == (first > 6)
+            assert main(["log", "replay", str(log), "--json"]) == 0
+            replayed = json.loads(capsys.readouterr().out)
+            assert replayed["states"] == 15 - first and replayed["advisory_onsets_s"] == [0.7]
+
+
+def test_a_log_in_mcap_is_explained_alike(states, tmp_path, capsys):
+    assert main(["log", "replay", str(states), "--export", f"mcap={tmp_path / 'a.mcap'}"]) == 0
+    told = []
+    for log in (states, tmp_path / "a.mcap"):
+        capsys.readouterr()
+        assert main(["explain", str(log), "--time", "1.0"]) == 0
+        told.append(capsys.readouterr().out)
+    assert told[0] == told[1]

@@ -25,7 +25,9 @@ from worldstate.adapters.export.log_messages import (
     state_messages,
 )
 from worldstate.adapters.export.scene import scene_update
+from worldstate.adapters.state_log import read_log
 from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError
 from worldstate.state import SearchedView, WorldState
 
 STATES = scripted_states()
@@ -226,6 +228,22 @@ def test_a_damaged_log_is_refused_in_one_line(logged, tmp_path, capsys):
     assert "broken.mcap: expected an MCAP file" in capsys.readouterr().err
     (tmp_path / "empty.jsonl").write_text("")
     assert main(["log", "replay", str(tmp_path / "empty.jsonl")]) == 2
+
+
+def test_a_log_that_was_cut_anywhere_is_read_up_to_its_last_whole_chunk(logged, tmp_path):
+    """Within a chunk, a head, the index and the footer: every byte where records are small, else some."""
+    path, whole = tmp_path / "cut.mcap", logged[0].read_bytes()
+    written, before = logged[1].read_text().splitlines(), 0
+    for end in [*range(0, len(whole), 1009), *range(len(whole) - 3000, len(whole), 7)]:
+        path.write_bytes(whole[:end])
+        try:
+            lines = [line for line, _ in read_log(path)]
+        except InputFileError as error:
+            assert not before and ("its first whole chunk" in str(error) or "got none" in str(error))
+            continue
+        assert lines == written[: len(lines)] and len(lines) >= before
+        before = len(lines)
+    assert before == len(written)
 
 
 def test_without_the_package_the_extra_is_named(logged, monkeypatch, capsys):

@@ -27,7 +27,7 @@ from worldstate.ground.checks import one_of
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("states", type=Path, metavar="JSONL", help="snapshots, as `worldstate run --out` writes them")
+    add("states", type=Path, metavar="LOG", help="what `worldstate run` wrote by --out or --export mcap")
     add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the first advisory)")
     add("--side", help="of this side only, such as left (default: every side)")
 
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     state = read_state_near(arguments.states, stamp_ns)
     if arguments.side is not None:
         one_of("--side", arguments.side, [cue.direction for cue in state.cues])
-    read = partial(read_state_near, arguments.states)
+    read = partial(read_state_near, arguments.states, anywhere=True)
     reports = evidence_report.evidence_report(state, read, arguments.side)
     now_s = ground.seconds(state.stamp_ns)
     written = state.to_dict()

@@ -16,6 +16,7 @@ _SAID = {
     "above": "none, though above the threshold: the risk denies it, or there is no second of sound yet",
     "below": "none: below the threshold",
 }
+_SAME_NS = 50_000_000  # half a hop
 _OF = {
     "coming": "a vehicle comes into view within 3 s",
     "hidden": "a vehicle is hidden on any side, by this window alone",
@@ -43,10 +44,14 @@ class ToldAdvisory:
 
 
 def told_advisories(states: Iterable[WorldState], side: str | None = None) -> tuple[list[ToldAdvisory], int]:
-    """Return advisories of one side or all by onset, and the first onset, or when risk was highest."""
+    """Return advisories of one side or all by onset, and the first onset, or when risk was highest.
+
+    The first one may have begun before the first snapshot, whose time it is then.
+    """
     last_ns: dict[tuple[int, str], int] = {}
-    highest, riskiest_ns = -1.0, 0
+    highest, riskiest_ns, first_ns = -1.0, 0, None
     for state in states:
+        first_ns = state.stamp_ns if first_ns is None else first_ns
         cues = [cue for cue in state.cues if side in (None, cue.direction)]
         for cue in cues:
             if cue.advisory is not None:
@@ -55,7 +60,7 @@ def told_advisories(states: Iterable[WorldState], side: str | None = None) -> tu
         if risk > highest:
             highest, riskiest_ns = risk, state.stamp_ns
     told = [ToldAdvisory(direction, since, last) for (since, direction), last in sorted(last_ns.items())]
-    return told, told[0].since_ns if told else riskiest_ns
+    return told, max(told[0].since_ns, first_ns or 0) if told else riskiest_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,11 +145,17 @@ def evidence_report(
     reports = {}
     for cue in state.cues:
         if side in (None, cue.direction):
-            began = () if cue.advisory is None else read(cue.advisory.since_ns).cues
+            began = () if cue.advisory is None else _cues_at(read, cue.advisory.since_ns)
             first = next((one for one in began if one.direction == cue.direction), None)
             entity = entities.get(cue.entity_id or "")
             reports[cue.direction] = SideEvidenceReport(cue, first, entity, state.calibrated)
     return reports
+
+
+def _cues_at(read: Callable[[int], WorldState], stamp_ns: int) -> tuple[RiskCue, ...]:
+    """Return the cues at a time, none where a log begins later, within an advisory."""
+    state = read(stamp_ns)
+    return state.cues if state.stamp_ns - stamp_ns <= _SAME_NS else ()
 
 
 def common_lines(state: WorldState) -> Iterator[str]:

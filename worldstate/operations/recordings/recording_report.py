@@ -76,7 +76,9 @@ class WarningMeter:
         if raised:
             now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk).entity_id
             if not self._raised:
-                self._onsets.append((now_s, told))
+                # The first one of a log may have begun before it.
+                since_ns = min(cue.advisory.since_ns for cue in raised if cue.advisory is not None)
+                self._onsets.append((seconds(since_ns) if self.states == 1 else now_s, told))
             if self.t0_s is not None and now_s < self.t0_s:
                 self._hidden_id = told or self._hidden_id
         self._raised = bool(raised)
