@@ -42,6 +42,8 @@ _LARGEST_BYTES = 1 << 16
 _POLL_S = 0.2
 # Nothing older than the lag of the filter is used.
 _OLDEST_S = 1e-9 * LAG_NS
+# By so much the clocks of a sensor and of its sender may differ: what comes from the future is of now.
+_AHEAD_S = 0.05
 # A sender that has been silent for so long has ended: the next one takes its place.
 PINNED_S = 10.0
 
@@ -200,7 +202,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
         except UnicodeDecodeError as error:
             raise InvalidArgumentError("datagram: expected UTF-8") from error
         about = record if isinstance(record, dict) else {}
-        age_s = in_range("age_s", decode(float, about.pop("age_s", 0.0), "age_s"), 0.0, _OLDEST_S)
+        age_s = in_range("age_s", decode(float, about.pop("age_s", 0.0), "age_s"), -_AHEAD_S, _OLDEST_S)
         source, number = sender[0], about.pop("number", None)
         if self._trust.key is not None:
             source = ""
@@ -210,7 +212,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
             number = decode(int, number, "number")
             if number <= last:
                 raise InvalidArgumentError(f"number: expected one above {last}, taken already, got {number}")
-        read = arrived_s - age_s, self._decode(record)
+        read = arrived_s - max(age_s, 0.0), self._decode(record)
         if number is not None:
             self._last[source] = number
         self._pinned = pinned

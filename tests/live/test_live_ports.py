@@ -86,6 +86,12 @@ def test_a_host_is_allowed_by_its_name_too():
         _trust(argparse.Namespace(allow=["no such host"], key=None))
 
 
+@pytest.mark.parametrize(("age_s", "read"), [(-0.002, True), (-0.05, True), (-0.051, False), (-3600, False)])
+def test_an_age_from_clocks_that_differ_a_little_is_none(age_s, read):
+    """A datagram is not lost with its content for two milliseconds."""
+    assert taken(Trust(), (0, odometry(1, age_s=age_s)), (0, odometry(2)))[0] == [1] * read + [2]
+
+
 @pytest.mark.parametrize("age_s", ["x", None, [1], {}, True])
 def test_an_age_that_is_no_number_is_refused(age_s):
     assert taken(Trust(), (0, odometry(1, age_s=age_s)), (0, odometry(2)))[0] == [2]
