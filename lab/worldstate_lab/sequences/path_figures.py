@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequencePosterior
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SMOOTHED_HOPS, SequencePosterior
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.file_io import read_json
 from worldstate.frontend.settings import HOP_RATE_HZ
@@ -167,6 +167,7 @@ def score_figures(
 
 _MEAN_HOPS = 20  # Two seconds
 _LEAST_NATS = -20.0  # Where the window gives no sides
+_SMALLEST = 1e-9  # Of a chance whose log-odds are formed
 
 
 def _window(trial: Trial) -> FloatArray:
@@ -194,7 +195,17 @@ def _sequence(trial: Trial) -> FloatArray:
     return np.nan_to_num(within[..., HORIZONS_S.index(3.0)])
 
 
-_risk, _decision = attrgetter("hops.risk"), attrgetter("hops.compared_nats")
+def _decision(trial: Trial) -> FloatArray:
+    """Return the mean over 0.3 s of the log-odds of the stated chance to come into view within 3 s."""
+    # What is held against the threshold, `compared_nats`, is on another scale before the sequence is read,
+    # in the first second of every recording: in the curves those hops would count as early warnings.
+    chance = np.clip(np.nan_to_num(trial.hops.within[..., HORIZONS_S.index(3.0)]), _SMALLEST, 1.0 - _SMALLEST)
+    log_odds = np.log(chance) - np.log1p(-chance)
+    recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
+    return np.asarray(log_odds[np.maximum(recent, 0)].mean(axis=1))
+
+
+_risk, _compared = attrgetter("hops.risk"), attrgetter("hops.compared_nats")
 PRODUCT, DECISION, DECISION_SEEN = (
     "product, with camera",
     "decision value, sound alone",
@@ -208,6 +219,8 @@ SCORES = (
     HopScore(PRODUCT, True, _risk),
     HopScore(DECISION, False, _decision),
     HopScore(DECISION_SEEN, True, _decision),
+    HopScore("compared value, sound alone", False, _compared),
+    HopScore("compared value, with camera", True, _compared),
     HopScore("side ratio", False, _ratios),
     HopScore("side ratio, mean of 2 s", False, _mean_ratios),
     HopScore("loudness meter", False, attrgetter("hops.meter_db")),
