@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hop_tables import blank_stream
 from scipy.signal import lfilter
-from worldstate_lab.cli.ablations import (
+from worldstate_lab.evaluation.ablation_rows import (
     AblationSwitches,
     ablation_table,
     evaluate_ablation,

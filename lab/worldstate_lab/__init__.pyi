@@ -1,8 +1,8 @@
-from .cli.ablations import AblationSwitches as AblationSwitches
-from .cli.ablations import evaluate_ablation as evaluate_ablation
 from .cli.windows import comparison as comparison
 from .degradation.degradation_study import DegradationSettings as DegradationSettings
 from .degradation.degradation_study import degradation_study as degradation_study
+from .evaluation.ablation_rows import AblationSwitches as AblationSwitches
+from .evaluation.ablation_rows import evaluate_ablation as evaluate_ablation
 from .features.published_classifier import PublishedClassifier as PublishedClassifier
 from .paper.identifiability import fano_bound as fano_bound
 from .paper.identifiability import information_from_posteriors as information_from_posteriors

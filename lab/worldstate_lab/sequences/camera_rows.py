@@ -19,7 +19,12 @@ from worldstate.operations.metrics.approach_table import (
 )
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.parallel import in_processes
-from worldstate_lab.cli.ablations import AblationRow, AblationSwitches, ablation_table, evaluate_ablation
+from worldstate_lab.evaluation.ablation_rows import (
+    AblationRow,
+    AblationSwitches,
+    ablation_table,
+    evaluate_ablation,
+)
 from worldstate_lab.metrics.intervals import deal_folds
 
 from .hearing import Chain, heard
