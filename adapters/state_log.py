@@ -6,7 +6,7 @@ from pathlib import Path
 
 from worldstate.adapters.export.log_messages import IMAGE_TOPIC, SNAPSHOT_TOPIC, SOUND_TOPIC, read_messages
 from worldstate.adapters.export.scene import CompressedImage, RawAudio
-from worldstate.adapters.files.file_io import refused_as_file
+from worldstate.adapters.files.file_io import plain_file, refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
 from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
@@ -49,7 +49,7 @@ def _lines(path: Path) -> Iterator[str]:
 def _is_own_mcap(path: Path) -> bool:
     if path.suffix.lower() != ".mcap" or not path.is_file():
         return False
-    with path.open("rb") as file:
+    with plain_file(path, "snapshots") as file:
         return _ROS_PROFILE not in file.read(_HEADER_BYTES)
 
 
@@ -75,7 +75,7 @@ def read_state_near(path: Path, stamp_ns: int, *, anywhere: bool = False) -> Wor
 
 def _json_lines(path: Path) -> Iterator[str]:
     """Yield every line of the file, without its end; a first or last one that was cut is left out."""
-    with path.open("rb") as file:
+    with plain_file(path, "snapshots") as file:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
             if number > 1 and len(line) < MOST_CHARACTERS and not line.endswith(b"\n") and _is_cut(line):
                 return

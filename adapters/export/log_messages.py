@@ -20,7 +20,7 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import SoundInput, open_sound
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.files.file_io import FileOpener, GrowingFile, atomic_path, whole_file
+from worldstate.adapters.files.file_io import FileOpener, GrowingFile, atomic_path, plain_file, whole_file
 from worldstate.ground import FloatArray, InputFileError, nanoseconds
 from worldstate.ground.errors import MissingExtraError
 from worldstate.ground.extras import check_extra, optional
@@ -317,7 +317,7 @@ def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
     """
     reader, cut_short = optional("mcap.reader").NonSeekingReader, optional("mcap.exceptions").EndOfFile
     check_chunks(path)
-    with path.open("rb") as file:
+    with plain_file(path, "an MCAP file") as file:
         found = False
         try:
             # By time of writing and not by stamp: a late measurement may have moved a stamp back.
@@ -370,7 +370,7 @@ def check_chunks(path: Path) -> None:
 @lru_cache(maxsize=8)  # a bag is opened several times in a run, and decoding takes seconds a gigabyte
 def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
     chunks, times = dict[int, tuple[tuple[int, int], tuple[int, ...]]](), list[tuple[int, int, int]]()
-    with path.open("rb") as file:
+    with plain_file(path, "an MCAP file") as file:
         at = _MAGIC_BYTES
         while at + _RECORD.size <= end:
             file.seek(at)

@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import shutil
+import stat
 import uuid
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -313,10 +314,36 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
         raise InputFileError(path, f"expected {what} in UTF-8") from error
 
 
+def plain_file(path: str | Path, what: str) -> BinaryIO:
+    """Open a file to read; refuse a pipe or device, which may never end or never begin, and a name with NUL.
+
+    Raises
+    ------
+    InputFileError
+        If it cannot be opened, or is no file.
+
+    Examples
+    --------
+    >>> plain_file("/dev/zero", "positions")
+    Traceback (most recent call last):
+    worldstate.ground.errors.InputFileError: /dev/zero: expected positions, found a device or pipe
+    """
+    # Without waiting: a pipe is opened once somebody writes to it.
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        file = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115 - the caller's
+    except (OSError, ValueError) as error:
+        raise InputFileError(path, f"expected {what} ({getattr(error, 'strerror', error)})") from error
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise InputFileError(path, f"expected {what}, found a device or pipe")
+    return file
+
+
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
     """Return what a file of at most so many bytes holds."""
     try:
-        with Path(path).open("rb") as file:
+        with plain_file(path, what) as file:
             data = file.read(max_bytes + 1)
     except OSError as error:
         raise InputFileError(path, f"expected {what} ({error.strerror})") from error
@@ -474,7 +501,7 @@ def load_npz(
     np.int64(3)
     """
     try:
-        with Path(path).open("rb") as file:
+        with plain_file(path, f"{what} as npz") as file:
             if _decoded_bytes(file) > max_bytes:
                 raise InputFileError(path, f"expected {what} of at most {max_bytes >> 20} MiB")
             with np.load(file, allow_pickle=False) as arrays:

@@ -7,19 +7,24 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 from damaged_files import damaged, write_inputs
+from scripted_states import scripted_states
 
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.cli.common import progress
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import extras
 from worldstate.simulation.dataset.dataset import LogRow, write_log
+from worldstate.state import Classification, SensorHealth
 
 COMMAND = (sys.executable, "-m", "worldstate.cli.main")
 RECORDING = "set/SA1/left/1_00_0000"
@@ -404,3 +409,103 @@ def test_another_simulation_keeps_what_the_log_lists(tmp_path):
     assert main([*words, "--bandwidth", "2000"]) == 0
     listed = [recording.recording_id for recording in OvadDataset(tmp_path).recordings]
     assert listed == ["3_01_0007", "1_00_0000"]
+
+
+@contextmanager
+def within(seconds: float):
+    """Raise TimeoutError if the block takes longer."""
+
+    def end(number: int, frame: object) -> None:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+CAR = "run real.wav --car car.json"
+
+
+@pytest.mark.parametrize(
+    ("line", "car"),
+    [
+        ("run pipe --array mics.csv", None),
+        ("run real.wav --array pipe", None),
+        ("run real.wav --array mics.csv --model pipe", None),
+        ("run real.wav --array mics.csv --detections pipe", None),
+        ("run real.wav --array mics.csv --camera /dev/zero", None),
+        ("run real.wav --car pipe", None),
+        ("run real.wav --resume pipe --array mics.csv", None),
+        ("run bag.mcap", None),
+        ("explain pipe", None),
+        ("log replay bag.mcap", None),
+        ("live --play real.wav --array mics.csv --uncalibrated --key pipe --odometry 127.0.0.1:0", None),
+        (CAR, {"array": {"file": "pipe"}}),
+        (CAR, {"array": {"file": "mics\0.csv"}}),
+        (CAR, {"array": {"file": "mics.csv"}, "model": "pipe"}),
+        (CAR, {"array": {"file": "mics.csv"}, "model": "m\0.json"}),
+        (CAR, {"array": {"file": "mics.csv"}, "odometry": "pipe"}),
+        (CAR, {"array": {"file": "mics.csv"}, "odometry": "o\0.csv"}),
+    ],
+)
+def test_a_pipe_a_device_and_a_nul_are_refused_at_once(line, car, files, capsys):
+    soundfile.write("real.wav", np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000)
+    Path("mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    os.mkfifo("bag.mcap")
+    if car is not None:
+        Path("car.json").write_text(json.dumps(car))
+    with within(20.0):
+        said = refusal(
+            [*line.split(), *(["--uncalibrated"] if line.startswith("run") else [])], files, capsys
+        )
+    assert "device or pipe" in said or "null byte" in said
+
+
+ODD = "\x1b[2J\x1b]0;mine\x07\x9b\u202e"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", f"{ODD}.wav"],
+        ["run", "a.wav", "--array", ODD],
+        ["run", "a.wav", f"--{ODD}"],
+        [f"{ODD}"],
+        ["explain", f"{ODD}.jsonl"],
+        ["log", "replay", "log.jsonl"],
+        ["explain", "log.jsonl"],
+        ["live", "--play", "a.wav", "--allow", ODD],
+    ],
+)
+def test_no_control_character_reaches_a_terminal(words, files, capsys):
+    state = max(scripted_states(), key=lambda one: len(one.entities))
+    entities = tuple(replace(one, classification=(Classification(ODD, 1.0),)) for one in state.entities)
+    cues = tuple(replace(one, direction=f"left{ODD}") for one in state.cues)
+    sensors = (SensorHealth(ODD, "impaired", state.stamp_ns, f"reason {ODD}"),)
+    log = replace(state, entities=entities, cues=cues, sensors=sensors)
+    Path("log.jsonl").write_text(log.to_json() + "\n")
+    with suppress(SystemExit):
+        main(words)
+    printed = "".join(capsys.readouterr())
+    assert printed
+    assert [one for one in printed if not (one.isprintable() or one == "\n")] == []
+
+
+def test_what_is_logged_is_written_for_a_terminal():
+    script = (
+        "import logging; from worldstate.cli.main import main; main(['--version'])\n"
+        "logging.getLogger('worldstate').warning('%s', chr(27) + '[2J')"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stderr == "\\x1b[2J\n"
+
+
+def test_a_bar_and_a_view_show_names_as_they_are(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "can_draw", lambda: True)
+    with progress.progress_bar(f"[/red] {ODD}", 10) as bar:
+        bar.advance()
+    assert "[2J" not in capsys.readouterr().err.replace("\\x1b[2J", "")

@@ -39,7 +39,6 @@ Examples
 import argparse
 import math
 import socket
-import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -360,7 +359,7 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
             try:
                 save()
             except (ground.WorldstateError, OSError) as error:  # the next minute may have room
-                print(f"worldstate: {error}", file=sys.stderr)
+                output.say(str(error))
 
     try:
         yield keep
@@ -400,6 +399,6 @@ def _loss_notices() -> "Callable[[LiveStep], None]":
         if live.overruns > said and stamp_ns - said_ns >= SAID_EVERY_NS:
             said, said_ns = live.overruns, stamp_ns
             lost = f"{live.overruns} overruns, {live.lost_s:.2f} s of sound lost"
-            print(f"worldstate: {ground.seconds(stamp_ns):.1f} s: {lost}", file=sys.stderr)
+            output.say(f"{ground.seconds(stamp_ns):.1f} s: {lost}")
 
     return notice

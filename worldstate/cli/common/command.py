@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import logging
 import os
 import signal
 import sys
@@ -14,13 +15,14 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
+from typing import NoReturn
 
 from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError, WorldstateError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, WorldstateError
 from worldstate.ground.extras import check_extra
 from worldstate.ground.version import __version__
 
-from .output import CommandResult, print_result
+from .output import CommandResult, print_result, printable, say
 
 _WIDTH = 80  # of the overview, characters
 _HELP = "-h", "--help"
@@ -89,6 +91,10 @@ class CommandParser(argparse.ArgumentParser):
         self.set_defaults(run=module.run, needs=getattr(module, "NEEDS", ()))
         module.add_options(self)
 
+    def error(self, message: str) -> NoReturn:
+        """Refuse a call."""
+        super().error(printable(message))
+
     def format_help(self) -> str:
         """Return the help; only the first options and the first paragraph where there are many."""
         if not self.first:
@@ -105,6 +111,14 @@ class CommandParser(argparse.ArgumentParser):
             self.description = description
             for one, text in zip(hidden, told, strict=True):
                 one.help = text
+
+
+class _Printable(logging.Formatter):
+    """Writes what is logged for a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        return printable(super().format(record))
 
 
 class _HelpAll(argparse.Action):
@@ -163,6 +177,8 @@ def run_program(
 
     `current` replaces former words of a call, `prepare` adds options to the parser of every command.
     """
+    if logging.lastResort is not None:  # what prints warnings where no program has set up logging
+        logging.lastResort.setFormatter(_Printable())
     try:
         # SIGTERM is an exception, so that unfinished files are removed on the way out; exit code 143.
         with _handled((signal.SIGTERM,), _terminate):
@@ -207,9 +223,18 @@ def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandP
     in_range("--seed", getattr(arguments, "seed", 0), 0, 2**63)
     in_range("--jobs", getattr(arguments, "jobs", 1), 1, 256)
     check_extra(*arguments.needs)
+    _check_paths(arguments)
     result: CommandResult = arguments.run(arguments)
     print_result(result, as_json=arguments.json)
     return result.code
+
+
+def _check_paths(arguments: argparse.Namespace) -> None:
+    """Refuse a pipe or device in the place of a file: it may never begin, or never end."""
+    given = (value if isinstance(value, list) else [value] for value in vars(arguments).values())
+    for path in (one for values in given for one in values if isinstance(one, Path)):
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputFileError(path, "expected a file, found a device or pipe")
 
 
 def _without_command(program: Program, words: Sequence[str]) -> int:
@@ -265,6 +290,5 @@ def _terminate(number: int, frame: object) -> None:
 
 def _refused(problem: str) -> int:
     """Print one line on standard error; return exit code 2."""
-    line = " ".join(problem.split())
-    print(f"worldstate: {line}", file=sys.stderr)
+    say(" ".join(problem.split()))
     return 2

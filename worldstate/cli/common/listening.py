@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from worldstate.ground.extras import check_extra
 
 from .exports import needed_extras
 from .inputs import search_of
+from .output import say
 from .progress import progress_bar, track
 from .sensors import MOVING, GivenSensors, given_sensors
 
@@ -105,10 +105,12 @@ def array_of_model(path: Path | None = None) -> "frontend.MicrophoneArray | None
     """
     from importlib.resources import files
 
+    from worldstate.adapters.files.file_io import plain_file
+
     shipped = files("worldstate") / "data" / "default_model.json"
     try:
-        with (shipped if path is None else path).open(encoding="utf-8") as file:
-            lines = iter(lambda: file.readline(_LONGEST_LINE), "")
+        with shipped.open("rb") if path is None else plain_file(path, "a model file") as file:
+            lines = iter(lambda: file.readline(_LONGEST_LINE).decode(), "")
             line = next(one for one in lines if one.startswith('"signature": {'))
         domain = json.loads(f"{{{line.rstrip().rstrip(',')}}}")["signature"]["domain"]
         return frontend.MicrophoneArray(domain["positions_m"], domain["array"])
@@ -149,7 +151,7 @@ def open_given(
         mask_dead=mask_dead,
     )
     if given.model is None and (moving_ego or (ego is not None and ego.moves)):
-        print("worldstate: the model of a moving ego is used, as odometry is given", file=sys.stderr)
+        say("the model of a moving ego is used, as odometry is given")
     return adapters.open_source(
         sound,
         ego=ego,

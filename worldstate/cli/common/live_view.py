@@ -12,6 +12,8 @@ from rich.text import Text
 
 from worldstate import ground
 
+from .output import printable
+
 if TYPE_CHECKING:
     from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.state import Entity, RiskCue, WorldState
@@ -64,7 +66,7 @@ def _bearing(state: "WorldState") -> Text:
 
 def _cue(cue: "RiskCue") -> Text:
     filled = round(cue.risk * _BAR)
-    line = Text(f"{cue.direction:<6}", style="bold")
+    line = Text(printable(f"{cue.direction:<6}"), style="bold")
     line.append("█" * filled + "─" * (_BAR - filled), style="red" if cue.advisory else "yellow")
     line.append(f"  risk {cue.risk:.2f}", style="default")
     if cue.advisory:
@@ -78,5 +80,6 @@ def _entities(entities: "tuple[Entity, ...]") -> Table:
     for one in likeliest:
         label = max(one.classification, key=lambda said: said.probability).label if one.classification else ""
         azimuth = f"{math.degrees(one.azimuth_rad):+.0f} ± {math.degrees(one.azimuth_std_rad):.0f} deg"
-        table.add_row(one.id[:8], one.status, f"{one.existence_probability:.2f}", azimuth, label)
+        cells = one.id[:8], one.status, f"{one.existence_probability:.2f}", azimuth, label
+        table.add_row(*(Text(printable(cell)) for cell in cells))  # text alone would be read as markup
     return table

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,24 @@ class CommandResult:
     code: int = 0  # Exit code
 
 
+def printable(text: str) -> str:
+    r"""Return text with all that is no visible character written out, line ends and tabs apart.
+
+    Names of files, labels and reasons come from others, and a terminal obeys what follows an escape.
+
+    Examples
+    --------
+    >>> print(printable("a\x1b[2Jb.wav: 63 ± 52"))
+    a\x1b[2Jb.wav: 63 ± 52
+    """
+    return "".join(one if one.isprintable() or one in "\n\t" else ascii(one)[1:-1] for one in text)
+
+
+def say(text: str) -> None:
+    """Print a notice on standard error."""
+    print(f"worldstate: {printable(text)}", file=sys.stderr, flush=True)
+
+
 def print_result(result: CommandResult, *, as_json: bool) -> None:
     """Print a result on standard output; None shows as a dash in the table, as null in JSON.
 
@@ -39,9 +58,9 @@ def print_result(result: CommandResult, *, as_json: bool) -> None:
     table = result.report if result.table is None else result.table
     width = max(map(len, table), default=0)
     for key, value in table.items():
-        print(f"{key:<{width}}  {_readable(value)}")
+        print(printable(f"{key:<{width}}  {_readable(value)}"))
     for line in result.lines:
-        print(line)
+        print(printable(line))
 
 
 def write_report(path: Path, report: Mapping[str, object]) -> None:

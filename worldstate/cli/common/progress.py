@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from worldstate.ground.extras import has_extra
 
+from .output import printable, say
+
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
 
@@ -59,9 +61,10 @@ def _drawn(description: str, bar: Bar) -> Iterator[None]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    told = TextColumn("{task.description}", markup=False)
+    columns = told, BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(description, total=bar.total)
+        task = progress.add_task(printable(description), total=bar.total)
         bar.shown = lambda amount: progress.advance(task, amount)
         yield
 
@@ -74,8 +77,7 @@ def _told(description: str, bar: Bar) -> Iterator[None]:
     def tell() -> None:
         while not ended.wait(EVERY_S):
             share = f"{100.0 * bar.done / bar.total:.0f} %" if bar.total else f"{bar.done:g} done"
-            line = f"worldstate: {description}: {share} after {time.monotonic() - begun_s:.0f} s"
-            print(line, file=sys.stderr, flush=True)
+            say(f"{description}: {share} after {time.monotonic() - begun_s:.0f} s")
 
     teller = threading.Thread(target=tell, daemon=True)
     teller.start()

@@ -133,7 +133,6 @@ def _heard_windows(labels: Path, table: "adapters.FeatureTable") -> "adapters.Fe
 
 def _with_domain(arguments: argparse.Namespace, table: "adapters.FeatureTable") -> "adapters.FeatureTable":
     """Return the table with what its windows were made with: as it says, as the options say, or as OVAD's."""
-    import sys
     from dataclasses import replace
 
     from worldstate.adapters.files.acoustic_domain import check_array, domain_of, ovad_domain
@@ -142,7 +141,7 @@ def _with_domain(arguments: argparse.Namespace, table: "adapters.FeatureTable") 
     environments = table.environments.tolist()
     if arguments.array is None:
         if table.domain is None:
-            print(f"worldstate: {arguments.table} names no array: taken as OVAD's", file=sys.stderr)
+            output.say(f"{arguments.table} names no array: taken as OVAD's")
         return replace(table, domain=table.domain or ovad_domain(environments))
     array = adapters.read_array(arguments.array)
     if table.domain is not None:

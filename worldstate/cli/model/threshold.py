@@ -15,7 +15,6 @@ Examples
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 from worldstate import adapters, operations
@@ -66,7 +65,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     provenance = replace(model.provenance, figures=figures)
     adapters.save_model(arguments.out, replace(model, policies=done.policies, provenance=provenance))
     for warning in done.warnings:
-        print(f"worldstate: warning: {warning}", file=sys.stderr)
+        output.say(f"warning: {warning}")
     return _result(arguments, done)
 
 
