@@ -1,22 +1,29 @@
 """Model files: versioned JSON that holds coefficients only."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from importlib.resources import as_file, files
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.road_users import DomainGuard, RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.ensemble import AnySignature
 from worldstate.abduction.signature.published_signature import ModelDomain
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Via, encode
 
-from .file_io import read_record, write_text
+from .file_io import read_record, refused_as_file, write_text
+
+# Of a number of a model file. The largest that ships is a sample rate; a sum of thousands of products of two
+# such numbers, squared, is still finite.
+LARGEST = 1e12
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +125,8 @@ def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> M
     Raises
     ------
     InputFileError
-        If the file is missing, too large, truncated or no JSON, or a number is missing, not finite or out of
-        range.
+        If the file is missing, too large, truncated or no JSON, or a number is missing, not finite, above
+        1e12 or out of range.
     SchemaVersionError
         If it is of another major version.
 
@@ -129,11 +136,34 @@ def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> M
     ['standing', 'moving']
     """
     if path is not None:
-        return read_record(Model, path, "model")
+        model = read_record(Model, path, "model")
+        with refused_as_file(path):
+            for name, part in _parts(model):
+                if part is not model.provenance:  # a seed may be larger, and nothing is computed with it
+                    _check_sizes(part, f"model{name}")
+        return model
     shipped = _shipped("moving_model.json" if moving_ego else "default_model.json")
     # All else of it is read-only.
     figures = dict(shipped.provenance.figures)
     return replace(shipped, provenance=replace(shipped.provenance, figures=figures))
+
+
+def _check_sizes(value: Any, where: str) -> None:
+    """Refuse a number that would overflow once it is multiplied, wherever it stands."""
+    for name, part in _parts(value):
+        _check_sizes(part, where + name)
+    if isinstance(value, int | float | np.ndarray) and (most := np.max(np.abs(value), initial=0.0)) > LARGEST:
+        raise InvalidArgumentError(f"{where}: expected numbers up to {LARGEST:g}, got {most:g}")
+
+
+def _parts(value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the parts of a value that is no number, each with its place."""
+    if is_dataclass(value):
+        yield from ((f".{one.name}", getattr(value, one.name)) for one in fields(value))
+    elif isinstance(value, Mapping):
+        yield from ((f".{name}", part) for name, part in value.items())
+    elif isinstance(value, tuple):
+        yield from ((f"[{number}]", part) for number, part in enumerate(value))
 
 
 @cache

@@ -50,6 +50,13 @@ def paths(value, here=()):
             yield from paths(inner, (*here, key))
 
 
+def at(path):
+    inner = DEFAULT
+    for key in path:
+        inner = inner[key]
+    return inner
+
+
 def replaced(path, value):
     data = copy.deepcopy(DEFAULT)
     inner = data
@@ -141,6 +148,18 @@ def test_wrong_values_are_refused_or_harmless(path, value):
 def test_a_number_that_is_none_is_always_refused(path, value):
     with pytest.raises(InputFileError):
         read(replaced(path, value))
+
+
+NUMBERS = [path for path in paths(DEFAULT) if type(at(path)) is float and path[0] != "provenance"]
+
+
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
+@pytest.mark.parametrize("path", NUMBERS, ids=lambda path: ".".join(map(str, path)))
+def test_a_number_that_would_overflow_is_refused(path, tmp_path):
+    for value in (1e308, -1e308, 1e15):
+        (tmp_path / "m.json").write_text(json.dumps(replaced(path, value)))
+        with pytest.raises(InputFileError):
+            read_model(tmp_path / "m.json")
 
 
 @pytest.mark.parametrize(
