@@ -82,11 +82,12 @@ locked: $(VENV)/.test $(VENV)/.docs
 	$(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | grep '==' >> out.locked
 	mv out.locked locked.txt
 
-# Known vulnerabilities of those versions; it needs an index of advisories, and says where none can be reached.
+# Known vulnerabilities of those versions. It needs an index of advisories: a version that could not be looked up
+# is a failure, else an audit of nothing would pass.
 audit:
 	$(PYTHON) -m venv out/audit
 	out/audit/bin/pip install -q --disable-pip-version-check pip-audit
-	out/audit/bin/pip-audit -r locked.txt --no-deps --disable-pip
+	out/audit/bin/pip-audit --strict -r locked.txt --no-deps --disable-pip
 
 # Oldest and newest releases of what the library needs, on every Python from 3.11 to 3.13 that is here.
 matrix:

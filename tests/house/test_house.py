@@ -139,6 +139,11 @@ def test_it_runs_as_a_module_and_names_its_version(command):
     assert done.stdout.split() == ["worldstate", worldstate.__version__]
 
 
+def test_an_audit_of_nothing_fails():
+    done = subprocess.run(["make", "-n", "audit"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "pip-audit --strict -r locked.txt" in done.stdout
+
+
 def test_the_lock_holds_every_requirement():
     def plain(requirement: str) -> str:
         return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
