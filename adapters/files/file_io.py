@@ -181,11 +181,9 @@ class GrowingFile:
     def _make_way(self) -> None:
         """Give this file the name of the one before it, unless that is gone or another's by now."""
         here, before = os.fstat(self._file.fileno()), self._aside
-        _let_go(self._file)
-        if before is None or not (before[0].exists() and os.path.samestat(before[0].stat(), before[1])):
-            self._aside = set_aside(check_target(self.path)), here
-        else:
-            self._aside = check_target(self.path).replace(before[0]), here
+        ours = before and before[0].exists() and os.path.samestat(before[0].stat(), before[1])
+        target = check_target(self.path)
+        self._aside = _set_aside(self._file, target, before[0] if before and ours else None), here
 
     def go_on(self) -> None:
         """Begin a new file if this one is full or gone; else take records again after one that was lost."""
@@ -249,8 +247,7 @@ def claimed_file(path: str | Path) -> io.FileIO:
         if is_named(file, target) and not os.fstat(file.fileno()).st_size:
             return file
         if is_named(file, target):
-            _let_go(file)
-            set_aside(target)
+            _set_aside(file, target)
         file.close()
 
 
@@ -275,20 +272,17 @@ def _lock(file: io.FileIO, path: str | Path) -> None:
         return
 
 
-def _let_go(file: io.FileIO) -> None:
-    """Close a file that shall be renamed where the system needs that; elsewhere its lock keeps others out."""
-    if fcntl is None:
+def _set_aside(file: io.FileIO, target: Path, name: Path | None = None) -> Path:
+    """Rename an open file to `name`, else to NAME.N.SUFFIX with the first number that is free; return it."""
+    if fcntl is None:  # Windows renames no open file; elsewhere its lock keeps other runs out
         file.close()
-
-
-def set_aside(target: Path) -> Path:
-    """Rename a file to NAME.N.SUFFIX, the first number that is free; return that name."""
-    for number in itertools.count(1):
-        aside = target.with_name(f"{target.stem}.{number}{target.suffix}")
+    numbers = itertools.count(1)
+    while name is None:
+        free = target.with_name(f"{target.stem}.{next(numbers)}{target.suffix}")
         with suppress(FileExistsError):
-            aside.touch(exist_ok=False)  # so that no other run takes the same number
-            return target.replace(aside)
-    raise AssertionError
+            free.touch(exist_ok=False)  # so that no other run takes the same number
+            name = free
+    return target.replace(name)
 
 
 def _remove(path: Path) -> None:

@@ -200,9 +200,8 @@ class _Ports:
         """Return what to go on from, with the numbers that were taken last."""
         from worldstate.adapters.files.checkpoint_file import PortNumbers
 
-        taken = [one.numbers for one in self.sockets]
-        numbers = {k: v for held in (self.trust.numbers, *taken) for k, v in held.items()}
-        return replace(last.checkpoint, ports=PortNumbers(numbers) if numbers else None)
+        numbers = {name: number for one in self.sockets for name, number in one.numbers.items()}
+        return replace(last.checkpoint, ports=PortNumbers({**self.trust.numbers, **numbers}))
 
 
 def _with_cameras(
@@ -340,10 +339,7 @@ def _listen(
 
 @contextmanager
 def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[adapters.Step], None]]":
-    """Lend a function that saves --save-state once a minute, and save it at the end, whatever ends the run.
-
-    The error that ends it says what was kept.
-    """
+    """Lend a function that saves --save-state once a minute, and save it at the end, whatever ends it."""
     path, last, saved_ns = arguments.save_state, None, None
 
     def save() -> None:
@@ -363,16 +359,9 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
 
     try:
         yield keep
-    except (ground.WorldstateError, OSError) as error:
-        if last is None:
-            raise
-        until = f"the states up to {ground.seconds(last.state.stamp_ns):.1f} s"
-        with suppress(ground.WorldstateError, OSError):
-            save()
-            until += "" if path is None else f", and all of the belief in {path}"
-        raise ground.WorldstateError(f"{error}. Kept are {until}") from error
     except BaseException:
-        save()
+        with suppress(ground.WorldstateError, OSError):  # what ended the run is told
+            save()
         raise
     save()
 
