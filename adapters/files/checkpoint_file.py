@@ -42,7 +42,7 @@ class Checkpoint:
     street : StreetHearing or None
         `StreetListener.hearing`; likewise.
     ports : PortNumbers or None
-        None of a chain that no port fed.
+        None where no port has a key.
     senses : object or None
         What a `Listener` goes on with at the very next sample: the sound and images of its windows. No file
         holds it.

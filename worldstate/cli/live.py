@@ -200,8 +200,10 @@ class _Ports:
         """Return what to go on from, with the numbers that were taken last."""
         from worldstate.adapters.files.checkpoint_file import PortNumbers
 
-        numbers = {name: number for one in self.sockets for name, number in one.numbers.items()}
-        return replace(last.checkpoint, ports=PortNumbers({**self.trust.numbers, **numbers}))
+        numbers = dict(self.trust.numbers)
+        for one in self.sockets:
+            numbers |= one.numbers
+        return replace(last.checkpoint, ports=PortNumbers(numbers) if numbers else None)
 
 
 def _with_cameras(
