@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from scripted_states import scripted_states
 
 from worldstate.adapters.export.log_messages import mcap_file, state_messages
+from worldstate.adapters.export.other_stacks import osi_trace
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.file_io import GrowingFile, line_writer
 from worldstate.adapters.live.live_sound import kept_sound
@@ -209,6 +211,18 @@ def test_an_mcap_that_is_removed_begins_anew_and_reads(tmp_path, caplog):
                 write(message)
     assert [state.stamp_ns for _, state in read_log(path)] == [state.stamp_ns for state in states[30:]]
     assert "moved or removed" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["trace.osi", "trace.mcap"])
+def test_a_trace_that_is_removed_is_a_notice(tmp_path, caplog, name):
+    pytest.importorskip("osi3")
+    state = scripted_states()[-1]
+    with osi_trace(tmp_path / name, 9.0, GrowingFile) as write:
+        write(state)
+        (tmp_path / name).unlink()
+        write(state)
+    assert "moved or removed" in caplog.text
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_is_removed_ends_no_run(tmp_path, caplog):

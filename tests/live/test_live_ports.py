@@ -14,10 +14,17 @@ import numpy as np
 import pytest
 import soundfile
 
+from worldstate.adapters.files.checkpoint_file import (
+    Checkpoint,
+    PortNumbers,
+    read_checkpoint,
+    save_checkpoint,
+)
 from worldstate.adapters.live import live_sensors
 from worldstate.adapters.live.live_sensors import DetectionSocket, OdometrySocket, Trust
 from worldstate.cli.live import _trust
 from worldstate.cli.main import main
+from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import nanoseconds
 
@@ -46,8 +53,9 @@ def taken(
         sender.bind((host, 0))
     with told:
         for number, datagram in sent:
-            senders[number].sendto(datagram, ("127.0.0.1", told.port))
+            # Before it is sent: the thread that reads counts what it refuses at once.
             done, until_s = len(speeds) + told.refused, time.monotonic() + 5.0
+            senders[number].sendto(datagram, ("127.0.0.1", told.port))
             while len(speeds) + told.refused == done and time.monotonic() < until_s:
                 told.deliver(lambda stamp_ns, record: speeds.append(record.speed_mps))
                 time.sleep(0.005)
@@ -160,6 +168,13 @@ def test_a_datagram_that_was_taken_is_refused_after_a_restart():
         numbers = told.numbers
     assert speeds == [1, 2]
     assert numbers == {"odometry": 8}
+
+
+def test_numbers_are_kept_with_the_belief(tmp_path):
+    save_checkpoint(tmp_path / "a.json", Checkpoint(WorldFilter(), ports=PortNumbers({"odometry": 2**62})))
+    before = read_checkpoint(tmp_path / "a.json")
+    assert _trust(argparse.Namespace(allow=[], key=None), before).numbers == {"odometry": 2**62}
+    assert _trust(argparse.Namespace(allow=[], key=None), Checkpoint(WorldFilter())).numbers == {}
 
 
 def test_rubbish_of_strangers_displaces_nothing_that_waits():
