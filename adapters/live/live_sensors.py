@@ -276,7 +276,7 @@ class DetectionSocket(DatagramSocket[DetectionFrame]):
     def __init__(
         self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None, camera: str = ""
     ) -> None:
-        name = f"detections/{camera}".rstrip("/")
+        name = f"detections/{camera}" if camera else "detections"
         super().__init__(address, stamp_ns, partial(frame_of, where="datagram"), name, trust)
 
 

@@ -9,7 +9,7 @@ import sys
 import textwrap
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
@@ -233,8 +233,9 @@ def _check_paths(arguments: argparse.Namespace) -> None:
     """Refuse a pipe or device in the place of a file: it may never begin, or never end."""
     given = (value if isinstance(value, list) else [value] for value in vars(arguments).values())
     for path in (one for values in given for one in values if isinstance(one, Path)):
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise InputFileError(path, "expected a file, found a device or pipe")
+        with suppress(OSError):  # what opens it says why it cannot be looked at
+            if path.exists() and not (path.is_file() or path.is_dir()):
+                raise InputFileError(path, "expected a file, found a device or pipe")
 
 
 def _without_command(program: Program, words: Sequence[str]) -> int:
