@@ -216,6 +216,7 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
     assert main(["sequences", str(folder), "--boxes", "none", "--start", "1"]) == 0
     printed = capsys.readouterr().out
     assert "seven: 2 approaches, 2 hazard-free recordings" in printed
+    assert "risk, sound alone" in printed
     # Of 3 s that are left T0 is at 2 s: the first hop ends a second before.
     assert "0 + 0" in printed
 

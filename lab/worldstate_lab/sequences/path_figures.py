@@ -236,6 +236,7 @@ def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dic
     return {
         "recordings": len(path.seen),
         "stands_on": run.stands_on,
+        "camera": any(one.hops.about["camera"] for one in path.seen),
         "rows": _rows(run, path, rng),
         "leads": scores[PRODUCT]["leads"],
         "at_onsets": scores[DECISION]["at_onsets"],
