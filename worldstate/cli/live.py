@@ -8,7 +8,7 @@ people. What the machine was too slow for is counted as an overrun, said when it
 silence. Ctrl-C ends the run, and what it wrote is complete. Snapshots, MCAP and sound grow under their own
 name, and read at any time: a killed run loses half a second. What was there before becomes NAME.N.SUFFIX, the
 first number that is free; two runs cannot write one file. A log that cannot be written, or was removed, does
-not end the run: it is said on standard error.
+not end the run: a notice on standard error names it.
 
 --detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
   {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
