@@ -3,9 +3,10 @@
 import heapq
 import logging
 from bisect import insort
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Unpack
@@ -185,6 +186,7 @@ class Listener:
         self._waiting = _Waiting(source.others, self._since_ns)
         self._part = max(int(sample_rate_hz / PARTS_PER_SECOND), 1)
         self._first_ns, self._samples, self._warned = source.start_ns, 0, set[str]()
+        self._ahead: list[tuple[int, str, Callable[[], None]]] = []
         senses = None if source.before is None else source.before.senses
         if isinstance(senses, Senses) and start_s is None:
             self._go_on(senses)
@@ -225,9 +227,11 @@ class Listener:
     def add(self, *told: Timed) -> None:
         """Take odometry, positions or measurements of other sensors; each counts from its own stamp on.
 
-        What is stamped more than two seconds from the sound is refused and counted.
+        What is stamped more than two seconds before the sound, or after what is pushed next, is refused and
+        counted.
         """
-        self._waiting.add([one for one in told if self._is_near(one.stamp_ns, one.source)])
+        for one in told:
+            self._take(one.stamp_ns, one.source, partial(self._waiting.add, (one,)))
 
     def skip(self, lost_ns: int) -> None:
         """Let time go on by sound that was lost and is not pushed as silence.
@@ -266,8 +270,8 @@ class Listener:
     def look(self, stamp_ns: int, frame: DetectionFrame, camera: str = SENSOR) -> None:
         """Take what a running detector found in an image; of several cameras the one is named.
 
-        One that was taken more than two seconds from the sound is refused, and so are boxes outside the
-        image; `WorldState.delivery` counts them.
+        One that was taken more than two seconds before the sound, or after what is pushed next, is refused,
+        and so are boxes outside the image; `WorldState.delivery` counts them.
 
         Parameters
         ----------
@@ -289,14 +293,27 @@ class Listener:
             check_mounting(self._source.array)
             self._blind = False
         query = self._cameras[one_of("camera", camera, self._cameras)]
-        if self._is_near(query.taken_ns(stamp_ns), camera):
-            before = query.outside
-            query.see(stamp_ns, frame)
-            self.refuse(query.outside - before)
+        self._take(query.taken_ns(stamp_ns), camera, partial(self._see, query, stamp_ns, frame))
+
+    def _see(self, query: VisionQuery, stamp_ns: int, frame: DetectionFrame) -> None:
+        before = query.outside
+        query.see(stamp_ns, frame)
+        self.refuse(query.outside - before)
+
+    def _take(self, stamp_ns: int, name: str, take: Callable[[], None]) -> None:
+        """Take what is near the sound; what is ahead of it waits for the sound that is pushed next."""
+        if stamp_ns > self._now_ns() + LAG_NS:
+            self._ahead.append((stamp_ns, name, take))
+        elif self._is_near(stamp_ns, name):
+            take()
+
+    def _now_ns(self) -> int:
+        """Return the time of the sound up to which it was pushed."""
+        return self._first_ns + nanoseconds(self._samples / self._rate_hz)
 
     def _is_near(self, stamp_ns: int, name: str) -> bool:
         """Return whether a stamp is near the sound that was pushed; else count it, and warn of the first."""
-        now_ns = self._first_ns + nanoseconds(self._samples / self._rate_hz)
+        now_ns = self._now_ns()
         if abs(stamp_ns - now_ns) <= LAG_NS:
             return True
         self.refuse(1)
@@ -351,6 +368,10 @@ class Listener:
         """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
         hear = self._adapter.front_end
         self._samples += 0 if block is None else len(block)
+        ahead, self._ahead = self._ahead, []
+        for stamp_ns, name, take in ahead:
+            if self._is_near(stamp_ns, name):
+                take()
         for frames in [hear.finish()] if block is None else map(hear.process, self._parts(block)):
             for frame in frames:
                 # What the belief to go on from has taken in already only fills the windows.

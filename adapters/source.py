@@ -19,13 +19,7 @@ from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.sound_file import SoundInput, SoundStream, as_sound, path_of
 from worldstate.adapters.camera.camera_channel import seen_in, video_degradation
-from worldstate.adapters.camera.detections import (
-    IMAGE_RATE_HZ,
-    DetectionFilter,
-    DetectionLog,
-    Detector,
-    read_any_detections,
-)
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector, read_any_detections
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
@@ -39,14 +33,8 @@ from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
-from worldstate.ground import (
-    InputFileError,
-    InvalidArgumentError,
-    NotUsable,
-    in_range,
-    nanoseconds,
-    seconds,
-)
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
+from worldstate.ground.values import seconds
 from worldstate.state import Context
 
 from .acoustic import Grounding, Signature
@@ -444,51 +432,42 @@ def check_clocks(source: Source, length_s: float | None) -> None:
     """
     begins_s = seconds(source.start_ns)
     ends_s = begins_s + (_ONE_DAY_S if length_s is None else length_s)
-    for log, offset_s in _logs(source):
-        if log.counted_hz is None and (off := _off_clock(log.stamps_ns.tolist(), begins_s, ends_s)):
-            together_s = offset_s + begins_s - seconds(int(log.stamps_ns[0]))
-            way_on = f'"stamp_offset_s": {together_s:.1f} of its camera would make both begin together'
-            raise InputFileError(log.source, f"{off}: {way_on}")
-        if log.assumed and length_s is not None:
-            _check_rate(log, seconds(int(log.stamps_ns[-1])) - begins_s - offset_s, length_s)
-    for other in source.others:
-        stamped = [(one.stamp_ns, one.source) for one in other()]
-        if off := _off_clock([stamp_ns for stamp_ns, _ in stamped], begins_s, ends_s):
-            way_on = "the sound begins at --start (start_s), that of a bag at its first stamp"
-            raise InputFileError(stamped[0][1], f"{off}: {way_on}")
-
-
-def _logs(source: Source) -> list[tuple[DetectionLog, float]]:
-    """Return what each camera reported, and the offset of its stamps."""
     held = [(source.detections, source.camera)]
     if source.co_evidence is not None:
         held = [(one.detections, one.camera) for one in source.co_evidence.cameras.values()]
-    return [(log, camera.stamp_offset_s) for log, camera in held if log]
+    for log, offset_s in [(log, camera.stamp_offset_s) for log, camera in held if log]:
+        if log.counted_hz is None:
+            together_s = offset_s + begins_s - seconds(int(log.stamps_ns[0]))
+            way_on = f'"stamp_offset_s": {together_s:.1f} of its camera would make both begin together'
+            _check_stamps(log.source, log.stamps_ns.tolist(), begins_s, ends_s, way_on)
+        elif log.assumed and length_s is not None:
+            _check_rate(log, seconds(int(log.stamps_ns[-1])) - begins_s - offset_s, length_s)
+    for told in filter(None, ([*other()] for other in source.others)):
+        way_on = "the sound begins at --start (start_s), that of a bag at its first stamp"
+        _check_stamps(told[0].source, [one.stamp_ns for one in told], begins_s, ends_s, way_on)
 
 
-def _off_clock(stamps_ns: Sequence[int], begins_s: float, ends_s: float) -> str:
-    """Return what is wrong with stamps if none lies within the sound, or all are off by a time scale."""
-    if not stamps_ns:
-        return ""
+def _check_stamps(name: str, stamps_ns: Sequence[int], begins_s: float, ends_s: float, way_on: str) -> None:
+    """Refuse stamps none of which lies within the sound, or that are off by a time scale from end to end."""
     first_s, last_s = seconds(stamps_ns[0]), seconds(stamps_ns[-1])
     off_s, off_at_end_s = first_s - begins_s, last_s - ends_s
     scale = any(max(abs(abs(off_s) - one), abs(off_at_end_s - off_s)) < _SAME_S for one in _TIME_SCALES_S)
-    if not scale and any(begins_s <= seconds(stamp_ns) <= ends_s for stamp_ns in stamps_ns):
-        return ""
-    expected = f"expected stamps on the clock of the sound, {begins_s:.1f} to {ends_s:.1f} s"
-    return f"{expected}, got {first_s:.1f} to {last_s:.1f} s"
+    if scale or not any(begins_s <= seconds(stamp_ns) <= ends_s for stamp_ns in stamps_ns):
+        expected = f"expected stamps on the clock of the sound, {begins_s:.1f} to {ends_s:.1f} s"
+        raise InputFileError(name, f"{expected}, got {first_s:.1f} to {last_s:.1f} s: {way_on}")
 
 
 def _check_rate(log: DetectionLog, last_s: float, length_s: float) -> None:
     """Refuse images of a rate that was not stated, where they go on after the sound or fit another rate."""
-    images = round(last_s * IMAGE_RATE_HZ) + 1
+    assumed_hz = log.counted_hz or 0.0
+    images = round(last_s * assumed_hz) + 1
     rate_hz = images / length_s
     # Where the last one has a box, those after it may not be listed.
     slow = not len(log.frames[-1]) and any(abs(rate_hz / one - 1.0) < _SAME_LENGTH for one in _SLOW_RATES_HZ)
-    if slow or images / IMAGE_RATE_HZ > length_s * (1.0 + _SAME_LENGTH) + _LONGER_S:
+    if slow or images / assumed_hz > length_s * (1.0 + _SAME_LENGTH) + _LONGER_S:
         got = f"got {images} in {length_s:.1f} s of sound, {rate_hz:.3g} a second"
         way_on = "state their rate (--image-rate, image_rate_hz, frame_rate_hz)"
-        raise InputFileError(log.source, f"expected {IMAGE_RATE_HZ:g} images a second, {got}: {way_on}")
+        raise InputFileError(log.source, f"expected {assumed_hz:g} images a second, {got}: {way_on}")
 
 
 def check_mounting(array: MicrophoneArray) -> None:

@@ -101,26 +101,25 @@ class DetectionFrame:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def cut(self, size_px: tuple[int, int]) -> tuple["DetectionFrame", int, int]:
-        """Return the boxes within an image, how many were cut at its border, and how many lie outside.
+    def cut(self, size_px: tuple[int, int]) -> tuple["DetectionFrame", int]:
+        """Return the boxes within an image, cut at its border, and how many reach beyond or lie outside.
 
         Examples
         --------
         >>> boxes = np.array([[500.0, 20.0, 645.0, 140.0], [700.0, 20.0, 760.0, 140.0]])
-        >>> frame, *counts = DetectionFrame(boxes, np.array([0.9, 0.8]), ("car", "car")).cut((640, 480))
-        >>> frame.boxes_px.tolist(), counts
-        ([[500.0, 20.0, 640.0, 140.0]], [1, 1])
+        >>> frame, beyond = DetectionFrame(boxes, np.array([0.9, 0.8]), ("car", "car")).cut((640, 480))
+        >>> frame.boxes_px.tolist(), beyond
+        ([[500.0, 20.0, 640.0, 140.0]], 2)
         """
-        size = np.tile(size_px, 2)
-        within: FloatArray = np.clip(self.boxes_px, 0.0, size)
+        within: FloatArray = np.clip(self.boxes_px, 0.0, np.tile(size_px, 2))
         beyond: BoolArray = np.any(np.abs(self.boxes_px - within) > BORDER_PX, axis=1)
         if not beyond.any():
-            return self, 0, 0
-        outside = beyond & np.any(within[:, 2:] <= within[:, :2], axis=1)
-        kept = np.flatnonzero(~outside)
+            return self, 0
+        there = (self.boxes_px[:, 2:] > 0.0) & (self.boxes_px[:, :2] < size_px)
+        kept = np.flatnonzero(~beyond | there.all(axis=1))
         boxes = np.where(beyond[:, None], within, self.boxes_px)[kept]
         frame = DetectionFrame(boxes, self.scores[kept], tuple(self.labels[i] for i in kept))
-        return frame, int((beyond & ~outside).sum()), int(outside.sum())
+        return frame, int(beyond.sum())
 
     def select(self, keep: "DetectionFilter") -> IntArray:
         """Return the indices of the boxes that `keep` lets through."""
@@ -691,10 +690,7 @@ def _mot_row(line: str, where: str) -> tuple[int, Row]:
 
 
 def _log(
-    path: Path,
-    rows: Mapping[int, list[Row]],
-    frame_rate_hz: float | None,
-    looked: Sequence[int] | int | None,
+    path: Path, rows: Mapping[int, list[Row]], rate_hz: float | None, looked: Sequence[int] | int | None
 ) -> DetectionLog:
     """Stamp the images that were looked at: those of these numbers, so many, or up to the last with a box."""
     count = max(rows, default=-1) + 1
@@ -706,11 +702,11 @@ def _log(
         raise InputFileError(path, f"expected {count} to {MAX_FRAMES} images by its boxes, got {looked}")
     numbers = looked if isinstance(looked, Sequence) else range(looked or 0)
     if looked is None and rows:
-        numbers = _numbers_up_to_the_last(path, rows, stated=frame_rate_hz is not None)
+        numbers = _numbers_up_to_the_last(path, rows, stated=rate_hz is not None)
     if max(map(len, rows.values()), default=0) > MAX_BOXES_A_FRAME:
         raise InputFileError(path, f"expected at most {MAX_BOXES_A_FRAME} boxes a frame")
     found = tuple(frame_of_rows(rows.get(number, [])) for number in numbers)
-    return DetectionLog.at_rate(found, frame_rate_hz, str(path), numbers)
+    return DetectionLog.at_rate(found, rate_hz, str(path), numbers)
 
 
 def _numbers_up_to_the_last(path: Path, named: Collection[int], *, stated: bool) -> range:

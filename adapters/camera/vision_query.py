@@ -18,11 +18,11 @@ from worldstate.abduction.co_evidence import (
     default_miss_rates,
 )
 from worldstate.core.filter import MOST_BOXES
-from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, NotUsable
+from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
-from .detections import BORDER_PX, PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
+from .detections import PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
@@ -93,8 +93,8 @@ class VisionQuery:
 
     Attributes
     ----------
-    cut, outside : int
-        Boxes of a running camera that were cut at the border of the image, and left out as outside of it.
+    beyond, outside : int
+        Boxes of a running camera that reached beyond the image, and those of them that were left out.
 
     Examples
     --------
@@ -126,7 +126,7 @@ class VisionQuery:
         self._line_of_sight = line_of_sight
         self._clutter = clutter or (lambda d: _CLUTTER_RATE)
         self._asked = detections is not None
-        self.cut = self.outside = 0
+        self.beyond = self.outside = 0
         log = within_images(camera, NO_LOOKS if detections is None else detections)
         self._other_ns: int | None = None
         self._take(replace(log, frames=tuple(_most_likely(frame, self.keep) for frame in log.frames)))
@@ -170,10 +170,10 @@ class VisionQuery:
         'Absent'
         """
         before, taken_ns = self.detections, self.taken_ns(stamp_ns)
-        found, cut, outside = frame.cut(_size_px(self.camera))
-        if outside and not len(found):
+        found, beyond = frame.cut(_size_px(self.camera))
+        if beyond and not len(found):
             raise InputFileError(before.source, _other_size(self.camera, frame))
-        self.cut, self.outside = self.cut + cut, self.outside + outside
+        self.beyond, self.outside = self.beyond + beyond, self.outside + len(frame) - len(found)
         # A look that comes late is put in its place: one that is stamped ahead keeps no other out.
         at = int(np.searchsorted(before.stamps_ns, taken_ns))
         if (np.abs(before.stamps_ns[max(at - 1, 0) : at + 1] - taken_ns) < LEAST_APART_NS).any():
@@ -353,18 +353,17 @@ def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
     An image of which all boxes lie outside counts as not looked at.
     """
     parts = [frame.cut(_size_px(camera)) for frame in log.frames]
-    cut, outside = sum(part[1] for part in parts), sum(part[2] for part in parts)
-    if not cut + outside:
+    if not (beyond := sum(count for _, count in parts)):
         return log
-    beyond_px = np.concatenate([_beyond_px(camera, frame) for frame in log.frames])
-    few = len(beyond_px) < _FEW_BOXES
-    mostly = not few and np.median(beyond_px) > BORDER_PX and beyond_px.max() > _FAR_BEYOND * camera.width_px
-    if mostly or outside > max(_MOST_OUTSIDE * len(beyond_px), 1.0):
-        number = next(i for i, part in enumerate(parts) if part[1] + part[2])
+    boxes_px, size_px = np.concatenate([one.boxes_px for one in log.frames]), np.tile(_size_px(camera), 2)
+    boxes, outside = len(boxes_px), len(boxes_px) - sum(len(frame) for frame, _ in parts)
+    far = np.abs(boxes_px - np.clip(boxes_px, 0.0, size_px)).max() > _FAR_BEYOND * camera.width_px
+    if (far and 2 * beyond > boxes >= _FEW_BOXES) or outside > max(_MOST_OUTSIDE * boxes, 1.0):
+        number = next(i for i, (_, count) in enumerate(parts) if count)
         raise InputFileError(log.source, f"frame {number}: {_other_size(camera, log.frames[number])}")
-    told = "%s: %d boxes reach beyond the image and are cut at its border, %d lie outside and are left out"
-    _LOG.warning(told, log.source, cut, outside)
-    kept = [i for i, (frame, _, out) in enumerate(parts) if len(frame) or not out]
+    told = "%s: %d boxes reach beyond the image and are cut at its border; %d of them, outside, are left out"
+    _LOG.warning(told, log.source, beyond, outside)
+    kept = [i for i, (frame, count) in enumerate(parts) if len(frame) or not count]
     return replace(log, frames=tuple(parts[i][0] for i in kept), stamps_ns=log.stamps_ns[kept])
 
 
@@ -372,16 +371,9 @@ def _size_px(camera: PinholeCamera) -> tuple[int, int]:
     return camera.width_px, camera.height_px
 
 
-def _beyond_px(camera: PinholeCamera, frame: DetectionFrame) -> FloatArray:
-    """Return by how much each box reaches beyond the image, shape (n,); below 0 within."""
-    corners = frame.boxes_px.reshape(-1, 2, 2)
-    return np.asarray(np.maximum(corners - _size_px(camera), -corners).max(axis=(1, 2)))
-
-
 def _other_size(camera: PinholeCamera, frame: DetectionFrame) -> str:
-    """Return what is wrong with boxes outside the images of a camera."""
-    box = frame.boxes_px[_beyond_px(camera, frame).argmax()]
-    corners = box.reshape(2, 2)
+    """Return what is wrong with boxes beyond the images of a camera."""
+    corners = frame.boxes_px.reshape(-1, 2)
     x, y = corners[np.maximum(corners - _size_px(camera), -corners).max(axis=1).argmax()]
     image = f"the camera's {camera.width_px} x {camera.height_px} px"
     return f"expected boxes within {image}, got a corner at ({x:g}, {y:g})"

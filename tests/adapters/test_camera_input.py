@@ -2,11 +2,14 @@
 
 import json
 import math
+import re
 
 import cv2
 import numpy as np
 import pytest
 import soundfile
+from hypothesis import given
+from hypothesis import strategies as st
 
 from worldstate.adapters.camera.detections import (
     DetectionFilter,
@@ -18,6 +21,7 @@ from worldstate.adapters.camera.detections import (
 from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.listener import Listener, listen
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.adapters.vehicle.car_file import read_camera_setup
@@ -194,13 +198,13 @@ def test_images_of_a_camera_that_is_not_described_are_refused_beside_another_arr
     anything, empty = ListenSettings(uncalibrated=True), DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     seen = DetectionLog.at_rate([empty] * 3, 10.0)
     soundfile.write(tmp_path / "a.wav", np.zeros((48_000, 3)), 48_000)
-    for given in ({"detections": seen}, {"detections": seen, "camera": PinholeCamera.ovad()}):
+    for beside in ({"detections": seen}, {"detections": seen, "camera": PinholeCamera.ovad()}):
         try:
-            open_source(tmp_path / "a.wav", array=array, settings=anything, **given)
+            open_source(tmp_path / "a.wav", array=array, settings=anything, **beside)
             refused = False
         except InvalidArgumentError as error:
             refused = "where it stands" in str(error)
-        assert refused == ("camera" not in given)
+        assert refused == ("camera" not in beside)
     with pytest.raises(InvalidArgumentError, match="where it stands beside the array"):
         Listener(array, 48_000, settings=anything).look(0, empty)
     Listener(ovad_array(), 48_000).look(0, empty)
@@ -227,3 +231,110 @@ def test_results_without_their_images_are_read_and_nothing_looked_at_is_told(tmp
     (tmp_path / "d.json").write_text("[]")
     assert main(["run", str(watched), "--detections", str(tmp_path / "d.json")]) == 0
     assert "no image was looked at" in capsys.readouterr().err
+
+
+EDGES = st.tuples(*[st.floats(-300.0, 900.0)] * 2).map(sorted)
+
+
+@given(across=st.lists(st.tuples(EDGES, EDGES), max_size=8))
+def test_boxes_are_cut_at_the_image_and_those_outside_left_out(across):
+    boxes = np.array([[left, top, right, bottom] for (left, right), (top, bottom) in across]).reshape(-1, 4)
+    frame = DetectionFrame(boxes, np.linspace(0.0, 1.0, len(boxes)), tuple(map(str, range(len(boxes)))))
+    found, beyond = frame.cut((640, 480))
+    kept = [int(label) for label in found.labels]
+    assert kept == sorted(kept)
+    assert found.scores.tolist() == frame.scores[kept].tolist()
+    within = np.clip(boxes, 0, [640, 480] * 2)
+    moved = np.abs(boxes - within).max(axis=1, initial=0.0) > 1.0
+    assert beyond == moved.sum()
+    assert found.boxes_px.tolist() == np.where(moved[:, None], within, boxes)[kept].tolist()
+    for left_out in {*range(len(boxes))} - {*kept}:
+        left, top, right, bottom = boxes[left_out]
+        assert right <= 0 or bottom <= 0 or left >= 640 or top >= 480
+    assert beyond or found is frame
+
+
+SMALL = PinholeCamera.ovad(width_px=640, height_px=402)
+INSIDE, OUTSIDE = (100.0, 100.0, 300.0, 300.0), (700.0, 100.0, 900.0, 300.0)
+# Boxes of a recording, by image; whether they are of this camera, and how many images were looked at.
+OF_IMAGES = {
+    "within": ([[INSIDE]] * 10, True, 10),
+    "five pixels outside": ([[(500.0, 100.0, 645.0, 300.0)]] * 10, True, 10),
+    "above and below": ([[(100.0, -5.0, 200.0, 405.0)]] * 10, True, 10),
+    "leaves as a whole object": ([[(80 * i, 100, 300 + 80 * i, 300)] for i in range(8)], True, 8),
+    "a tracker that goes on for two images": ([[INSIDE]] * 20 + [[OUTSIDE]] * 2, True, 20),
+    "one of two": ([[INSIDE, OUTSIDE], *[[INSIDE]] * 12], True, 13),
+    "larger images": ([[(3 * left, 300, 3 * left + 500, 900)] for left in range(0, 600, 50)], False, 0),
+    "larger images, to the left": ([[(left, 500, left + 300, 900)] for left in range(0, 300, 50)], False, 0),
+    "all outside": ([[OUTSIDE]] * 10, False, 0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_IMAGES)
+def test_boxes_of_larger_images_are_refused_and_others_are_cut(name, caplog):
+    images, fit, looked = OF_IMAGES[name]
+    frames = [
+        DetectionFrame(np.array(rows), np.full(len(rows), 0.9), ("car",) * len(rows)) for rows in images
+    ]
+    log = DetectionLog.at_rate(frames, 10.0, "boxes.json")
+    if not fit:
+        with pytest.raises(
+            InputFileError, match=r"boxes.json: frame \d+: expected boxes within .* 640 x 402 px"
+        ):
+            VisionQuery(SMALL, log)
+        return
+    seen = VisionQuery(SMALL, log).detections
+    assert len(seen) == looked
+    boxes_px = np.concatenate([frame.boxes_px for frame in seen.frames])
+    assert boxes_px.min() >= 0.0 and (boxes_px <= [640, 402, 640, 402]).all()
+    assert ("are cut at its border" in caplog.text) == (name != "within")
+
+
+def test_of_a_running_camera_boxes_outside_are_counted_and_an_image_of_them_alone_is_refused():
+    listener = Listener(ovad_array(), 48_000, camera=SMALL)
+    score = np.array([0.9, 0.9])
+    listener.look(0, DetectionFrame(np.array([INSIDE, OUTSIDE]), score, ("car", "car")))
+    assert listener.world.state.delivery.refused == 1
+    with pytest.raises(InputFileError, match="640 x 402 px, got a corner"):
+        listener.look(10**8, DetectionFrame(np.array([OUTSIDE]), score[:1], ("car",)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (
+            {"horizontal_fov_deg": 181},
+            r"camera.horizontal_fov_deg: expected a number in \(0.0, 180.0\), got 181",
+        ),
+        ({"horizontal_fov_deg": 0}, "camera.horizontal_fov_deg"),
+        ({"pitch_deg": 90}, r"camera.pitch_deg: .* got 90"),
+        ({"roll_deg": -95}, r"camera.roll_deg: .* got -95"),
+        ({"horizontal_fov_deg": None, "fx": 500, "cx": 900}, r"camera.cx: .* got 900"),
+        ({"horizontal_fov_deg": None, "fx": -1}, "camera.fx"),
+        ({"position_m": [1200, 0, 0]}, r"camera.position_m: expected less than 10 m .*got \[1200"),
+        ({"min_box_px": -1}, "camera.min_box_px"),
+        ({"min_score": 75}, "camera.min_score"),
+        ({"image_rate_hz": 0}, "camera.image_rate_hz"),
+        ({"stamp_offset_s": 1e11}, "stamp_offset_s"),
+        ({"width_px": 0}, "width_px"),
+    ],
+)
+def test_a_wrong_number_of_a_camera_is_named_as_it_was_written(wrong, named, tmp_path):
+    lens = {"width_px": 640, "height_px": 402, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]} | wrong
+    (tmp_path / "c.json").write_text(
+        json.dumps({key: value for key, value in lens.items() if value is not None})
+    )
+    with pytest.raises(InputFileError, match=named) as refused:
+        read_camera_setup(tmp_path / "c.json")
+    assert not re.search("half_angle|_rad|principal|nominal|min_height", str(refused.value))
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "wrapped_deg"), [(350.0, -10.0), (-190.0, 170.0), (180.0, 180.0), (725.0, 5.0)]
+)
+def test_the_yaw_of_a_camera_goes_round(yaw_deg, wrapped_deg, tmp_path):
+    lens = {"width_px": 640, "height_px": 402, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
+    (tmp_path / "c.json").write_text(json.dumps(lens | {"yaw_deg": yaw_deg, "stamp_offset_s": -1.7e9}))
+    camera, _ = read_camera_setup(tmp_path / "c.json")
+    assert math.degrees(camera.yaw_rad) == pytest.approx(wrapped_deg)
+    assert camera.stamp_offset_s == -1.7e9

@@ -110,7 +110,7 @@ def test_the_demo_s_recording_is_pushed_as_run_hears_it(approach, tmp_path: Path
 
 
 def test_a_checkpoint_of_a_file_goes_on_from_a_second_before_it(tmp_path: Path, model: Model) -> None:
-    told = [Odometry("wheels", nanoseconds(at), 0.0) for at in (0.4, 1.4, 1.9)]
+    told = [Odometry("wheels", nanoseconds(at), 0.0) for at in (0.4, 1.4, 2.4)]
     whole = Listener(ARRAY, RATE_HZ, model=model)
     whole.add(*told)
     first, rest = whole.push(SOUND[: 2 * RATE_HZ]), None

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
-from worldstate.adapters.files.odometry_file import read_odometry
+from worldstate.adapters.camera.detections import read_any_detections
+from worldstate.adapters.files.odometry_file import OdometryRecord, read_odometry
 from worldstate.belief.association import reached_edge
 from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.kinematics.cartesian import EgoBelief, driven
@@ -221,3 +222,40 @@ def test_a_run_with_odometry_drives_up_to_the_corner(approach, tmp_path) -> None
         assert state["ego"]["position_m"] == pytest.approx([x, 0.0], abs=1e-6)
         edge = state["context"]["occluders"][0]["edge_azimuth_rad"]
         assert edge == pytest.approx(math.atan2(4.0, 20.0 - x), abs=1e-6)
+
+
+@given(
+    turns=st.integers(-1000, 1000), yaw_rad=st.floats(-3.1, 3.1), told_as=st.sampled_from(["csv", "datagram"])
+)
+def test_the_yaw_of_a_localiser_that_counts_on_is_wrapped(turns, yaw_rad, told_as, tmp_path_factory) -> None:
+    counted = yaw_rad + 2.0 * math.pi * turns
+    if told_as == "csv":
+        path = tmp_path_factory.getbasetemp() / "yaw.csv"
+        path.write_text(f"time_s,speed_mps,x_m,y_m,yaw_rad\n0,5,0,0,{counted!r}\n")
+        told = read_odometry(path).told[0]
+    else:
+        told = OdometryRecord(5.0, 0.0, 5.4e6, 6.9e5, counted).at(0)  # UTM
+    assert told.speed_mps == 5.0 and told.pose is not None
+    assert told.pose.yaw_rad == pytest.approx(yaw_rad, abs=1e-9)
+
+
+def test_a_localiser_that_is_silent_at_times_leaves_its_cells_empty(tmp_path) -> None:
+    path = tmp_path / "ego.csv"
+    path.write_text("time_s,speed_mps,x_m,y_m,yaw_rad\n0,5,,,\n0.1,5,1,2,3\n")
+    assert [one.pose is None for one in read_odometry(path).told] == [True, False]
+    path.write_text("time_s,speed_mps,x_m,y_m,yaw_rad\n0,5,1e9,0,0\n")
+    with pytest.raises(InputFileError, match="line 2: x_m: expected a number in"):
+        read_odometry(path)
+    path.write_text("time_s,speed_mps\n0,\n")
+    with pytest.raises(InputFileError, match="line 2: expected a finite number as speed_mps"):
+        read_odometry(path)
+
+
+@pytest.mark.slow
+def test_an_hour_of_odometry_and_of_images_is_read(tmp_path) -> None:
+    lines = (f"{i / 100},{5 + i % 7 / 10},{i * 0.05:.3f},0.1,{i * 1e-3:.4f}\n" for i in range(360_000))
+    (tmp_path / "ego.csv").write_text("time_s,speed_mps,x_m,y_m,yaw_rad\n" + "".join(lines))
+    assert len(read_odometry(tmp_path / "ego.csv").told) == 360_000
+    image = {"boxes": [[100.5, 200.5, 300.5, 400.5]] * 3, "scores": [0.9] * 3, "classes_str": ["car"] * 3}
+    (tmp_path / "d.json").write_text(json.dumps({"detections_per_frame": [image] * 108_000}))
+    assert len(read_any_detections(tmp_path / "d.json", 30.0)) == 108_000
