@@ -30,7 +30,7 @@ _UNKNOWN_SIZE = 0xFFFFFFFF
 # 0x7FFFFF00, SoX 0x7FFFF000, ffmpeg 0xFFFFFFFF, some rounded to whole samples of all channels.
 _OPEN_SIZE, _NEAR_BYTES = 1 << 31, 1 << 16
 # Enough samples to see how they are stored.
-_LOOK_BYTES = 1 << 16
+LOOK_BYTES = 1 << 16
 # By the format's tag (1 whole numbers, 3 floats) and the bytes of a sample.
 _STORED = {
     (1, 1): "PCM_U8",
@@ -129,7 +129,7 @@ class WaveLayout:
         """Whether 24 bits stand in the lower bytes, as arecord writes them, or in the upper as all others."""
         with self.path.open("rb") as file:
             file.seek(self.first_byte)
-            return four_byte_form(file.read(_LOOK_BYTES)) == "s24_32"
+            return four_byte_form(file.read(LOOK_BYTES)) == "s24_32"
 
 
 class PlainSamples:

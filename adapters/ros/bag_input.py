@@ -2,9 +2,10 @@
 
 import io
 import logging
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,22 +13,26 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.audio import sound_file
-from worldstate.adapters.audio.plain_samples import MAX_CHANNELS, MAX_RATE_HZ, Encoding
+from worldstate.adapters.audio.plain_samples import LOOK_BYTES, MAX_CHANNELS, MAX_RATE_HZ, Encoding
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
+from worldstate.adapters.datasets.ovad import AUDIO_NAME
 from worldstate.adapters.export.log_messages import check_chunks
 from worldstate.adapters.files.array_file import named_arrays
-from worldstate.adapters.files.file_io import MAX_BYTES, read_text, refused_as_file
+from worldstate.adapters.files.file_io import MAX_BYTES, in_order, read_text, refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, WorldstateError, seconds
 from worldstate.ground.extras import optional
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import Float32Array, FloatArray, IntArray
 from worldstate.measurement.odometry import Odometry
 
 from . import message_types as types
 from .message_types import instant_of, stamp_of, typestore
+from .sample_clock import begins_again, contradiction, early_ns, lost_before
 
-METADATA_NAME, STORAGE_SUFFIXES = "metadata.yaml", (".mcap", ".db3")
+# What may mend a file of each storage.
+_MENDED = {".mcap": "`mcap recover IN -o OUT`", ".db3": "`sqlite3 IN .recover | sqlite3 OUT`"}
+METADATA_NAME, STORAGE_SUFFIXES = "metadata.yaml", tuple(_MENDED)
 # Half a second of a thousand microphones; an image of detections is far below it.
 MAX_MESSAGE_BYTES = 64 << 20
 
@@ -40,7 +45,15 @@ def is_bag(path: Path) -> bool:
     >>> is_bag(Path("drive.mcap")), is_bag(Path("street.wav"))
     (True, False)
     """
-    return path.suffix in STORAGE_SUFFIXES or (path / METADATA_NAME).is_file()
+    if path.suffix in STORAGE_SUFFIXES or (path / METADATA_NAME).is_file():
+        return True
+    return path.is_dir() and not (path / AUDIO_NAME).exists() and _storage_of(path) != [path]
+
+
+def _storage_of(path: Path) -> list[Path]:
+    """Return what is opened of a bag: its folder or file, and the files of a folder without metadata."""
+    files = [] if (path / METADATA_NAME).is_file() else [path.glob(f"*{kind}") for kind in STORAGE_SUFFIXES]
+    return sorted(one for found in files for one in found) or [path]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +125,7 @@ def open_bag(path: Path) -> Iterator[BagReader]:
         if (metadata := path / METADATA_NAME).is_file():
             _check_packing(metadata, metadata.stat().st_mtime_ns)
         # Bags of before ROS 2 Iron hold no definitions; then those that ship here count.
-        reader = AnyReader([path], default_typestore=store)
+        reader = AnyReader(_storage_of(path), default_typestore=store)
         reader.open()
     try:
         yield BagReader(path, reader)
@@ -143,7 +156,10 @@ def refused_as_bag(path: Path) -> Iterator[None]:
         said = " ".join(str(error).split()) or type(error).__name__
         if "rofile" in said:  # An MCAP file of another program, such as `run --export mcap=FILE`
             said += "; `worldstate log replay` reads files of snapshots"
-        raise InputFileError(path, f"expected a bag of ROS 2 that can be read ({said:.200})") from error
+        kind = ".db3" if path.suffix == ".db3" or any(path.glob("*.db3")) else ".mcap"
+        way_on = f"{_MENDED[kind]} may save a file that was cut, `ros2 bag reindex` a folder"
+        problem = f"expected a bag of ROS 2 that can be read ({said:.200}); {way_on}"
+        raise InputFileError(path, problem) from error
 
 
 _LOG = logging.getLogger(__name__)
@@ -151,43 +167,52 @@ _LOG = logging.getLogger(__name__)
 AUDIO_KINDS = types.AUDIO, types.STAMPED_PCM, types.PCM, types.AUDIO_FRAME, types.RAW_AUDIO
 # Formats by the message that names them; a compressed one has lost the phase between microphones.
 ENCODINGS: dict[str, dict[str, Encoding]] = {
-    types.PCM_INFO: {"S16LE": "s16", "S24LE": "s24", "S32LE": "s32", "F32LE": "f32"},
-    types.AUDIO_FRAME: {"signed_16": "s16", "signed_24": "s24", "signed_32": "s32", "float": "f32"},
+    types.PCM_INFO: {"S16LE": "s16", "S24LE": "s24", "S24_32LE": "s24_32", "S32LE": "s32", "F32LE": "f32"},
+    types.AUDIO_FRAME: {
+        "signed_16": "s16",
+        "signed_24": "s24",
+        "signed_padded_24": "s24_32",
+        "signed_32": "s32",
+        "float": "f32",
+    },
     types.RAW_AUDIO: {"pcm-s16": "s16"},
 }
 # Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
 LONGEST_GAP_S = 2.0
+_MISSING = "%s: %.3f s of %s are missing at %.3f s"
 STATIC_TOPIC = "/tf_static"
 # Of a quaternion, as tf2 has it.
 _LENGTH_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AudioBlock:
-    """Samples of one message."""
+class AudioPacket:
+    """The bytes of one message, which may begin and end within a sample."""
 
     stamp_ns: int  # Time of the first sample
-    sample_rate_hz: int
-    samples: Float32Array  # Shape (n, M), full scale 1
+    recorded_ns: int
+    pcm: sound_file.RawPcm
+    data: bytes
 
     @property
-    def duration_s(self) -> float:
-        """Length, seconds."""
-        return len(self.samples) / self.sample_rate_hz
-
-    @property
-    def end_ns(self) -> int:
-        """Time of the sample that would follow."""
-        return self.stamp_ns + round(len(self.samples) * 1_000_000_000 / self.sample_rate_hz)
+    def length_ns(self) -> float:
+        """Length of the samples, ns."""
+        return len(self.data) * 1e9 / (self.pcm.frame_bytes * self.pcm.sample_rate_hz)
 
 
 @dataclass(frozen=True, slots=True)
 class BagSound(sound_file.SoundStream):
-    """A topic of a bag that holds sound, on the clock of its stamps."""
+    """A topic of a bag that holds sound. Samples are its clock, from the stamp of the first one on."""
 
     path: Path
     topic: str
+    sample_rate_hz: int
+    channels: int
     start_ns: int
+    stated: sound_file.RawPcm | None = None  # How bytes are read, if that was stated
+    frames: int = 0  # With silence for what was lost
+    lost_ns: Mapping[int, float] = field(default_factory=dict)  # Before messages, by their number
+    again: tuple[tuple[int, int], ...] = ()  # When stamps began again, by the recorder, and what is added
 
     @property
     def name(self) -> str:
@@ -198,31 +223,26 @@ class BagSound(sound_file.SoundStream):
         """Open it at its start."""
         return BagAudio(self)
 
-    def blocks(self) -> Iterator[AudioBlock]:
-        """Yield what each message holds."""
-        with open_bag(self.path) as bag:
-            yield from audio_blocks(bag, self.topic)
+    def time_ns(self, stamp_ns: int, recorded_ns: int) -> int:
+        """Return the time of another message on this clock; one without a stamp has that of the recorder."""
+        last = bisect_right(self.again, (recorded_ns, np.inf))
+        return stamp_ns + self.again[last - 1][1] if last and stamp_ns else stamp_ns or recorded_ns
 
 
 class BagAudio(sound_file.Audio):
     """Sound of a bag that is being read; lost messages are filled with silence."""
 
     def __init__(self, sound: BagSound) -> None:
-        self._sound, self.path = sound, sound.path
-        with open_bag(sound.path) as bag:
-            parts = _first_second(audio_blocks(bag, sound.topic), sound)
-            counted = bag.count(sound.topic) * len(parts[0].samples)
-        first = np.concatenate([part.samples for part in parts])
-        self.sample_rate_hz, self.channels = parts[0].sample_rate_hz, first.shape[1]
+        self._sound, self.path, self.frames = sound, sound.path, sound.frames
+        self.sample_rate_hz, self.channels = sound.sample_rate_hz, sound.channels
+        first = next(self.blocks(self.sample_rate_hz), np.empty((0, self.channels), np.float32))
         self.silent_channels = sound_file.constant_channels(first)
-        # As many as there are while all are as long as the first; less than a second is counted exactly.
-        self.frames = max(counted, len(first)) if len(first) >= self.sample_rate_hz else len(first)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
         held = np.empty((0, self.channels), np.float32)
-        for part in _without_gaps(self._sound.blocks(), self._sound):
-            held = np.concatenate([held, part.samples])
+        for part in self._parts():
+            held = np.concatenate([held, part])
             for start in range(0, len(held) - frames + 1, frames):
                 yield held[start : start + frames]
             held = held[len(held) // frames * frames :]
@@ -232,41 +252,75 @@ class BagAudio(sound_file.Audio):
     def close(self) -> None:
         """Do nothing: the bag is open while its blocks are read."""
 
+    def _parts(self) -> Iterator[Float32Array]:
+        """Yield the samples of each message, after silence for what was lost before it."""
+        held, done, sound = b"", 0, self._sound
+        with open_bag(self.path) as bag:
+            for number, packet in enumerate(audio_packets(bag, sound.topic, sound.stated)):
+                if lost_ns := sound.lost_ns.get(number, 0.0):
+                    self._tell_lost(1e-9 * lost_ns, done / self.sample_rate_hz)
+                whole = packet.pcm.frame_bytes
+                data = held + bytes(_lost_bytes(packet, lost_ns, bool(held))) + packet.data
+                samples = packet.pcm.to_samples(data[: len(data) // whole * whole])
+                sound_file.check_finite(self.path, samples, done)
+                held, done = data[len(data) // whole * whole :], done + len(samples)
+                yield samples
 
-def audio_blocks(bag: BagReader, topic: str) -> Iterator[AudioBlock]:
+    def _tell_lost(self, lost_s: float, at_s: float) -> None:
+        """Say what is missing; refuse a long gap."""
+        if lost_s > LONGEST_GAP_S:
+            expected = f"expected messages on {self._sound.topic} at most {LONGEST_GAP_S:g} s apart"
+            got = f"at {at_s:.3f} s the next is {lost_s:.3f} s off: cut the bag there (`ros2 bag convert`)"
+            raise InputFileError(self.path, f"{expected}; {got}")
+        _LOG.warning(_MISSING, self.path, lost_s, self._sound.topic, at_s)
+
+
+def _lost_bytes(packet: AudioPacket, lost_ns: float, within: bool) -> int:
+    """Return the bytes that stand for what was lost: whole samples, or messages if these split samples."""
+    whole = packet.pcm.frame_bytes
+    each = len(packet.data) if within or len(packet.data) % whole else whole
+    return round(lost_ns * 1e-9 * packet.pcm.sample_rate_hz * whole / each) * each
+
+
+def audio_packets(
+    bag: BagReader, topic: str, stated: sound_file.RawPcm | None = None
+) -> Iterator[AudioPacket]:
     """Yield what each message of a topic holds, checked against the first; refuse a topic without any."""
-    kind, first, taken = bag.kind_of(topic), None, 0
-    info = _pcm_info(bag, topic) if kind in (types.STAMPED_PCM, types.PCM) else None
+    kind, first = bag.kind_of(topic), None
+    if kind == types.AUDIO and stated is not None:
+        raise InputFileError(bag.path, f"expected no --audio-format: messages of {kind} state theirs")
+    if stated is None and kind in (types.STAMPED_PCM, types.PCM):
+        stated = _pcm_info(bag, topic)
     for recorded_ns, message in bag.messages(topic):
         if kind == types.AUDIO:
-            block = _own_block(bag.path, message)
+            packet = _own_packet(bag.path, message, recorded_ns)
         else:
-            block = _pcm_block(info or _described(bag, topic, kind, message), message, recorded_ns)
-        first = first or block
-        got = block.sample_rate_hz, block.samples.shape[1]
-        if got != (wanted := (first.sample_rate_hz, first.samples.shape[1])):
+            pcm = stated or _described(bag, topic, kind, message)
+            packet = _pcm_packet(pcm, message, recorded_ns)
+        first = first or packet
+        got = packet.pcm.sample_rate_hz, packet.pcm.channels
+        if got != (wanted := (first.pcm.sample_rate_hz, first.pcm.channels)):
             told = "expected {} Hz and {} channels as in the first message of {}, got {} and {}"
             raise InputFileError(bag.path, told.format(*wanted, topic, *got))
-        sound_file.check_finite(bag.path, block.samples, taken)
-        taken += len(block.samples)
-        yield block
+        if packet.data:
+            yield packet
     if first is None:
         raise InputFileError(bag.path, f"expected samples on {topic}, it holds no message")
 
 
-def _own_block(path: Path, message: Any) -> AudioBlock:
+def _own_packet(path: Path, message: Any, recorded_ns: int) -> AudioPacket:
     rate_hz, channels, data = int(message.sample_rate), int(message.channels), message.data
     if not (1 <= rate_hz <= MAX_RATE_HZ and 1 <= channels <= MAX_CHANNELS):
         expected = f"expected 1 to {MAX_RATE_HZ} samples a second and 1 to {MAX_CHANNELS} channels"
         raise InputFileError(path, f"{expected}, got {rate_hz} and {channels}")
-    if len(data) % channels or not len(data):
+    if len(data) % channels:
         raise InputFileError(path, f"expected samples of {channels} channels, got {len(data)} numbers")
     if message.layout not in ("interleaved", "planar"):
         raise InputFileError(path, f"layout: expected interleaved or planar, got {message.layout!r:.40}")
-    flat = np.asarray(data, dtype=np.float32)
-    planar = message.layout == "planar"
-    samples = flat.reshape(channels, -1).T if planar else flat.reshape(-1, channels)
-    return AudioBlock(stamp_of(message.header), rate_hz, np.ascontiguousarray(samples))
+    flat = np.asarray(data, dtype="<f4")
+    samples = flat.reshape(channels, -1).T if message.layout == "planar" else flat
+    pcm = sound_file.RawPcm(io.BytesIO(), rate_hz, channels, "f32", str(path))
+    return _packet(pcm, message, recorded_ns, samples.tobytes())
 
 
 def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
@@ -274,11 +328,13 @@ def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
     where = bag.topic("the topic of AudioInfo", None, types.PCM_INFO)
     said = None if where is None else next(bag.messages(where), None)
     if said is None:
-        problem = f"expected {types.PCM_INFO} beside {topic}: rate, channels and format of its bytes"
+        problem = (
+            f"expected {types.PCM_INFO} beside {topic}, or --audio-format RATE:CHANNELS:FORMAT of its bytes"
+        )
         raise InputFileError(bag.path, problem)
     info = said[1]
     if info.coding_format.lower() not in ("wave", "raw", ""):
-        problem = f"{where}: expected uncompressed samples (wave), got {info.coding_format!r:.20}"
+        problem = f"{where}: expected uncompressed samples (format:=wave), got {info.coding_format!r:.20}"
         raise InputFileError(bag.path, problem)
     return _pcm(bag, str(where), types.PCM_INFO, info.sample_format, info.sample_rate, info.channels)
 
@@ -301,61 +357,26 @@ def _pcm(
         return sound_file.RawPcm(io.BytesIO(), int(rate_hz), int(channels), encoding, str(bag.path))
 
 
-def _pcm_block(info: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioBlock:
+def _pcm_packet(pcm: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioPacket:
     data = bytes(getattr(message, "audio", message).data)
-    frames = getattr(message, "frame_sample_count", len(data) // info.frame_bytes)
-    if not data or len(data) != frames * info.frame_bytes:
-        expected = f"expected whole samples of {info.channels} channels"
-        counted = f", {frames} as frame_sample_count says" if hasattr(message, "frame_sample_count") else ""
-        raise InputFileError(info.name, f"{expected}{counted}, got {len(data)} bytes")
-    samples = info.to_samples(data)
-    length_ns = round(len(samples) * 1_000_000_000 / info.sample_rate_hz)
-    return AudioBlock(_begin_ns(message, recorded_ns, length_ns), info.sample_rate_hz, samples)
+    frames = getattr(message, "frame_sample_count", None)
+    if frames is not None and len(data) != frames * pcm.frame_bytes:
+        counted = f"expected whole samples of {pcm.channels} channels, {frames} as frame_sample_count says"
+        raise InputFileError(pcm.name, f"{counted}, got {len(data)} bytes")
+    return _packet(pcm, message, recorded_ns, data)
 
 
-def _begin_ns(message: Any, recorded_ns: int, length_ns: int) -> int:
-    """Return the time of a message's first sample."""
+def _packet(pcm: sound_file.RawPcm, message: Any, recorded_ns: int, data: bytes) -> AudioPacket:
+    """Return bytes with the time of their first sample."""
     if hasattr(message, "timestamp"):
-        return instant_of(message.timestamp)
-    if hasattr(message, "audio"):
-        return stamp_of(message.header)
+        stamp_ns = instant_of(message.timestamp)
+    else:
+        stamp_ns = stamp_of(message.header) if hasattr(message, "header") else 0
+    packet = AudioPacket(stamp_ns, recorded_ns, pcm, data)
     # AudioFrame is stamped when its last sample is there; what has no stamp was recorded then.
-    end_ns = stamp_of(message.header) if hasattr(message, "header") else recorded_ns
-    return max(end_ns - length_ns, 0)
-
-
-def _without_gaps(blocks: Iterator[AudioBlock], sound: BagSound) -> Iterator[AudioBlock]:
-    """Yield blocks with silence where messages are missing; refuse long gaps and stamps that go back."""
-    before: AudioBlock | None = None
-    for block in blocks:
-        if before is not None:
-            late_s = seconds(block.stamp_ns - before.end_ns)
-            at_s = seconds(before.end_ns - sound.start_ns)
-            if block.stamp_ns <= before.stamp_ns or late_s > LONGEST_GAP_S:
-                expected = f"expected messages on {sound.topic} in order, at most {LONGEST_GAP_S:g} s apart"
-                got = f"at {at_s:.3f} s the next is {late_s:.3f} s off"
-                raise InputFileError(sound.path, f"{expected}; {got}")
-            # Drivers stamp blocks give or take some milliseconds; a lost one is a whole block.
-            if late_s > 0.5 * min(block.duration_s, before.duration_s):
-                _LOG.warning("%s: %.3f s of %s are missing at %.3f s", sound.path, late_s, sound.topic, at_s)
-                yield _silence(before, late_s)
-        yield block
-        before = block
-
-
-def _silence(before: AudioBlock, length_s: float) -> AudioBlock:
-    samples = np.zeros((round(length_s * before.sample_rate_hz), before.samples.shape[1]), np.float32)
-    return AudioBlock(before.end_ns, before.sample_rate_hz, samples)
-
-
-def _first_second(blocks: Iterator[AudioBlock], sound: BagSound) -> list[AudioBlock]:
-    """Return the blocks of the first second, fewer where there is less."""
-    parts: list[AudioBlock] = []
-    for block in _without_gaps(blocks, sound):
-        parts.append(block)
-        if sum(part.duration_s for part in parts) >= 1.0:
-            break
-    return parts
+    if stamp_ns and not hasattr(message, "frame_sample_count"):
+        return packet
+    return replace(packet, stamp_ns=max((stamp_ns or recorded_ns) - round(packet.length_ns), 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,10 +389,12 @@ class BagInput:
     ego: OdometryLog | None
 
 
-def read_sound(path: Path, topic: str | None = None) -> tuple[BagSound, MicrophoneArray | None]:
+def read_sound(
+    path: Path, topic: str | None = None, stated: sound_file.RawPcm | None = None
+) -> tuple[BagSound, MicrophoneArray | None]:
     """Return the sound of a bag and its array, where it holds one."""
     with open_bag(path) as bag, refused_as_file(path):
-        return sound_of_bag(bag, topic), _array(bag)
+        return sound_of_bag(bag, topic, stated), _array(bag)
 
 
 def read_bag(
@@ -384,12 +407,16 @@ def read_bag(
     InputFileError
         If it is damaged, has no sound, several topics would do, or a message holds what cannot be.
     """
-    with open_bag(path) as bag, refused_as_file(path):
-        sound = sound_of_bag(bag, audio)
+    return read_beside(read_sound(path, audio)[0], detections=detections, odometry=odometry)
+
+
+def read_beside(sound: BagSound, *, detections: str | None = None, odometry: str | None = None) -> BagInput:
+    """Read what a bag holds beside its sound."""
+    with open_bag(sound.path) as bag, refused_as_file(sound.path):
         seen = bag.topic("--topic detections=", detections, types.DETECTIONS)
         driven = bag.topic("--topic odometry=", odometry, types.ODOMETRY)
-        boxes = None if seen is None else _detections(bag, seen)
-        return BagInput(sound, _array(bag), boxes, None if driven is None else _ego(bag, driven))
+        boxes = None if seen is None else _detections(bag, seen, sound)
+        return BagInput(sound, _array(bag), boxes, None if driven is None else _ego(bag, driven, sound))
 
 
 def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneArray:
@@ -462,12 +489,49 @@ def _in_parent(path: Path, transform: Any, points_m: FloatArray) -> FloatArray:
     return np.asarray(turned + np.array([by.x, by.y, by.z]))
 
 
-def sound_of_bag(bag: BagReader, topic: str | None) -> BagSound:
-    """Return the sound of a bag; refuse one without."""
+def sound_of_bag(bag: BagReader, topic: str | None, stated: sound_file.RawPcm | None = None) -> BagSound:
+    """Return the sound of a bag by the stamps of all its messages; refuse one without."""
     heard = bag.topic("--topic audio=", topic, *AUDIO_KINDS)
     if heard is None:
         raise InputFileError(bag.path, f"expected a topic of {' or '.join(AUDIO_KINDS)}, got {bag.told()}")
-    return BagSound(bag.path, heard, next(audio_blocks(bag, heard)).stamp_ns)
+    if _storage_of(bag.path) != [bag.path]:
+        _LOG.warning("%s: %s is missing, `ros2 bag reindex` writes it", bag.path, METADATA_NAME)
+    stamps, recorded, lengths, data = list[int](), list[int](), list[float](), b""
+    for packet in audio_packets(bag, heard, stated):
+        stamps.append(packet.stamp_ns)
+        recorded.append(packet.recorded_ns)
+        lengths.append(packet.length_ns)
+        data += packet.data if len(data) < LOOK_BYTES else b""
+    if not stamps:
+        raise InputFileError(bag.path, f"expected samples on {heard}, its messages are empty")
+    pcm = packet.pcm
+    pcm.check_encoding(data)
+    sound = BagSound(bag.path, heard, pcm.sample_rate_hz, pcm.channels, stamps[0], stated)
+    return _on_samples(sound, np.array(stamps), np.array(recorded), np.array(lengths))
+
+
+def _on_samples(
+    sound: BagSound, stamps_ns: IntArray, recorded_ns: IntArray, lengths_ns: FloatArray
+) -> BagSound:
+    """Return sound with the losses and the repetitions that its stamps show."""
+    again = begins_again(stamps_ns, lengths_ns)
+    added_ns = np.zeros(len(stamps_ns), dtype=np.int64)
+    for k, more_ns in again:
+        added_ns[k:] = more_ns
+        told = "%s: stamps of %s begin again at %.3f s (a bag in a loop?) and are counted on"
+        _LOG.warning(told, sound.path, sound.topic, seconds(int(lengths_ns[:k].sum())))
+    stamps_ns = stamps_ns + added_ns
+    lost_ns = lost_before(stamps_ns, lengths_ns)
+    if told := contradiction(stamps_ns, lengths_ns, lost_ns):
+        problem = f"{sound.topic}: {told}: another rate (--audio-format), or a bag that was played in a loop"
+        raise InputFileError(sound.path, f"{problem} and whose passes its recorder mixed: record one pass")
+    return replace(
+        sound,
+        start_ns=sound.start_ns - round(early_ns(stamps_ns, lengths_ns)),
+        frames=round(float(lengths_ns.sum() + lost_ns.sum()) * 1e-9 * sound.sample_rate_hz),
+        lost_ns={int(k): float(lost_ns[k]) for k in np.flatnonzero(lost_ns)},
+        again=tuple((int(recorded_ns[k]), more_ns) for k, more_ns in again),
+    )
 
 
 def _array(bag: BagReader) -> MicrophoneArray | None:
@@ -482,13 +546,13 @@ def _array(bag: BagReader) -> MicrophoneArray | None:
     return MicrophoneArray(positions_m, str(said[1].name or topic))
 
 
-def _detections(bag: BagReader, topic: str) -> DetectionLog:
+def _detections(bag: BagReader, topic: str, sound: BagSound) -> DetectionLog:
     stamps, frames = [], []
     for recorded_ns, message in _few(bag, topic):
         # A detector that leaves the stamp out saw the image shortly before it was recorded.
-        stamps.append(stamp_of(message.header) or recorded_ns)
+        stamps.append(sound.time_ns(stamp_of(message.header), recorded_ns))
         frames.append(_frame(message.detections))
-    return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), f"{bag.path} {topic}")
+    return DetectionLog.in_order(frames, stamps, f"{bag.path} {topic}")
 
 
 def _frame(found: Any) -> DetectionFrame:
@@ -516,13 +580,16 @@ def _best(results: Any) -> tuple[str, float]:
     return str(getattr(best, "class_id", getattr(best, "id", "unknown"))), float(best.score)
 
 
-def _ego(bag: BagReader, topic: str) -> OdometryLog:
-    told = (
-        (stamp_of(said.header) or recorded_ns, said.twist.twist)
+def _ego(bag: BagReader, topic: str, sound: BagSound) -> OdometryLog:
+    told = [
+        (sound.time_ns(stamp_of(said.header), recorded_ns), said.twist.twist)
         for recorded_ns, said in _few(bag, topic, 100 * MAX_FRAMES)
-    )
+    ]
+    places = in_order([stamp_ns for stamp_ns, _ in told], f"{bag.path} {topic}")
     # Not its pose: the frame of odometry is not the map in which the corners of a context stand.
-    return OdometryLog(tuple(Odometry(topic, ns, twist.linear.x, twist.angular.z) for ns, twist in told))
+    return OdometryLog(
+        tuple(Odometry(topic, told[i][0], told[i][1].linear.x, told[i][1].angular.z) for i in places)
+    )
 
 
 def _few(bag: BagReader, topic: str, most: int = MAX_FRAMES) -> Iterator[tuple[int, Any]]:

@@ -48,8 +48,8 @@ general: {
     samplerate: { mu = 16000; };   # mu: of the rate (Hz)
     mics = (
         # mu: Microphone position coordinates (x, y, z) in meters "with a quote
-        { mu = ( +0.5, +0.2, 1.4 ); sigma2 = ( +0.0, +0.0 ); direction = ( 0.0, 0.0, 1.0 ); angle = ( 80.0, 90.0 );
-        },
+        { mu = ( +0.5, +0.2, 1.4 ); sigma2 = ( +0.0, +0.0 ); direction = ( 0.0, 0.0, 1.0 );
+          angle = ( 80.0, 90.0 ); },
         { mu = ( 5E-1,
                  -0.2, 1.4 ); },  // { mu = ( 1, 2, 3 ); }
         { sigma2 = ( 0.0 ); mu = [ 0.1, 0, 1.5 ]; }

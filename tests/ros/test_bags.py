@@ -463,11 +463,11 @@ def test_transforms_that_cannot_be_are_refused(transforms, problem, tmp_path):
         ("signed_16", {"channel_count": 0}, "channels: expected a number in [1, 1024], got 0"),
         ("signed_16", {"sampling_frequency": 2**31}, "sample_rate_hz: expected a number in [1, 10000000]"),
         ("signed_16", {"frame_sample_count": 2**32 - 1}, "4294967295 as frame_sample_count says"),
-        ("float", {"format": "double"}, "signed_16, signed_24, signed_32, float, got 'double'"),
+        ("float", {"format": "double"}, "signed_padded_24, signed_32, float, got 'double'"),
         ("float", {"data": np.full(12_800, 255, np.uint8)}, "expected finite samples, got nan in channel 1"),
         ("pcm-s16", {"format": "opus"}, "/mics: expected one of pcm-s16, got 'opus'"),
-        ("pcm-s16", {"data": np.zeros(0, np.uint8)}, "expected whole samples of 4 channels, got 0 bytes"),
-        ("pcm-s16", {"data": np.zeros(9, np.uint8)}, "expected whole samples of 4 channels, got 9 bytes"),
+        ("pcm-s16", {"data": np.zeros(0, np.uint8)}, "expected at least 1 s of audio, got 0.300 s"),
+        ("pcm-s16", {"data": np.zeros(9, np.uint8)}, "expected at least 1 s of audio, got 0.301 s"),
         ("pcm-s16", {"sample_rate": 16_000}, "expected 8000 Hz and 4 channels as in the first"),
     ],
 )
@@ -700,7 +700,7 @@ def test_the_metadata_of_a_bag_are_parsed_once_more_in_all_than_by_its_reader(tm
     monkeypatch.setattr(YAML, "load", lambda yaml, text: parsed.append(text) or load(yaml, text))
     with open_sound(read_bag(path).sound) as audio:
         assert sum(map(len, audio.blocks())) == RATE_HZ
-    opened = 3  # to find out what it holds, for its first second, and for its blocks
+    opened = 4  # for the stamps of its sound, for what is beside it, for its first second, and for its blocks
     assert len(parsed) == opened + 1
 
 

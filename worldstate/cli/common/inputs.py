@@ -1,14 +1,16 @@
 """What a command listens to, and by which microphones: INPUT, --array, where a bearing is looked for."""
 
 import argparse
+import io
 import re
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from inspect import getdoc
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 from worldstate import adapters, frontend
 from worldstate.ground.errors import InvalidArgumentError
@@ -31,7 +33,7 @@ def describe(parser: argparse.ArgumentParser, declare: Callable[..., object]) ->
 
 
 def add_sound_options(parser: argparse.ArgumentParser) -> None:
-    """Declare INPUT and --topic.
+    """Declare INPUT, --topic and --audio-format.
 
     INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
     (out_multi.wav and, where there is one, camera_baseline_results.json), several files of one channel each
@@ -45,6 +47,8 @@ def add_sound_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", type=Path, nargs="+", metavar="INPUT", help=what)
     topic = "audio=, detections= or odometry=TOPIC of a bag (default: the only one of its type); repeated"
     parser.add_argument("--topic", action="append", default=[], metavar="NAME=TOPIC", help=topic)
+    told = "RATE:CHANNELS:FORMAT of the sound of a bag whose messages do not state it (no AudioInfo)"
+    parser.add_argument("--audio-format", metavar="FORMAT", help=told)
     add_channel_option(parser)
 
 
@@ -97,26 +101,39 @@ def topics_of(arguments: argparse.Namespace) -> dict[str, str]:
 
 def sound_of(arguments: argparse.Namespace) -> "SoundInput":
     """Return what INPUT names."""
+    return _sound_and_own_array(arguments)[0]
+
+
+def _sound_and_own_array(
+    arguments: argparse.Namespace,
+) -> "tuple[SoundInput, frontend.MicrophoneArray | None]":
+    """Return what INPUT names, and the array that a bag holds."""
     from worldstate.adapters.audio.sound_file import as_sound
     from worldstate.adapters.ros.bag_input import read_sound
 
-    bag = bag_of(arguments)
-    if bag is not None:
-        return read_sound(bag, topics_of(arguments).get("audio"))[0]
+    stated = arguments.audio_format
+    if (bag := bag_of(arguments)) is not None:
+        pcm = None if stated is None else _pcm("--audio-format", stated, io.BytesIO(), str(bag))
+        return read_sound(bag, topics_of(arguments).get("audio"), pcm)
+    if stated is not None:
+        raise InvalidArgumentError(
+            f"--audio-format: expected a bag as INPUT; samples without one are {_RAW}..."
+        )
     names = [str(path) for path in arguments.input]
     raw = next((name for name in names if name == "-" or name.startswith(_RAW)), None)
-    return as_sound(tuple(arguments.input)) if raw is None else _raw_samples(raw, alone=len(names) == 1)
+    if raw is None:
+        return as_sound(tuple(arguments.input)), None
+    if len(names) > 1:
+        raise InvalidArgumentError(f"{raw}: expected standard input alone, as {_RAW}RATE:CHANNELS:FORMAT")
+    return _pcm(raw, raw.removeprefix(_RAW), sys.stdin.buffer), None
 
 
-def _raw_samples(name: str, *, alone: bool) -> "SoundInput":
-    import sys
-
-    told = name.removeprefix(_RAW).split(":")
-    if not (alone and len(told) in (2, 3) and told[0].isdecimal() and told[1].isdecimal()):
-        problem = f"expected standard input alone, as {_RAW}RATE:CHANNELS:FORMAT"
-        raise InvalidArgumentError(f"{name}: {problem}")
+def _pcm(name: str, text: str, stream: BinaryIO, path: str = "/dev/stdin") -> "adapters.RawPcm":
+    told = text.split(":")
+    if not (len(told) in (2, 3) and told[0].isdecimal() and told[1].isdecimal()):
+        raise InvalidArgumentError(f"{name}: expected RATE:CHANNELS:FORMAT, such as 48000:8:s32")
     rate, channels, kind = [*told, "s16"][:3]
-    return adapters.RawPcm(sys.stdin.buffer, int(rate), int(channels), cast("Encoding", kind))
+    return adapters.RawPcm(stream, int(rate), int(channels), cast("Encoding", kind), path)
 
 
 def bag_of(arguments: argparse.Namespace) -> Path | None:
@@ -159,13 +176,11 @@ def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, fronte
     """Return what INPUT and --array name, or the array that belongs to the sound."""
     from worldstate.adapters.audio.sound_file import path_of
     from worldstate.adapters.datasets.ovad import choose_array
-    from worldstate.adapters.ros.bag_input import needed_array, read_sound
+    from worldstate.adapters.ros.bag_input import BagSound, needed_array
 
-    bag = bag_of(arguments)
-    if bag is not None:
-        heard, own = read_sound(bag, topics_of(arguments).get("audio"))
-        return heard, needed_array(heard, given_array(arguments) or own)
-    sound = sound_of(arguments)
+    sound, own = _sound_and_own_array(arguments)
+    if isinstance(sound, BagSound):
+        return sound, needed_array(sound, given_array(arguments) or own)
     array = choose_array(path_of(sound), given_array(arguments))
     if isinstance(sound, Path) and sound.is_dir():
         sound = adapters.Recording.open(sound).audio_path

@@ -195,11 +195,12 @@ def with_bag(
     given: GivenSensors, sound: "SoundInput", seen: "Seen"
 ) -> "tuple[frontend.MicrophoneArray | None, Seen, OdometryLog | None]":
     """Return array and detections as given, of a bag those that it holds in their place; and its odometry."""
-    from worldstate.adapters.ros.bag_input import BagSound, needed_array, read_bag
+    from worldstate.adapters.ros.bag_input import BagSound, needed_array, read_beside
 
     if not isinstance(sound, BagSound):
         return given.car.array, seen, None
-    held = read_bag(sound.path, **topics_of(given.arguments))
+    topics = {name: topic for name, topic in topics_of(given.arguments).items() if name != "audio"}
+    held = read_beside(sound, **topics)
     array = needed_array(sound, given.car.array or held.array)
     return array, held.detections if seen is None else seen, held.ego
 
