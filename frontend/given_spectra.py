@@ -27,6 +27,8 @@ from .hop_spectra import SILENCE, Hop, HopCutter, LevelMeter, hop_end, mean_squa
 from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
 from .stream import CHARACTER_IS_OFF, AcousticFrame
 
+HALF_HOPS = WINDOW_HOPS // FEATURE_SEGMENTS
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenSpectra:
@@ -43,11 +45,14 @@ class GivenSpectra:
         Ascending, evenly spaced, left positive; from -90 to 90 degrees at least.
     array : MicrophoneArray
         The M microphones that they were computed from.
+    hops : int
+        Each row is of so many hops, the last of which is its own: 1, or 5 for half of a window.
 
     Raises
     ------
     InvalidArgumentError
-        If a value is out of range, or the azimuths do not ascend over the sector ahead.
+        If a value is out of range, the azimuths do not ascend over the sector ahead, or the hops of a row do
+        not divide half a window.
 
     Examples
     --------
@@ -60,6 +65,7 @@ class GivenSpectra:
     values: FloatArray
     azimuths_rad: FloatArray
     array: MicrophoneArray
+    hops: int = 1
 
     def __post_init__(self) -> None:
         freeze_arrays(self, values=(None, None), azimuths_rad=(None,))
@@ -68,6 +74,8 @@ class GivenSpectra:
             raise InvalidArgumentError("azimuths_rad: expected ascending ones from -90 to 90 degrees")
         if not ((self.values > 0.0) & (self.values <= 1.0)).all():
             raise InvalidArgumentError("values: expected pair sums in (0, 1]")
+        if self.hops not in (1, HALF_HOPS):
+            raise InvalidArgumentError(f"hops: expected 1 or {HALF_HOPS} a row, got {self.hops}")
 
 
 class SpectrumFrontEnd:
@@ -163,16 +171,18 @@ class SpectrumFrontEnd:
         return float(mean_square_per_bin(power(self._stft.push(samples)), self.settings.nfft).sum())
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
-        rows, first = self._rows[: hop.index], hop.index - WINDOW_HOPS
-        spectrum, azimuths = about_the_peak(rows[-BEARING_HOPS:].mean(axis=0), self.spectra.azimuths_rad)
+        each, window = self.spectra.hops, slice(hop.index - WINDOW_HOPS, hop.index)
+        rows = self._rows[window][each - 1 :: each]
+        newest = rows[-max(BEARING_HOPS // each, 1) :].mean(axis=0)
+        spectrum, azimuths = about_the_peak(newest, self.spectra.azimuths_rad)
         peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
         bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
-        halves = self._published[first : hop.index].reshape(FEATURE_SEGMENTS, -1, self._published.shape[1])
+        halves = self._published[window][each - 1 :: each].reshape(FEATURE_SEGMENTS, HALF_HOPS // each, -1)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
             sample_index=hop_end(hop.index, self.sample_rate_hz),
             azimuths_rad=self.spectra.azimuths_rad,
-            srp=rows[-WINDOW_HOPS:].mean(axis=0),
+            srp=rows.mean(axis=0),
             bearing_rad=bearing.azimuth_rad,
             bearing_std_rad=bearing.std_rad,
             prominence=bearing.prominence,
@@ -181,7 +191,7 @@ class SpectrumFrontEnd:
             band_log_energy=levels,
             looming=self._looming(),
             feature=halves.mean(axis=1).ravel(),
-            bearing_age_s=0.5 * BEARING_HOPS / HOP_RATE_HZ,
+            bearing_age_s=0.5 * max(BEARING_HOPS, each) / HOP_RATE_HZ,
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
             heard=None,
         )

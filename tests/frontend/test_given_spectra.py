@@ -136,3 +136,20 @@ def test_sound_that_does_not_fit_the_spectra_is_refused():
         Listener(ovad_array(), RATE_HZ, spectra=spectra).skip(10**9)
     with pytest.raises(InvalidArgumentError, match="48 kHz"):
         SpectrumFrontEnd(spectra, 16_000, FrontEndSettings.heard_at(16_000))
+
+
+def test_rows_of_half_a_window_are_taken_where_they_end():
+    """A row of five hops is what the mean of five rows of one hop is."""
+    rng = np.random.default_rng(8)
+    rows = rng.uniform(0.1, 0.3, (23, 180))
+    halves = np.array([rows[max(k - 4, 0) : k + 1].mean(axis=0) for k in range(23)])
+    sound = plane_wave(0.5, rng)[:, :1]
+    hops, whole = (
+        SpectrumFrontEnd(GivenSpectra(values, AHEAD_RAD, SEVEN, each), RATE_HZ, SETTINGS).process(sound)
+        for values, each in ((rows, 1), (halves, 5))
+    )
+    for one, other in zip(hops, whole, strict=True):
+        np.testing.assert_allclose(one.feature, other.feature)
+        np.testing.assert_allclose(one.srp, other.srp)
+        # The peak is that of the newest row.
+        assert (one.bearing_age_s, other.bearing_age_s) == (0.1, 0.25)

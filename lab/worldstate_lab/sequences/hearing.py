@@ -36,7 +36,7 @@ from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
 from .recordings import NANODET_BOXES, CornerRecording
 
-PathName = Literal["seven", "pair"]
+PathName = Literal["seven", "seven_on_time", "pair"]
 # What the product publishes at every hop, by side where it has sides.
 PRODUCT_COLUMNS = (
     "compared_nats",  # shape (2,): What the alarm of a side is decided by
@@ -61,10 +61,10 @@ class Chain:
 
     Parameters
     ----------
-    path : {"seven", "pair"}
-        What hears.
+    path : {"seven", "seven_on_time", "pair"}
+        What hears; see `CornerRecording.spectra` for the two readings of the spectra.
     model : Model
-        Made for what hears; on `seven` the one that ships.
+        Made for what hears; of spectra the one that ships.
     array : MicrophoneArray
         Of the model.
     boxes : str or None
@@ -105,12 +105,13 @@ class Chain:
         if self.path == "pair":
             yield from Listener(source, rate_hz).steps(sound)
         else:
-            yield from Listener(source, rate_hz, spectra=recording.spectra()).steps(sound[:, :1])
+            spectra = recording.spectra(self.path == "seven_on_time")
+            yield from Listener(source, rate_hz, spectra=spectra).steps(sound[:, :1])
 
 
-def ovad_chain(model: Model, boxes: str | None = "boxes") -> Chain:
-    """Return the path `seven` with a model for OVAD's array."""
-    return Chain("seven", model, ovad_array(), boxes)
+def ovad_chain(model: Model, boxes: str | None = "boxes", path: PathName = "seven") -> Chain:
+    """Return a path over spectra with a model for OVAD's array."""
+    return Chain(path, model, ovad_array(), boxes)
 
 
 def heard(chain: Chain, recording: CornerRecording) -> Trial:

@@ -15,9 +15,9 @@ from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, frame_of_rows
 from worldstate.adapters.files.file_io import load_npz, number, read_json, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.frontend.given_spectra import GivenSpectra
+from worldstate.frontend.given_spectra import HALF_HOPS, GivenSpectra
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import nanoseconds
 
 TRUTH, SPECTRA = "truth.csv", "srp.npz"
@@ -28,6 +28,8 @@ _MOST_BYTES = 64 << 20
 # A vehicle that stands through a recording has a box about its place in most images, one that passes in few.
 # Boxes of one parked car overlap by 0.7 and more in spite of the detector's scatter.
 _STANDS_IOU, _STANDS_SHARE = 0.6, 0.5
+# Below what silence has.
+LEAST_POWER = 1e-3
 # Chosen on the clean boxes of 45 recordings, each junction left out; `worldstate-lab staged` prints what was
 # tried. Share of the images after T0 with the vehicle found, and of hazard-free ones with a moving box: 0.80
 # and 0.02 here, 0.72 and 0.02 at 0.4 and 40 px, 0.08 and 0.00 with the library's defaults (0.75, 100 px).
@@ -80,14 +82,21 @@ class CornerRecording:
             first = round(self.start_s * audio.sample_rate_hz)
             return audio.span(first, audio.frames - first), audio.sample_rate_hz
 
-    def spectra(self) -> GivenSpectra:
-        """Read the spectra of seven microphones."""
+    def spectra(self, on_time: bool = False) -> GivenSpectra:
+        """Read the spectra of seven microphones, a row every 0.1 s as they lie in the file, or on time.
+
+        A row is of the second that *begins* with it: see `half_windows`. Taken as they lie, a window of ten
+        rows reaches 0.9 s beyond its end.
+        """
         path = self.folder / SPECTRA
         values = load_npz(path, "spectra by recording", _MOST_BYTES, lambda found: found.get(self.name))
         if values is None:
             raise InputFileError(path, f"expected spectra of {self.name}, found none")
-        kept = values[round(10.0 * self.start_s) :, ::-1].astype(np.float64)
-        return GivenSpectra(kept, _AZIMUTHS_RAD, seven_microphones())
+        rows = values[:, ::-1].astype(np.float64)
+        first = round(10.0 * self.start_s)
+        if not on_time:
+            return GivenSpectra(rows[first:], _AZIMUTHS_RAD, seven_microphones())
+        return GivenSpectra(half_windows(rows)[first:], _AZIMUTHS_RAD, seven_microphones(), HALF_HOPS)
 
     def boxes(self, folder: str | Path = "boxes") -> DetectionLog:
         """Read the boxes of every image, those of vehicles that stand through the recording left out."""
@@ -104,6 +113,35 @@ def seven_microphones() -> MicrophoneArray:
     0.365
     """
     return MicrophoneArray(ovad_array().positions_m[::8], "OVAD, every eighth")
+
+
+def half_windows(rows: FloatArray) -> FloatArray:
+    r"""Return the spectra of the half second that ends with each hop, from those of the second that begins.
+
+    .. math:: h_k = 2 r_k - h_{k+5}, \qquad r_k = \tfrac12 (h_k + h_{k+5})
+
+    from the end of the recording backwards, where the seconds are cut short. At T0 - 1 s and T0 - 0.5 s they
+    are the released features of 23 approaches: correlation 0.988, level within 0.001 [deviation 0.003] nats;
+    means of five rows as they lie have 0.985 and 0.007 [0.013].
+
+    Shapes: rows (n, azimuths), returns the same; the first four repeat the first whole one.
+
+    Examples
+    --------
+    >>> hops = np.arange(1.0, 31.0)[:, None] / 100.0
+    >>> seconds = np.array([hops[k : k + 10].mean(axis=0) for k in range(30)])
+    >>> halves = half_windows(seconds)
+    >>> np.allclose(halves[4:], [hops[k - 4 : k + 1].mean(axis=0) for k in range(4, 30)])
+    True
+    """
+    count, half = len(rows), HALF_HOPS
+    begin = rows.copy()
+    for k in range(count - half - 1, -1, -1):
+        whole = min(2 * half, count - k)
+        begin[k] = (whole * rows[k] - (whole - half) * begin[k + half]) / half
+    ending = np.concatenate([np.repeat(begin[:1], half - 1, axis=0), begin])[:count]
+    # Errors of the recursion may leave a direction without power.
+    return np.asarray(np.clip(ending, LEAST_POWER, 1.0))
 
 
 def read_recordings(folder: Path) -> tuple[CornerRecording, ...]:
