@@ -123,7 +123,7 @@ def _sound_and_own_array(
     raw = next((name for name in names if name == "-" or name.startswith(_RAW)), None)
     if raw is None:
         return as_sound(tuple(arguments.input)), None
-    if len(names) > 1:
+    if len(names) > 1 or raw == "-":
         raise InvalidArgumentError(f"{raw}: expected standard input alone, as {_RAW}RATE:CHANNELS:FORMAT")
     return _pcm(raw, raw.removeprefix(_RAW), sys.stdin.buffer), None
 
