@@ -140,7 +140,7 @@ class Source:
     settings : ListenSettings
         How it is listened to.
     t0_s : float or None
-        Line-of-sight entry where the recording knows it, seconds from its start.
+        Line-of-sight entry where the recording knows it, seconds on the clock of the states.
     hazard_free : bool
         Whether the recording is labelled as one without a vehicle; False where nothing is known.
     camera : PinholeCamera
@@ -393,6 +393,8 @@ def open_source(
     if camera is None and (detections, detector) != (None, None):
         check_mounting(heard_by)
     first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
+    start_ns = nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns
+    t0_s = None if recording is None else recording.t0_s
     source = Source(
         sound=sound if recording is None else recording.audio_path,
         array=heard_by,
@@ -401,12 +403,12 @@ def open_source(
         policy=policy,
         context=context,
         settings=settings,
-        t0_s=None if recording is None else recording.t0_s,
+        t0_s=None if t0_s is None else t0_s + seconds(start_ns),
         hazard_free=recording is not None and recording.label == "none",
         camera=_read(camera, read_camera) or PinholeCamera.ovad(),
         miss_rates=_read(miss_rates, load_miss_rates),
         before=_read(resume, read_checkpoint),
-        start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns,
+        start_ns=start_ns,
         guard=known.guard,
         road_users=known.road_users,
         sequence=_sequence_of(known, moves, settings.uncalibrated),
@@ -443,7 +445,8 @@ def check_clocks(source: Source, length_s: float | None) -> None:
         elif log.assumed and length_s is not None:
             _check_rate(log, seconds(int(log.stamps_ns[-1])) - begins_s - offset_s, length_s)
     for told in filter(None, ([*other()] for other in source.others)):
-        way_on = "the sound begins at --start (start_s), that of a bag at its first stamp"
+        more_s = begins_s - seconds(told[0].stamp_ns)
+        way_on = f"{more_s:.1f} s more would make both begin together; --start (start_s) moves the sound"
         _check_stamps(told[0].source, [one.stamp_ns for one in told], begins_s, ends_s, way_on)
 
 

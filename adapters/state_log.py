@@ -16,7 +16,7 @@ from worldstate.state import WorldState
 # A hop: the last decision of a recording ends up to so long before it does.
 _SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
-_HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
+_MAGIC, _HEADER_BYTES, _ROS_PROFILE = b"\x89MCAP", 64, b"\x04\x00\x00\x00ros2"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
 
@@ -47,10 +47,12 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _is_own_mcap(path: Path) -> bool:
-    if path.suffix.lower() != ".mcap" or not path.is_file():
+    if not path.is_file():
         return False
     with plain_file(path, "snapshots") as file:
-        return _ROS_PROFILE not in file.read(_HEADER_BYTES)
+        head = file.read(_HEADER_BYTES)
+    # The name of a rotated one may end with a number.
+    return (path.suffix.lower() == ".mcap" or head.startswith(_MAGIC)) and _ROS_PROFILE not in head
 
 
 def read_state_near(path: Path, stamp_ns: int, *, anywhere: bool = False) -> WorldState:
@@ -85,7 +87,7 @@ def _json_lines(path: Path) -> Iterator[str]:
             try:
                 yield line.decode().rstrip("\n")
             except UnicodeDecodeError as error:
-                raise InvalidArgumentError(f"line {number}: expected UTF-8") from error
+                raise InvalidArgumentError(f"line {number}: expected UTF-8, unpacked as by gunzip") from error
 
 
 def _is_cut(line: bytes) -> bool:

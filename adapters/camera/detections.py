@@ -390,7 +390,8 @@ def _ovad_log(name: Path, document: object, frame_rate_hz: float | None) -> Dete
     rows = document.get("detections_per_frame") if isinstance(document, dict) else None
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
-        raise InputFileError(name, problem)
+        others = 'results of COCO, or its "images" and "annotations"; YOLO (a folder) or MOTChallenge (.txt)'
+        raise InputFileError(name, f"{problem}; or {others}")
     with refused_as_file(name):
         read = [decode(_OvadFrame, row, f"frame {number}") for number, row in enumerate(rows)]
         frames, stamps = [one.frame() for one in read], [one.stamp_ns for one in read]

@@ -74,7 +74,7 @@ def test_stamps_on_another_clock_are_refused_and_the_offset_brings_them_back(
 @pytest.mark.parametrize("off_s", OFF_S)
 def test_odometry_on_another_clock_is_refused(sound: Path, off_s: float) -> None:
     told = tuple(Odometry("wheels", nanoseconds(off_s + 0.1 * i), 0.1) for i in range(201))
-    with pytest.raises(InputFileError, match=r"wheels: expected stamps on the clock of the sound.*--start"):
+    with pytest.raises(InputFileError, match=r"wheels: expected stamps on the clock .* s more .*--start"):
         heard(sound, ego=OdometryLog(told))
     if off_s > 0.0:
         heard(sound, off_s, ego=OdometryLog(told))

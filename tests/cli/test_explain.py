@@ -166,8 +166,9 @@ def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, tmp_path, 
 def test_a_log_in_mcap_is_explained_alike(states, tmp_path, capsys):
     assert main(["log", "replay", str(states), "--export", f"mcap={tmp_path / 'a.mcap'}"]) == 0
     told = []
-    for log in (states, tmp_path / "a.mcap"):
+    (tmp_path / "a.mcap.1").write_bytes((tmp_path / "a.mcap").read_bytes())
+    for log in (states, tmp_path / "a.mcap", tmp_path / "a.mcap.1"):
         capsys.readouterr()
         assert main(["explain", str(log), "--time", "1.0"]) == 0
         told.append(capsys.readouterr().out)
-    assert told[0] == told[1]
+    assert told[0] == told[1] == told[2]
