@@ -22,7 +22,7 @@ from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
-from .detections import PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
+from .detections import BORDER_PX, PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
@@ -352,12 +352,13 @@ def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
 
     An image of which all boxes lie outside counts as not looked at.
     """
-    parts = [frame.cut(_size_px(camera)) for frame in log.frames]
-    if not (beyond := sum(count for _, count in parts)):
+    boxes_px = np.concatenate([np.empty((0, 4)), *(frame.boxes_px for frame in log.frames)])
+    by_px = np.abs(boxes_px - np.clip(boxes_px, 0.0, np.tile(_size_px(camera), 2))).max(axis=1, initial=0.0)
+    if not (beyond := int((by_px > BORDER_PX).sum())):
         return log
-    boxes_px, size_px = np.concatenate([one.boxes_px for one in log.frames]), np.tile(_size_px(camera), 2)
+    parts = [frame.cut(_size_px(camera)) for frame in log.frames]
     boxes, outside = len(boxes_px), len(boxes_px) - sum(len(frame) for frame, _ in parts)
-    far = np.abs(boxes_px - np.clip(boxes_px, 0.0, size_px)).max() > _FAR_BEYOND * camera.width_px
+    far = by_px.max() > _FAR_BEYOND * camera.width_px
     if (far and 2 * beyond > boxes >= _FEW_BOXES) or outside > max(_MOST_OUTSIDE * boxes, 1.0):
         number = next(i for i, (_, count) in enumerate(parts) if count)
         raise InputFileError(log.source, f"frame {number}: {_other_size(camera, log.frames[number])}")
