@@ -226,7 +226,7 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
     [
         (["--features", "a.csv"], "--lists"),
         (["--model", "a.json"], "--path"),
-        (["--path", "seven", "--streams", "a.npz"], "both paths"),
+        (["--path", "seven", "--streams", "a.npz"], "every path"),
         (["--start", "9"], "--start"),
     ],
 )

@@ -111,7 +111,10 @@ def test_sums_are_means_over_three_hops_of_what_they_are_made_of(streams, model)
     columns = stream_evidence(parts_of(model)[0], streams[0])
     # The path of two microphones hears a hop more.
     seven, pair = trial(columns[100:150]), trial(columns[160:211], unknown=3)
-    found = {name: one[0] for name, one in summed_scores([seven], [pair], streams, model).items()}
+    found = {
+        name: one[0]
+        for name, one in summed_scores([seven], [pair], LevelReading.learned(streams, model), model).items()
+    }
     assert all(one.shape == (50,) and np.isfinite(one).all() for one in found.values())
     parts = ("sequence, levels of both channels", "side ratio", "logistic")
     whole = found["sequence + side ratio + logistic"]
@@ -125,7 +128,7 @@ def test_levels_of_both_channels_are_those_of_the_pair(streams, model) -> None:
     columns = stream_evidence(parts_of(model)[0], streams[0])
     seven, same, louder = (trial(columns[first : first + 60]) for first in (0, 0, 150))
     names = [f"sequence, levels of {which}, one hop" for which in ("one channel", "both channels")]
-    found = summed_scores([seven, seven], [same, louder], streams, model)
+    found = summed_scores([seven, seven], [same, louder], LevelReading.learned(streams, model), model)
     one, both = (found[name] for name in names)
     assert np.array_equal(one[0], both[0])
     assert np.array_equal(one[0], one[1])

@@ -30,7 +30,7 @@ from worldstate.cli.common.progress import track
 from worldstate_lab.evaluation.ablation_rows import AblationSwitches, ablation_table
 from worldstate_lab.report.table import figure_lines
 from worldstate_lab.sequences.camera_rows import corner_rows
-from worldstate_lab.sequences.hearing import ovad_chain
+from worldstate_lab.sequences.hearing import SPECTRA, ovad_chain
 from worldstate_lab.sequences.recordings import TRUTH, read_recordings
 
 
@@ -42,6 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--model", type=Path, help="model file (default: the one that ships)")
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
     add("--boxes", nargs="+", default=["boxes"], metavar="DIR", help="of a real corner (default: boxes)")
+    add("--path", choices=SPECTRA, default=SPECTRA[0], help="of a real corner (default: %(default)s)")
     add("--miss-rates", type=Path, metavar="JSON", help="of the detector: one more row")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--seed", type=int, default=0, help="deals the folds (default: %(default)s)")
@@ -68,7 +69,7 @@ def _corner(arguments: argparse.Namespace, model: Model, switches: AblationSwitc
     states, lines = {}, list[str]()
     for boxes in track(arguments.boxes, "cameras"):
         folder = boxes if (arguments.inputs[0] / boxes).is_dir() else str(Path(boxes).absolute())
-        chain = ovad_chain(model, folder)
+        chain = ovad_chain(model, folder, arguments.path)
         rows = corner_rows(chain, recordings, measured, switches, arguments.seed, arguments.jobs)
         states[Path(boxes).name] = rows
         for kind, some in rows.items():

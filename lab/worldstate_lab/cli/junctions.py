@@ -42,7 +42,7 @@ from worldstate_lab.evaluation.protocols import (
 )
 from worldstate_lab.metrics.intervals import worst_group
 from worldstate_lab.report.table import Cell, Table, Value, plain
-from worldstate_lab.sequences.hearing import Chain, heard, ovad_chain
+from worldstate_lab.sequences.hearing import SPECTRA, Chain, heard, ovad_chain
 from worldstate_lab.sequences.path_figures import classifiers_of
 from worldstate_lab.sequences.path_tables import alarm_table
 from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
@@ -66,6 +66,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--features", type=Path, required=True, metavar="CSV", help="windows to train the classifiers on")
     add("--lists", type=Path, nargs="+", required=True, metavar="CSV", help="recordings left out of them")
     add("--model", type=Path, metavar="FILE", help="for the chain (default: the one that ships)")
+    add("--path", choices=SPECTRA, default=SPECTRA[0], help="how the spectra are read (default: %(default)s)")
     add("--seed", type=int, default=1, help="of the classifiers and intervals (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
@@ -76,7 +77,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if len(junctions_with_both([(one.junction, one.hazard_free) for one in recordings])) < 2:
         raise InvalidArgumentError("recordings: expected approaches and hazard-free ones at two junctions")
     classifiers = classifiers_of(arguments.features, arguments.lists)
-    hear = partial(_heard, ovad_chain(read_model(arguments.model)))
+    hear = partial(_heard, ovad_chain(read_model(arguments.model), path=arguments.path))
     work = in_processes(hear, recordings, arguments.jobs)
     trials = list(track(work, "listening", len(recordings)))
     found = {one.name: across(one, trials, classifiers, arguments.seed) for one in (FIXED, RETRAINED)}

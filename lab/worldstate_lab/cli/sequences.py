@@ -3,7 +3,9 @@
 FOLDER holds `truth.csv`, `srp.npz`, `sound/`, `boxes/` and, for the second path, `pair/`. Every recording
 runs through the product's own chain, with the camera and by sound alone: on the path *seven* from the spectra
 of seven microphones and one channel of sound, with the model that ships; on the path *pair* from two
-channels, with a model made for them, whose simulated exam stands beside the figures.
+channels, with a model made for them, whose simulated exam stands beside the figures. A row of the spectra is
+of the second that begins with it: as they lie, a hop of *seven* uses sound up to 0.9 s after it. The path
+*seven_on_time* computes half seconds from the rows and uses each when it has ended.
 
 Printed for each path: the hazard AUROC so long before T0, what the alarm warns of and costs beside the rows
 of Table I (thresholds from five folds over recordings), the best thresholds at so many false onsets (a curve:
@@ -24,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -37,7 +39,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate_lab.report.table import plain
 from worldstate_lab.sequences.front_end_figures import front_end_figures
-from worldstate_lab.sequences.hearing import Chain, PathName, ovad_chain
+from worldstate_lab.sequences.hearing import SPECTRA, Chain, PathName, ovad_chain
 from worldstate_lab.sequences.path_figures import (
     SEEDS,
     Heard,
@@ -49,7 +51,7 @@ from worldstate_lab.sequences.path_figures import (
 )
 from worldstate_lab.sequences.path_tables import FOLLOWED, path_lines, scores_table
 from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
-from worldstate_lab.sequences.summed_scores import summed_scores
+from worldstate_lab.sequences.summed_scores import LevelReading, summed_scores
 from worldstate_lab.sequences.tracking import tracking_figures
 from worldstate_lab.trials.pass_cache import Failed, attempted
 
@@ -61,7 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("folder", type=Path, metavar="FOLDER", help="recordings of a corner")
-    add("--path", choices=("seven", "pair"), help="what hears (default: both, pair if its model is there)")
+    add("--path", choices=get_args(PathName), help="what hears (default: all, pair if its model is there)")
     add("--boxes", default="boxes", metavar="NAME", help="folder of boxes, none for no camera (%(default)s)")
     add("--model", type=Path, metavar="FILE", help="of --path (default: the one that ships, pair/model.json)")
     add("--exam", type=Path, metavar="FILE", help="simulated exam of the pair's model (default: beside it)")
@@ -89,7 +91,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         lines += [*path_lines(chain.path, report[chain.path]), ""]
     if arguments.streams:
         report["sums"] = _sums(arguments, heard, chains[0])
-        lines += scores_table(report["sums"], "seven: sums that are not the product, by sound alone").lines()
+        for path, sums in report["sums"].items():
+            lines += scores_table(sums, f"{path}: sums that are not the product, by sound alone").lines()
     return CommandResult(plain(report), table={}, lines=lines)
 
 
@@ -99,7 +102,7 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.model is not None and arguments.path is None:
         raise InvalidArgumentError("--model: expected --path, which it was made for")
     if arguments.streams and arguments.path is not None:
-        raise InvalidArgumentError("--streams: expected both paths, got one")
+        raise InvalidArgumentError("--streams: expected every path, got one")
 
 
 def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:
@@ -110,13 +113,14 @@ def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:
 def _paths(arguments: argparse.Namespace) -> tuple[PathName, ...]:
     if arguments.path is not None:
         return (arguments.path,)
-    return ("seven", "pair") if (arguments.folder / PAIR / "model.json").exists() else ("seven",)
+    given = (arguments.folder / PAIR / "model.json").exists()
+    return get_args(PathName) if given else SPECTRA
 
 
 def _chain(arguments: argparse.Namespace, path: PathName) -> Chain:
     boxes = None if arguments.boxes == "none" else arguments.boxes
-    if path == "seven":
-        return ovad_chain(read_model(arguments.model), boxes)
+    if path in SPECTRA:
+        return ovad_chain(read_model(arguments.model), boxes, path)
     folder = arguments.folder / PAIR
     return Chain(
         path, read_model(arguments.model or folder / "model.json"), read_array(folder / "array.csv"), boxes
@@ -133,7 +137,7 @@ def _heard(chain: Chain, recordings: Sequence[CornerRecording], jobs: int) -> tu
 
 
 def _figures(arguments: argparse.Namespace, chain: Chain, heard: Heard) -> dict[str, Any]:
-    published = chain.path == "seven" and arguments.features
+    published = chain.path in SPECTRA and arguments.features
     classifiers = classifiers_of(arguments.features, arguments.lists) if published else None
     found = path_figures(heard, classifiers, arguments.seed)
     exam = arguments.exam or arguments.folder / PAIR / EXAM
@@ -147,8 +151,11 @@ def _figures(arguments: argparse.Namespace, chain: Chain, heard: Heard) -> dict[
 
 
 def _sums(arguments: argparse.Namespace, heard: Mapping[PathName, Heard], seven: Chain) -> dict[str, Any]:
-    """Return what the sums of parts are worth on recordings that both paths heard."""
-    trials, pair = heard["seven"].alone, heard["pair"].alone
-    sums = summed_scores(trials, pair, [HeardStream.load(one) for one in arguments.streams], seven.model)
-    rng = np.random.default_rng(arguments.seed)
-    return {name: score_figures(trials, scores, None, rng) for name, scores in sums.items()}
+    """Return by path what the sums of parts are worth on recordings that all paths heard."""
+    levels = LevelReading.learned([HeardStream.load(one) for one in arguments.streams], seven.model)
+    found = dict[str, Any]()
+    for path in SPECTRA:
+        trials, rng = heard[path].alone, np.random.default_rng(arguments.seed)
+        sums = summed_scores(trials, heard["pair"].alone, levels, seven.model)
+        found[path] = {name: score_figures(trials, scores, None, rng) for name, scores in sums.items()}
+    return found

@@ -37,6 +37,7 @@ from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 from .recordings import NANODET_BOXES, CornerRecording
 
 PathName = Literal["seven", "seven_on_time", "pair"]
+SPECTRA: tuple[PathName, ...] = ("seven", "seven_on_time")
 # What the product publishes at every hop, by side where it has sides.
 PRODUCT_COLUMNS = (
     "compared_nats",  # shape (2,): What the alarm of a side is decided by

@@ -75,15 +75,15 @@ class LevelReading:
 
 
 def summed_scores(
-    seven: Sequence[Trial], pair: Sequence[Trial], streams: Sequence[HeardStream], model: Model
+    seven: Sequence[Trial], pair: Sequence[Trial], reading: LevelReading, model: Model
 ) -> Scores:
     """Return the sums and their parts at every hop of recordings, each shape (n,), by the name of a row.
 
     `seven` and `pair` are the same recordings on both paths of `hearing.heard`, `model` is that of the path
-    `seven`, `streams` are simulated ones of the pair. Of the two sides the larger value counts. Values are
-    means over 0.3 s, except for rows "one hop" and the decision value that the product publishes.
+    `seven`, `reading` was learned on simulated streams of the pair. Of the two sides the larger value counts.
+    Values are means over 0.3 s, except for rows "one hop" and the decision value that the product publishes.
     """
-    reading, (_, sequence) = LevelReading.learned(streams, model), parts_of(model)
+    _, sequence = parts_of(model)
     parts = [_parts(*one, reading, sequence) for one in zip(seven, pair, strict=True)]
     return {name: [one[name] for one in parts] for name in parts[0]}
 
