@@ -4,9 +4,9 @@ import io
 import os
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import ExitStack
 from pathlib import Path
-from typing import BinaryIO, Literal, NamedTuple
+from typing import BinaryIO, Literal, NamedTuple, get_args
 
 import numpy as np
 import soundfile
@@ -16,13 +16,8 @@ from worldstate.ground.typing import Float32Array
 Encoding = Literal["s16", "s24", "s24_32", "s32", "f32"]
 # Of libsndfile, but for the one that it lacks: 24 bits in the lower three of four bytes (ALSA's S24_LE).
 PADDED_24 = "PCM_24_32"
-SUBTYPES: dict[Encoding, str] = {
-    "s16": "PCM_16",
-    "s24": "PCM_24",
-    "s24_32": PADDED_24,
-    "s32": "PCM_32",
-    "f32": "FLOAT",
-}
+_NAMES = "PCM_16", "PCM_24", PADDED_24, "PCM_32", "FLOAT"
+SUBTYPES: dict[Encoding, str] = dict(zip(get_args(Encoding), _NAMES, strict=True))
 MAX_CHUNKS, MAX_CHANNELS, MAX_RATE_HZ = 10_000, 1024, 10_000_000
 _W64_RIFF = bytes.fromhex("726966662e91cf11a5d628db04c10000")
 _UNKNOWN_SIZE = 0xFFFFFFFF
@@ -31,15 +26,8 @@ _UNKNOWN_SIZE = 0xFFFFFFFF
 _OPEN_SIZE, _NEAR_BYTES = 1 << 31, 1 << 16
 # Enough samples to see how they are stored.
 LOOK_BYTES = 1 << 16
-# By the format's tag (1 whole numbers, 3 floats) and the bytes of a sample.
-_STORED = {
-    (1, 1): "PCM_U8",
-    (1, 2): "PCM_16",
-    (1, 3): "PCM_24",
-    (1, 4): "PCM_32",
-    (3, 4): "FLOAT",
-    (3, 8): "DOUBLE",
-}
+# By the format's tag (1 whole numbers, 3 floats), then the bytes of a sample.
+_WHOLE, _FLOATS = {1: "PCM_U8", 2: "PCM_16", 3: "PCM_24", 4: "PCM_32"}, {4: "FLOAT", 8: "DOUBLE"}
 
 
 def decoded(data: bytes, subtype: str, channels: int) -> Float32Array:
@@ -91,55 +79,34 @@ class _Form(NamedTuple):
 _RIFF, _W64 = _Form(12, struct.Struct("<4sI"), 0, 2), _Form(40, struct.Struct("<4s12xQ"), 24, 8)
 
 
-@dataclass(frozen=True, slots=True)
-class WaveLayout:
-    """Where a file keeps its samples, and how."""
-
-    path: Path
-    first_byte: int
-    declared_bytes: int  # As the header counts them
-    n_bytes: int  # Of samples, as the file shows
-    there_bytes: int  # From the first sample to the end of the file
-    about: bytes  # The chunk of the format
-    big: bool  # BW64, which libsndfile does not read
-
-    def samples(self) -> "PlainSamples | None":
-        """Open what libsndfile reads wrongly (24 bits in four bytes as three) or not at all; else None."""
-        (subtype, whole), right = self._subtype(), self.n_bytes == self.declared_bytes
-        return None if subtype is None or (right and whole and not self.big) else PlainSamples(self, subtype)
-
-    def format(self) -> tuple[int, int, int]:
-        """Return channels, samples a second, and bytes of one sample of all channels."""
-        channels, rate_hz, frame_bytes = struct.unpack_from("<HI4xH", self.about, 2)
-        return channels, rate_hz, frame_bytes
-
-    def _subtype(self) -> tuple[str | None, bool]:
-        """Return how samples are stored, None for no plain ones, and whether they fill their bytes."""
-        if len(self.about) < 16:
-            return None, True
-        channels, rate_hz, frame_bytes = self.format()
-        if not (1 <= channels <= MAX_CHANNELS and 1 <= rate_hz <= MAX_RATE_HZ) or frame_bytes % channels:
-            return None, True
-        (tag, bits), sub = struct.unpack_from("<H12xH", self.about), self.about[24:26]
-        tag, each = int.from_bytes(sub, "little") if tag == 0xFFFE else tag, frame_bytes // channels
-        lower = (tag, each, bits) == (1, 4, 24) and self._is_padded()
-        return PADDED_24 if lower else _STORED.get((tag, each)), bits == 8 * each
-
-    def _is_padded(self) -> bool:
-        """Whether 24 bits stand in the lower bytes, as arecord writes them, or in the upper as all others."""
-        with self.path.open("rb") as file:
-            file.seek(self.first_byte)
-            return four_byte_form(file.read(LOOK_BYTES)) == "s24_32"
-
-
 class PlainSamples:
-    """Samples of a layout, in what an `AudioSource` uses of `soundfile.SoundFile`."""
+    """The samples of a file by its chunks, in what an `AudioSource` uses of `soundfile.SoundFile`.
 
-    def __init__(self, layout: WaveLayout, subtype: str) -> None:
-        self._file, self._first, self.subtype = layout.path.open("rb"), layout.first_byte, subtype
-        self.channels, self.samplerate, self._frame_bytes = layout.format()
-        self.frames = layout.n_bytes // self._frame_bytes
-        self.close = self._file.close
+    Attributes
+    ----------
+    declared_bytes, n_bytes, there_bytes : int
+        Of samples: as the header counts them, as the chunks show, and from the first one to the file's end.
+    needed : bool
+        Whether libsndfile would read them wrongly (24 bits in four bytes as three) or not at all (BW64).
+    """
+
+    def __init__(self, file: BinaryIO, form: _Form, first: int, declared: int, about: bytes) -> None:
+        self._file, self.close, self._first, self.declared_bytes = file, file.close, first, declared
+        self.there_bytes = os.fstat(file.fileno()).st_size - first
+        self.n_bytes = _held_bytes(file, form, first, declared, self.there_bytes)
+        tag, self.channels, self.samplerate, self._frame_bytes, bits = struct.unpack("<HHI4xHH", about[:16])
+        whole = 1 <= self.channels <= MAX_CHANNELS and self._frame_bytes % self.channels == 0
+        each = self._frame_bytes // self.channels if whole and 1 <= self.samplerate <= MAX_RATE_HZ else 0
+        tag = int.from_bytes(about[24:26], "little") if tag == 0xFFFE else tag
+        self.subtype = {1: _WHOLE, 3: _FLOATS}.get(tag, {}).get(each)
+        self.seek(0)
+        # Arecord writes 24 bits into the lower bytes of four, all others into the upper.
+        if (tag, each, bits) == (1, 4, 24) and four_byte_form(file.read(LOOK_BYTES)) == "s24_32":
+            self.subtype = PADDED_24
+        file.seek(0)
+        right = self.n_bytes == declared and bits == 8 * each and file.read(4) != b"BW64"
+        self.needed = self.subtype is not None and not right
+        self.frames = self.n_bytes // max(self._frame_bytes, 1)
 
     @property
     def closed(self) -> bool:
@@ -152,27 +119,25 @@ class PlainSamples:
 
     def read(self, frames: int, **_: object) -> Float32Array:
         """Return so many samples of all channels."""
-        return decoded(self._file.read(frames * self._frame_bytes), self.subtype, self.channels)
+        return decoded(self._file.read(frames * self._frame_bytes), str(self.subtype), self.channels)
 
 
-def wave_layout(path: Path) -> WaveLayout | None:
-    """Return where a RIFF, RF64, BW64 or W64 file keeps its samples; None for all others."""
-    with path.open("rb") as file:
-        magic = file.read(16)
+def plain_samples(path: Path) -> PlainSamples | None:
+    """Open a RIFF, RF64, BW64 or W64 file by its chunks; None for all others."""
+    with ExitStack() as opened:
+        file = opened.enter_context(path.open("rb"))
+        magic, about, wide = file.read(16), b"", _UNKNOWN_SIZE
         is_riff = magic[:4] in (b"RIFF", b"RF64", b"BW64") and magic[8:12] == b"WAVE"
-        if not is_riff and magic != _W64_RIFF:
-            return None
-        form, about, wide = _RIFF if is_riff else _W64, b"", _UNKNOWN_SIZE
-        for name, size, at in _chunks(file, form):
-            if name == b"data":
-                declared = wide if size == _UNKNOWN_SIZE else size
-                there = os.fstat(file.fileno()).st_size - at
-                held = _held_bytes(file, form, at, declared, there)
-                return WaveLayout(path, at, declared, held, there, about, magic[:4] == b"BW64")
+        form = _RIFF if is_riff else _W64
+        for name, size, at in _chunks(file, form) if is_riff or magic == _W64_RIFF else ():
             if name == b"fmt ":
                 about = file.read(min(size, 40))
             elif name == b"ds64" and len(sizes := file.read(16)) == 16:
                 wide = struct.unpack("<8xQ", sizes)[0]
+            elif name == b"data" and len(about) >= 16:
+                opened.pop_all()
+                declared = wide if size == _UNKNOWN_SIZE else size
+                return PlainSamples(file, form, at, declared, about)
     return None
 
 

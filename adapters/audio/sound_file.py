@@ -24,7 +24,7 @@ from .plain_samples import (
     PlainSamples,
     decoded,
     four_byte_form,
-    wave_layout,
+    plain_samples,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -34,7 +34,6 @@ _EXPECTED = "WAV, RF64, W64 or FLAC"
 _WAYS_ON = {
     ".bag": "; a bag of ROS 1: `rosbags-convert --src IN.bag --dst OUT` makes one of ROS 2",
     ".raw": "; samples without a header are read from standard input: pcm:RATE:CHANNELS:FORMAT",
-    ".pcm": "; samples without a header are read from standard input: pcm:RATE:CHANNELS:FORMAT",
 }
 # Lossy codecs keep what the ear needs and lose the phase between microphones.
 FLOATING = ("FLOAT", "DOUBLE")
@@ -277,17 +276,18 @@ def _open_file(path: Path) -> Any:
 
 def _open_plain(path: Path) -> PlainSamples | None:
     """Open a file whose header does not fit what follows it, and say so; refuse one that was cut short."""
-    if (layout := wave_layout(path)) is None:
+    if (plain := plain_samples(path)) is None:
         return None
-    declared, there = layout.declared_bytes, layout.there_bytes
-    if layout.n_bytes > there:
-        problem = f"cut short: expected {declared} bytes of samples by its header, got {there}"
+    numbers = plain.declared_bytes, plain.n_bytes
+    if not plain.needed or plain.n_bytes > plain.there_bytes:
+        plain.close()
+    if plain.n_bytes > plain.there_bytes:
+        problem = f"cut short: expected {numbers[0]} bytes of samples by its header, got {plain.there_bytes}"
         raise InputFileError(path, f"{problem}; `sox --ignore-length IN OUT` keeps what is there")
-    plain = layout.samples()
-    if plain is not None and layout.n_bytes != declared:
+    if plain.needed and numbers[0] != numbers[1]:
         told = "%s: its header promises %d bytes of samples, the file holds %d: read to their end"
-        _LOG.warning(told, path, declared, layout.n_bytes)
-    return plain
+        _LOG.warning(told, path, *numbers)
+    return plain if plain.needed else None
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:

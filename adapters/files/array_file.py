@@ -46,7 +46,7 @@ _TRANSPOSED = "three rows are a 3 x M matrix, as of MATLAB and pyroomacoustics: 
 _DECIMAL_COMMAS = re.compile(r"(-?\d*,\d+|-?\d+)([;\s]+(-?\d*,\d+|-?\d+)){2,3}")
 # Of libconfig: strings stay, comments go; what does not end goes on to the end of the file.
 _COMMENT = re.compile(r'("(?:\\.|[^"\\])*"?)|#[^\n]*|//[^\n]*|/\*(?:.*?\*/|.*)', re.DOTALL)
-_MICS, _MARKS = re.compile(r"\bmics\s*[:=]\s*[(\[]"), re.compile(r"[()\[\]]")
+_MICS, _GROUPS = re.compile(r"\bmics\s*[:=]\s*[(\[]"), re.compile(r"(?:[\s,]*\{[^{}]*\})*[\s,]*[)\]]")
 _MU, _MAP = (re.compile(rf"\b{key}\s*[:=]\s*[(\[]([^()\[\]]*)[)\]]") for key in ("mu", "map"))
 
 
@@ -280,31 +280,22 @@ def _csv_columns(path: Path, cells: list[list[str]]) -> tuple[list[int], int | N
 
 def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]:
     """Return the columns of lines of four numbers if one, in front or behind, counts the microphones."""
-    width = len(cells[0])
-    counts = [i for i in (0, 3) if width == 4 and _counts([row[i] if i < len(row) else "" for row in cells])]
-    if len(counts) != 1:
-        problem = f"expected x, y and z, got {width} numbers a line: a header x,y,z,gain states what they are"
-        raise InputFileError(path, f"{problem}; {_TRANSPOSED}" if len(cells) == 3 else problem)
-    return [i for i in range(4) if i != counts[0]], counts[0], None
-
-
-def _counts(column: list[str]) -> bool:
-    return all(cell.isdecimal() for cell in column) and len({*column}) == len(column)
+    counted = [{row[i] for row in cells if len(row) == 4 and row[i].isdecimal()} for i in (0, 3)]
+    counts = [i for i, found in zip((0, 3), counted, strict=True) if len(found) == len(cells)]
+    if len(counts) == 1:
+        return [i for i in range(4) if i != counts[0]], counts[0], None
+    problem = (
+        f"expected x, y and z, got {len(cells[0])} numbers a line: a header x,y,z,gain states what they are"
+    )
+    raise InputFileError(path, f"{problem}; {_TRANSPOSED}" if len(cells) == 3 else problem)
 
 
 def _odas_rows(path: Path, text: str, begin: int) -> _Rows:
     """Return the microphones of a configuration of ODAS without its comments."""
-    level, end = 1, None
-    for mark in _MARKS.finditer(text, begin):
-        level += 1 if mark[0] in "([" else -1
-        if level == 0:
-            end = mark.start()
-            break
-    block = text[begin:end]
-    rows: list[Row] = [found[1].split(",") for found in _MU.finditer(block)]
-    if end is None or block.count("{") != len(rows) or any(len(row) != 3 for row in rows):
+    block, used = _GROUPS.match(text, begin), _MAP.search(text)
+    rows: list[Row] = [found[1].split(",") for found in _MU.finditer(block[0] if block else "")]
+    if block is None or block[0].count("{") != len(rows) or any(len(row) != 3 for row in rows):
         raise InputFileError(path, "expected mics = ( { mu = ( x, y, z ); ... }, ... ) as in ODAS")
-    used = _MAP.search(text)
     numbers = [one.strip() for one in used[1].split(",")] if used else []
     return _Rows(rows, channels=tuple(int(one) if one.isdecimal() else one for one in numbers))
 

@@ -103,17 +103,17 @@ def by_number(path: Path, names: Sequence[str]) -> list[int]:
     [0, 1, 2]
     """
     given, parts = list(range(len(names))), [re.split(r"(\d{1,9})", name) for name in names]
-    numbers = [tuple(map(int, part[1::2])) for part in parts]
+    numbers, texts = [tuple(map(int, part[1::2])) for part in parts], {tuple(part[::2]) for part in parts}
     ranked = sorted(given, key=numbers.__getitem__)
-    if len({tuple(part[::2]) for part in parts}) > 1 or len({*numbers}) < len(names) or ranked == given:
+    if len(texts) > 1 or len({*numbers}) < len(names) or ranked == given:
         return given
     # Locales sort without regard to punctuation: mic_10.wav before mic_1.wav.
     bare = [re.sub(r"[\W_]", "", name).lower() for name in names]
     by_text = sorted(names) == list(names) or sorted(bare) == bare
-    told = "%s: %s, %s, ... are not in the order of their numbers: %s"
     done = "taken in that of the numbers" if by_text else "kept as they were given"
-    at = next(i for i in given if ranked[i] != i)
-    _LOG.warning(told, path, names[at], names[min(at + 1, len(names) - 1)], done)
+    at = next(i for i in given[:-1] if ranked[i] != i)
+    told = "%s: %s, %s, ... are not in the order of their numbers: %s"
+    _LOG.warning(told, path, names[at], names[at + 1], done)
     return ranked if by_text else given
 
 

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from worldstate.adapters.audio import sound_file
-from worldstate.adapters.audio.plain_samples import LOOK_BYTES, MAX_CHANNELS, MAX_RATE_HZ, Encoding
+from worldstate.adapters.audio.plain_samples import LOOK_BYTES, MAX_CHANNELS, Encoding
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.datasets.ovad import AUDIO_NAME
 from worldstate.adapters.export.log_messages import check_chunks
@@ -28,7 +28,7 @@ from worldstate.measurement.odometry import Odometry
 
 from . import message_types as types
 from .message_types import instant_of, stamp_of, typestore
-from .sample_clock import begins_again, contradiction, early_ns, lost_before
+from .sample_clock import begins_again, contradiction, lost_before
 
 # What may mend a file of each storage.
 _MENDED = {".mcap": "`mcap recover IN -o OUT`", ".db3": "`sqlite3 IN .recover | sqlite3 OUT`"}
@@ -166,20 +166,16 @@ _LOG = logging.getLogger(__name__)
 
 AUDIO_KINDS = types.AUDIO, types.STAMPED_PCM, types.PCM, types.AUDIO_FRAME, types.RAW_AUDIO
 # Formats by the message that names them; a compressed one has lost the phase between microphones.
+_ENCODED: tuple[Encoding, ...] = get_args(Encoding)
+_FRAMES = "signed_16", "signed_24", "signed_padded_24", "signed_32", "float"
 ENCODINGS: dict[str, dict[str, Encoding]] = {
-    types.PCM_INFO: {"S16LE": "s16", "S24LE": "s24", "S24_32LE": "s24_32", "S32LE": "s32", "F32LE": "f32"},
-    types.AUDIO_FRAME: {
-        "signed_16": "s16",
-        "signed_24": "s24",
-        "signed_padded_24": "s24_32",
-        "signed_32": "s32",
-        "float": "f32",
-    },
+    types.PCM_INFO: dict(zip(("S16LE", "S24LE", "S24_32LE", "S32LE", "F32LE"), _ENCODED, strict=True)),
+    types.AUDIO_FRAME: dict(zip(_FRAMES, _ENCODED, strict=True)),
     types.RAW_AUDIO: {"pcm-s16": "s16"},
+    types.AUDIO: {"": "f32"},
 }
 # Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
 LONGEST_GAP_S = 2.0
-_MISSING = "%s: %.3f s of %s are missing at %.3f s"
 STATIC_TOPIC = "/tf_static"
 # Of a quaternion, as tf2 has it.
 _LENGTH_TOLERANCE = 0.01
@@ -272,7 +268,7 @@ class BagAudio(sound_file.Audio):
             expected = f"expected messages on {self._sound.topic} at most {LONGEST_GAP_S:g} s apart"
             got = f"at {at_s:.3f} s the next is {lost_s:.3f} s off: cut the bag there (`ros2 bag convert`)"
             raise InputFileError(self.path, f"{expected}; {got}")
-        _LOG.warning(_MISSING, self.path, lost_s, self._sound.topic, at_s)
+        _LOG.warning("%s: %.3f s of %s are missing at %.3f s", self.path, lost_s, self._sound.topic, at_s)
 
 
 def _lost_bytes(packet: AudioPacket, lost_ns: float, within: bool) -> int:
@@ -292,11 +288,7 @@ def audio_packets(
     if stated is None and kind in (types.STAMPED_PCM, types.PCM):
         stated = _pcm_info(bag, topic)
     for recorded_ns, message in bag.messages(topic):
-        if kind == types.AUDIO:
-            packet = _own_packet(bag.path, message, recorded_ns)
-        else:
-            pcm = stated or _described(bag, topic, kind, message)
-            packet = _pcm_packet(pcm, message, recorded_ns)
+        packet = _packet(stated or _described(bag, topic, kind, message), message, recorded_ns)
         first = first or packet
         got = packet.pcm.sample_rate_hz, packet.pcm.channels
         if got != (wanted := (first.pcm.sample_rate_hz, first.pcm.channels)):
@@ -308,30 +300,13 @@ def audio_packets(
         raise InputFileError(bag.path, f"expected samples on {topic}, it holds no message")
 
 
-def _own_packet(path: Path, message: Any, recorded_ns: int) -> AudioPacket:
-    rate_hz, channels, data = int(message.sample_rate), int(message.channels), message.data
-    if not (1 <= rate_hz <= MAX_RATE_HZ and 1 <= channels <= MAX_CHANNELS):
-        expected = f"expected 1 to {MAX_RATE_HZ} samples a second and 1 to {MAX_CHANNELS} channels"
-        raise InputFileError(path, f"{expected}, got {rate_hz} and {channels}")
-    if len(data) % channels:
-        raise InputFileError(path, f"expected samples of {channels} channels, got {len(data)} numbers")
-    if message.layout not in ("interleaved", "planar"):
-        raise InputFileError(path, f"layout: expected interleaved or planar, got {message.layout!r:.40}")
-    flat = np.asarray(data, dtype="<f4")
-    samples = flat.reshape(channels, -1).T if message.layout == "planar" else flat
-    pcm = sound_file.RawPcm(io.BytesIO(), rate_hz, channels, "f32", str(path))
-    return _packet(pcm, message, recorded_ns, samples.tobytes())
-
-
 def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
     """Return how the bytes of audio_common are to be read, as its AudioInfo says."""
     where = bag.topic("the topic of AudioInfo", None, types.PCM_INFO)
     said = None if where is None else next(bag.messages(where), None)
     if said is None:
-        problem = (
-            f"expected {types.PCM_INFO} beside {topic}, or --audio-format RATE:CHANNELS:FORMAT of its bytes"
-        )
-        raise InputFileError(bag.path, problem)
+        wanted = f"{types.PCM_INFO} beside {topic}, or --audio-format RATE:CHANNELS:FORMAT of its bytes"
+        raise InputFileError(bag.path, f"expected {wanted}")
     info = said[1]
     if info.coding_format.lower() not in ("wave", "raw", ""):
         problem = f"{where}: expected uncompressed samples (format:=wave), got {info.coding_format!r:.20}"
@@ -343,6 +318,8 @@ def _described(bag: BagReader, topic: str, kind: str, message: Any) -> sound_fil
     """Return how the bytes of a message that describes itself are to be read."""
     if kind == types.AUDIO_FRAME:
         return _pcm(bag, topic, kind, message.format, message.sampling_frequency, message.channel_count)
+    if kind == types.AUDIO:
+        return _pcm(bag, topic, kind, "", message.sample_rate, message.channels)
     return _pcm(bag, topic, kind, message.format, message.sample_rate, message.number_of_channels)
 
 
@@ -357,26 +334,33 @@ def _pcm(
         return sound_file.RawPcm(io.BytesIO(), int(rate_hz), int(channels), encoding, str(bag.path))
 
 
-def _pcm_packet(pcm: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioPacket:
-    data = bytes(getattr(message, "audio", message).data)
-    frames = getattr(message, "frame_sample_count", None)
-    if frames is not None and len(data) != frames * pcm.frame_bytes:
-        counted = f"expected whole samples of {pcm.channels} channels, {frames} as frame_sample_count says"
-        raise InputFileError(pcm.name, f"{counted}, got {len(data)} bytes")
-    return _packet(pcm, message, recorded_ns, data)
-
-
-def _packet(pcm: sound_file.RawPcm, message: Any, recorded_ns: int, data: bytes) -> AudioPacket:
-    """Return bytes with the time of their first sample."""
+def _packet(pcm: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioPacket:
+    """Return the bytes of a message with the time of their first sample."""
     if hasattr(message, "timestamp"):
         stamp_ns = instant_of(message.timestamp)
     else:
         stamp_ns = stamp_of(message.header) if hasattr(message, "header") else 0
-    packet = AudioPacket(stamp_ns, recorded_ns, pcm, data)
+    packet = AudioPacket(stamp_ns, recorded_ns, pcm, _bytes_of(pcm, message))
     # AudioFrame is stamped when its last sample is there; what has no stamp was recorded then.
     if stamp_ns and not hasattr(message, "frame_sample_count"):
         return packet
     return replace(packet, stamp_ns=max((stamp_ns or recorded_ns) - round(packet.length_ns), 0))
+
+
+def _bytes_of(pcm: sound_file.RawPcm, message: Any) -> bytes:
+    """Return samples as bytes, channels interleaved."""
+    data, layout = getattr(message, "audio", message).data, getattr(message, "layout", "interleaved")
+    if hasattr(message, "layout") and len(data) % pcm.channels:
+        raise InputFileError(
+            pcm.name, f"expected samples of {pcm.channels} channels, got {len(data)} numbers"
+        )
+    if layout not in ("interleaved", "planar"):
+        raise InputFileError(pcm.name, f"layout: expected interleaved or planar, got {layout!r:.40}")
+    frames = getattr(message, "frame_sample_count", None)
+    if frames is not None and len(data) != frames * pcm.frame_bytes:
+        counted = f"expected whole samples of {pcm.channels} channels, {frames} as frame_sample_count says"
+        raise InputFileError(pcm.name, f"{counted}, got {len(data)} bytes")
+    return bytes(data.reshape(pcm.channels, -1).T.tobytes() if layout == "planar" else data.tobytes())
 
 
 @dataclass(frozen=True, slots=True)
@@ -521,13 +505,13 @@ def _on_samples(
         told = "%s: stamps of %s begin again at %.3f s (a bag in a loop?) and are counted on"
         _LOG.warning(told, sound.path, sound.topic, seconds(int(lengths_ns[:k].sum())))
     stamps_ns = stamps_ns + added_ns
-    lost_ns = lost_before(stamps_ns, lengths_ns)
+    lost_ns, early_ns = lost_before(stamps_ns, lengths_ns)
     if told := contradiction(stamps_ns, lengths_ns, lost_ns):
         problem = f"{sound.topic}: {told}: another rate (--audio-format), or a bag that was played in a loop"
         raise InputFileError(sound.path, f"{problem} and whose passes its recorder mixed: record one pass")
     return replace(
         sound,
-        start_ns=sound.start_ns - round(early_ns(stamps_ns, lengths_ns)),
+        start_ns=sound.start_ns - round(early_ns),
         frames=round(float(lengths_ns.sum() + lost_ns.sum()) * 1e-9 * sound.sample_rate_hz),
         lost_ns={int(k): float(lost_ns[k]) for k in np.flatnonzero(lost_ns)},
         again=tuple((int(recorded_ns[k]), more_ns) for k, more_ns in again),
