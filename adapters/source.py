@@ -438,12 +438,11 @@ def check_clocks(source: Source, length_s: float | None) -> None:
     if source.co_evidence is not None:
         held = [(one.detections, one.camera) for one in source.co_evidence.cameras.values()]
     for log, offset_s in [(log, camera.stamp_offset_s) for log, camera in held if log]:
-        if log.counted_hz is None:
-            together_s = offset_s + begins_s - seconds(int(log.stamps_ns[0]))
-            way_on = f'"stamp_offset_s": {together_s:.1f} of its camera would make both begin together'
-            _check_stamps(log.source, log.stamps_ns.tolist(), begins_s, ends_s, way_on)
-        elif log.assumed and length_s is not None:
+        if log.assumed and length_s is not None:
             _check_rate(log, seconds(int(log.stamps_ns[-1])) - begins_s - offset_s, length_s)
+        together_s = offset_s + begins_s - seconds(int(log.stamps_ns[0]))
+        way_on = f'"stamp_offset_s": {together_s:.1f} of its camera would make both begin together'
+        _check_stamps(log.source, log.stamps_ns.tolist(), begins_s, ends_s, way_on)
     for told in filter(None, ([*other()] for other in source.others)):
         more_s = begins_s - seconds(told[0].stamp_ns)
         way_on = f"{more_s:.1f} s more would make both begin together; --start (start_s) moves the sound"
@@ -468,8 +467,8 @@ def _check_rate(log: DetectionLog, last_s: float, length_s: float) -> None:
     # Where the last one has a box, those after it may not be listed.
     slow = not len(log.frames[-1]) and any(abs(rate_hz / one - 1.0) < _SAME_LENGTH for one in _SLOW_RATES_HZ)
     if slow or images / assumed_hz > length_s * (1.0 + _SAME_LENGTH) + _LONGER_S:
-        got = f"got {images} in {length_s:.1f} s of sound, {rate_hz:.3g} a second"
-        way_on = "state their rate (--image-rate, image_rate_hz, frame_rate_hz)"
+        got = f"got number {images - 1} in {length_s:.1f} s of sound, as at {rate_hz:.3g} a second"
+        way_on = "state their rate (--image-rate, image_rate_hz), or count them from the first sample"
         raise InputFileError(log.source, f"expected {assumed_hz:g} images a second, {got}: {way_on}")
 
 

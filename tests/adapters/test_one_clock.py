@@ -53,6 +53,13 @@ def test_images_without_stamps_count_from_the_first_sample(sound: Path, start_s:
         assert isinstance(query.ask(nanoseconds(start_s + at_s), Bearing(0.0, 0.05)), Absent)
 
 
+def test_an_offset_that_leads_images_without_stamps_away_is_refused(sound: Path) -> None:
+    log = DetectionLog.at_rate([NONE] * 200, 10.0)
+    heard(sound, offset_s=-0.3, detections=log)
+    with pytest.raises(InputFileError, match=r'"stamp_offset_s": 0\.0'):
+        heard(sound, offset_s=1.7e9, detections=log)
+
+
 # Of clocks by which one sensor was stamped and not the other: epoch, TAI, GPS, an hour, a day, a minute.
 OFF_S = (1.7e9, 37.0, -37.0, 18.0, 19.0, 3600.0, -86_400.0, 60.0)
 
