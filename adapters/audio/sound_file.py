@@ -259,9 +259,9 @@ def _open_file(path: Path) -> Any:
     if not path.is_file():
         problem = "expected an audio file, found a folder" if path.is_dir() else "no such file"
         raise InputFileError(path, problem)
-    if (plain := _open_plain(path)) is not None:
-        return plain
     try:
+        if (plain := _open_plain(path)) is not None:
+            return plain
         file = soundfile.SoundFile(path)
     except (soundfile.SoundFileError, OSError, TypeError) as error:
         way = _WAYS_ON.get(path.suffix.lower(), "")
