@@ -32,13 +32,11 @@ STUDIES = {
         "clips",
         "foreign",
         "four",
-        "junctions",
         "kinds",
         "place",
-        "sequences",
-        "staged",
     )
 }
+CORNER = {name: f"worldstate_lab.cli.corner.{name}" for name in ("sequences", "junctions", "staged")}
 BENCHES = {
     "bench": f"{BENCH}.cost",
     "bench cost": f"{BENCH}.cost",
@@ -48,7 +46,9 @@ BENCHES = {
 DESCRIPTION = "The evaluation of the paper, and studies of our own."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"
 GROUPS = {"bench": "costs and accuracies of parts of the library, beside peers"}
-PROGRAM = Program("worldstate-lab", DESCRIPTION, EPILOG, STUDIES | BENCHES, GROUPS, hidden=("bench",))
+PROGRAM = Program(
+    "worldstate-lab", DESCRIPTION, EPILOG, STUDIES | CORNER | BENCHES, GROUPS, hidden=("bench",)
+)
 
 Run = Callable[[argparse.Namespace], CommandResult]
 
