@@ -21,6 +21,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.adapters.camera.miss_rates import load_miss_rates
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.cli.common.inputs import add_array_options, given_array
@@ -70,7 +71,8 @@ def _corner(arguments: argparse.Namespace, model: Model, switches: AblationSwitc
     for boxes in track(arguments.boxes, "cameras"):
         folder = boxes if (arguments.inputs[0] / boxes).is_dir() else str(Path(boxes).absolute())
         chain = ovad_chain(model, folder, arguments.path)
-        rows = corner_rows(chain, recordings, measured, switches, arguments.seed, arguments.jobs)
+        d = LEVELS[int(Path(boxes).name[-1])] if Path(boxes).name[-2:-1] == "-" else 0.0
+        rows = corner_rows(chain, recordings, measured, d, switches, arguments.seed, arguments.jobs)
         states[Path(boxes).name] = rows
         for kind, some in rows.items():
             lines += ["", f"{Path(boxes).name}, {kind}:", *figure_lines(some)]

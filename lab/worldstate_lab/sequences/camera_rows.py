@@ -41,15 +41,15 @@ def corner_rows(
     chain: Chain,
     recordings: Sequence[CornerRecording],
     measured: MissRates | None,
+    degradation: float,
     switches: AblationSwitches,
     seed: int,
     jobs: int = 1,
 ) -> dict[str, dict[str, Figures]]:
     """Return the rows of the paper's statistic and of the product with one camera, by what they change."""
     last_s = last_seen_s(recordings, chain)
-    made: dict[str, list[HopTable]] = {
-        name: corner_streams(one, recordings, last_s, jobs) for name, one in variants(chain, measured).items()
-    }
+    chains = variants(chain, measured, degradation)
+    made = {name: corner_streams(one, recordings, last_s, jobs) for name, one in chains.items()}
     prior = list(chain.model.signature.reference_prior)
     by_statistic = statistic_rows(made["product"], prior, seed, switches)
     return {
@@ -58,8 +58,8 @@ def corner_rows(
     }
 
 
-def variants(chain: Chain, measured: MissRates | None) -> dict[str, Chain]:
-    """Return the product with one thing changed at a time."""
+def variants(chain: Chain, measured: MissRates | None, degradation: float) -> dict[str, Chain]:
+    """Return the product with one thing changed at a time; with measured rates it is given d, too."""
     grounded = replace(chain.settings, grounding=Grounding())
     found = {"product": chain, "product, vision trusted": replace(chain, miss_rates=TRUSTED)}
     if chain.boxes == "boxes":
@@ -67,7 +67,7 @@ def variants(chain: Chain, measured: MissRates | None) -> dict[str, Chain]:
         found["product, no camera"] = replace(chain, boxes=None)
         found["product, eq. (5)"] = replace(chain, settings=grounded)
     if measured is not None:
-        found["product, measured beta"] = replace(chain, miss_rates=measured)
+        found["product, measured beta"] = replace(chain, miss_rates=measured, degradation=degradation)
     return found
 
 

@@ -6,8 +6,9 @@ that stand through a recording are left out, as are those that are parked by the
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import product
+from operator import add
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from worldstate.adapters.camera.detections import (
     DetectionLog,
     kept_and_parked,
 )
-from worldstate.adapters.camera.miss_rates import FamilyCounts
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import nanoseconds
@@ -207,6 +208,16 @@ def _clean_boxes(recording: CornerRecording) -> tuple[DetectionLog, BoolArray]:
 def staged_beta(staging: Staging, approaches: Sequence[CornerRecording], draws: IndexArray) -> BetaCurves:
     """Return beta(theta, d) of the reference vehicle after T0, by family of the paper."""
     return beta_curves([_beta_counts(staging, one) for one in approaches], draws)
+
+
+def staged_miss_rates(staging: Staging, approaches: Sequence[CornerRecording]) -> MissRates:
+    """Return the same counts as the library reads them: the miss rates of this detector."""
+    counted = [_beta_counts(staging, one) for one in approaches]
+    families: dict[str, FamilyCounts] = {
+        name: reduce(add, (one[name] for one in counted)) for name in FAMILIES
+    }
+    edges_deg = AbsenceSettings(FAMILIES, NANODET_BOXES).edges_deg(PinholeCamera.ovad())
+    return MissRates(edges_deg, families, {"detector": staging.detector, "images": "staged real videos"})
 
 
 def _beta_counts(staging: Staging, recording: CornerRecording) -> dict[str, FamilyCounts]:

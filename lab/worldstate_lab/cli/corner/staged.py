@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
+from worldstate.adapters.camera.miss_rates import save_miss_rates
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import Step
 from worldstate.cli.common.command import add_choice
@@ -47,6 +48,7 @@ from worldstate_lab.sequences.staged_looks import (
     box_choices,
     left_out_choices,
     staged_beta,
+    staged_miss_rates,
     vision_row,
     watched_images,
 )
@@ -84,6 +86,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     approaches = [one for one in recordings if not one.hazard_free]
     draws = stratified_draws([one.junction for one in approaches], np.random.default_rng(arguments.seed))
     curves = staged_beta(staging, approaches, draws)
+    rates = staged_miss_rates(staging, approaches)
+    save_miss_rates(arguments.out / f"{staging.detector}-miss_rates.json", rates)
     rows = [vision_row(staging, state, recordings, draws) for state in staging.states]
     report = {
         "recordings": len(recordings),
