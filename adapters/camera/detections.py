@@ -16,6 +16,8 @@ from worldstate.ground.checks import check_shape
 from worldstate.ground.serialisation import Check, Count, Probability, decode
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 
+from .class_names import COCO_CATEGORIES, ROAD_USERS, YOLO_NAMES, class_name
+
 _LOG = logging.getLogger(__name__)
 MAX_BYTES = 64 << 20
 MAX_FRAMES, MAX_BOXES = 250_000, 1_000_000  # two hours at 30 images a second
@@ -27,16 +29,13 @@ BORDER_PX = 1.0
 IMAGE_RATE_HZ = 10.0
 # Decisions at 47,998 Hz fall up to half a sample (10 us) before the frame that they belong to.
 STAMP_SLACK_NS = 1_000_000
-# The road users among COCO's categories, by the number that results files carry, and by their place in the
-# list of eighty names that YOLO text counts through.
-COCO_CATEGORIES: Mapping[int, str] = {
-    1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 7: "train", 8: "truck",
-}  # fmt: skip
-YOLO_CLASSES: Mapping[int, str] = {
-    0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck",
-}  # fmt: skip
+# The road users among the eighty names that YOLO text counts through.
+YOLO_CLASSES: Mapping[int, str] = {i: name for i, name in enumerate(YOLO_NAMES) if name in ROAD_USERS}
 # Of MOTChallenge's ground truth; -1 stands for what a line does not state.
-MOT_CLASSES: Mapping[float, str] = {-1: "car", 1: "person", 3: "car", 4: "bicycle", 5: "motorcycle"}
+MOT_CLASSES: Mapping[float, str] = {
+    -1: "car", 1: "person", 2: "rider", 3: "car", 4: "bicycle", 5: "motorcycle", 6: "cart without a motor",
+    7: "person",
+}  # fmt: skip
 MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
 # Roboflow puts a hash of the image behind its name.
 _HASH = re.compile(r"(_(jpe?g|png|bmp))?\.rf\.\w+$")
@@ -49,6 +48,8 @@ _LEAST_NUMBERS = 3
 # A box is parked when a box stood at its place, every edge within so many pixels, in this share of the images
 # of so many seconds; below 1 because detectors miss now and then.
 PARKED_S, PARKED_PX, PARKED_SHARE = 1.0, 5.0, 0.8
+# Of the images for which the least height of a box and these pixels were chosen.
+OVAD_HEIGHT_PX = 1216.0
 Row = tuple[tuple[float, float, float, float], float, str]
 # Beyond any image, and a sum of two is still a number.
 MAX_NUMBER = 1e9
@@ -124,8 +125,9 @@ class DetectionFrame:
     def select(self, keep: "DetectionFilter") -> IntArray:
         """Return the indices of the boxes that `keep` lets through."""
         heights_px = self.boxes_px[:, 3] - self.boxes_px[:, 1]
-        named = np.array([label in keep.labels for label in self.labels], dtype=bool)
-        return np.flatnonzero(named & (self.scores >= keep.min_score) & (heights_px > keep.min_height_px))
+        named = np.array([class_name(label) in keep.labels for label in self.labels], dtype=bool)
+        high = heights_px > keep.min_height_px * keep.scale
+        return np.flatnonzero(named & (self.scores >= keep.min_score) & high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,12 +136,15 @@ class DetectionFilter:
 
     Parameters
     ----------
-    labels : frozenset of str
-        Classes that count as a road user.
+    labels : collection of str
+        Classes that count as a road user, in the words of any data set (`class_name`).
     min_score : float
         Lowest score, in [0, 1].
     min_height_px : float
-        Boxes must be higher than this, which leaves the far ones out.
+        Boxes must be higher than this in an image of OVAD's height, 1216 pixels, which leaves the far ones
+        out; it scales with the image.
+    image_height_px : float
+        Height of the images that the boxes are of.
 
     Raises
     ------
@@ -155,10 +160,18 @@ class DetectionFilter:
     labels: Collection[str] = frozenset({"car", "motorcycle"})
     min_score: float = 0.75
     min_height_px: float = 100.0
+    image_height_px: float = OVAD_HEIGHT_PX
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", frozenset(map(class_name, self.labels)))
+        in_range("image_height_px", self.image_height_px, 0.0, math.inf, open_low=True)
         in_range("min_score", self.min_score, 0.0, 1.0)
         in_range("min_height_px", self.min_height_px, 0.0, math.inf)
+
+    @property
+    def scale(self) -> float:
+        """Height of the images in that of OVAD's."""
+        return self.image_height_px / OVAD_HEIGHT_PX
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,10 +288,11 @@ def _rate_hz(stated: float | None) -> float:
     return in_range("frame_rate_hz", rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
 
 
-def parked(log: DetectionLog, frame: int, boxes_px: FloatArray) -> BoolArray:
+def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, scale: float = 1.0) -> BoolArray:
     """Return which boxes (n, 4) of an image are parked, from that image and earlier ones, shape (n,).
 
-    For a standing camera: from a moving one every box moves, and none is parked.
+    For a standing camera: from a moving one every box moves, and none is parked. `scale` is the height of the
+    images in that of OVAD's.
     """
     since_ns = int(log.stamps_ns[frame]) - nanoseconds(PARKED_S)
     first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
@@ -287,7 +301,7 @@ def parked(log: DetectionLog, frame: int, boxes_px: FloatArray) -> BoolArray:
     if not past or not len(boxes_px) or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
         return np.zeros(len(boxes_px), dtype=bool)
     apart_px = (np.abs(boxes_px[:, None] - earlier.boxes_px[None]).max(axis=2) for earlier in past)
-    present = [(apart <= PARKED_PX).any(axis=1) for apart in apart_px]
+    present = [(apart <= PARKED_PX * scale).any(axis=1) for apart in apart_px]
     return np.asarray(np.mean(present, axis=0) >= PARKED_SHARE)
 
 
@@ -295,7 +309,14 @@ def kept_and_parked(log: DetectionLog, frame: int, keep: DetectionFilter) -> tup
     """Return the indices of the boxes of an image that are used, and which of those are parked."""
     here = log.frames[frame]
     kept = here.select(keep)
-    return kept, parked(log, frame, here.boxes_px[kept])
+    return kept, parked(log, frame, here.boxes_px[kept], keep.scale)
+
+
+def left_out(log: DetectionLog, frame: int, keep: DetectionFilter) -> IntArray:
+    """Return the indices of the moving boxes of an image that do not count; a score of 0 is no box."""
+    here = log.frames[frame]
+    others = np.setdiff1d(np.flatnonzero(here.scores > 0.0), here.select(keep))
+    return others[~parked(log, frame, here.boxes_px[others], keep.scale)] if others.size else others
 
 
 COUNTS_TOLD = (
@@ -304,9 +325,15 @@ COUNTS_TOLD = (
 )
 
 
+def told_counts(counts: Mapping[str, int]) -> str:
+    """Return the counts of boxes in words."""
+    none = counts["boxes"] and not counts["counted"] + counts["parked"]
+    return COUNTS_TOLD.format(**counts) + ("; none counts: the camera is impaired" if none else "")
+
+
 def count_boxes(log: DetectionLog, keep: DetectionFilter) -> dict[str, int]:
     """Count the boxes of a log by what becomes of them: each is put down to the first reason."""
-    looser = DetectionFilter(keep.labels, 0.0, 0.0), DetectionFilter(keep.labels, keep.min_score, 0.0), keep
+    looser = replace(keep, min_score=0.0, min_height_px=0.0), replace(keep, min_height_px=0.0), keep
     named, scored, high = (sum(len(frame.select(one)) for frame in log.frames) for one in looser)
     boxes = sum(map(len, log.frames))
     still = sum(int(kept_and_parked(log, i, keep)[1].sum()) for i in range(len(log)))
@@ -602,6 +629,7 @@ def read_yolo_text(
     """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image."""
     folder = Path(path)
     files = sorted(file for file in folder.glob("*.txt") if file.name not in _NO_LABELS)
+    names = _listed_names(folder / "classes.txt")
     numbers = image_numbers([file.name for file in files[: MAX_FRAMES + 1]])
     if numbers is None or len(files) > MAX_FRAMES:
         some = ", ".join(file.name for file in files[:2]) or "none"
@@ -612,7 +640,7 @@ def read_yolo_text(
     for file, number in zip(files, numbers, strict=True):
         with refused_as_file(file):
             lines = read_text(file, "a text file", MAX_TEXT_BYTES).splitlines()
-            rows[number] = [_yolo_row(line, size_px) for line in lines if line.strip()]
+            rows[number] = [_yolo_row(line, size_px, names) for line in lines if line.strip()]
     # Who writes empty files, or a data set, writes one for every image: what has none was not looked at.
     if n_images is None and (not all(rows.values()) or any(_HASH.search(file.stem) for file in files)):
         first = _first(rows)
@@ -621,7 +649,13 @@ def read_yolo_text(
     return _log(folder, rows, frame_rate_hz, n_images)
 
 
-def _yolo_row(line: str, size_px: tuple[int, int]) -> Row:
+def _listed_names(path: Path) -> dict[int, str]:
+    """Return the classes that YOLO text counts through: those that are listed beside it, else COCO's."""
+    listed = read_text(path, "a text file", MAX_TEXT_BYTES).split("\n") if path.exists() else YOLO_NAMES
+    return dict(enumerate(listed))
+
+
+def _yolo_row(line: str, size_px: tuple[int, int], names: Mapping[int, str]) -> Row:
     name, *numbers = line.split()
     expected = "class x y w h [score] with w, h >= 0 and the score in [0, 1]"
     problem = f"expected {expected}, got {line!r:.60}"
@@ -634,7 +668,7 @@ def _yolo_row(line: str, size_px: tuple[int, int]) -> Row:
         raise InvalidArgumentError(problem)
     centre, half = (x * size_px[0], y * size_px[1]), (width * size_px[0] / 2, height * size_px[1] / 2)
     box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
-    return box, score, YOLO_CLASSES.get(int(name), name)
+    return box, score, names.get(int(name), name)
 
 
 def _in_bounds(x: float, y: float, width: float, height: float, score: float) -> bool:

@@ -294,7 +294,7 @@ class CameraRecord:
     miss_rates: str | None = None
     classes: tuple[str, ...] = field(default=("car", "motorcycle"), metadata=ADDED)
     min_score: float = field(default=0.75, metadata=ADDED)
-    min_box_px: float = field(default=100.0, metadata=ADDED)
+    min_box_px: float | None = None
     labels: tuple[str, ...] = field(default=("car",), metadata=ADDED)
 
     def camera(self) -> PinholeCamera:

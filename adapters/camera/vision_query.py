@@ -3,6 +3,7 @@
 import itertools
 import logging
 import math
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
@@ -19,10 +20,20 @@ from worldstate.abduction.co_evidence import (
 )
 from worldstate.core.filter import MOST_BOXES
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
+from worldstate.ground.typing import BoolArray, IntArray
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
-from .detections import BORDER_PX, PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
+from .class_names import class_name, may_be
+from .detections import (
+    BORDER_PX,
+    PARKED_S,
+    DetectionFilter,
+    DetectionFrame,
+    DetectionLog,
+    kept_and_parked,
+    left_out,
+)
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
@@ -33,6 +44,11 @@ SAMPLES = 8
 # this lies outside, or half of them reach beyond, some by more than this share of the width.
 _MOST_OUTSIDE, _FAR_BEYOND, _FEW_BOXES = 0.1, 0.01, 4
 _LOG = logging.getLogger(__name__)
+# A box that may be what is asked for and does not count: nobody has read what is there.
+_UNREAD = Unqueried("a box there does not count, by its class, score or size")
+NONE_COUNTS = "none of its boxes has counted yet, by class, score or size"
+# A vehicle that drives up is too small for some seconds: of a running camera a warning waits so long.
+_WARNED_AFTER_NS = nanoseconds(10.0)
 # Looks of a running camera that are remembered: whether a box stands still is asked over the last second, and
 # more than 60 images a second bring nothing to a decision every 0.1 s. So what comes sooner is left out.
 REMEMBERED = 64
@@ -58,6 +74,7 @@ class VisionQuery:
 
     - `Unqueried` where there are no detections, no frame at that time, or nothing of the sector is in view;
     - `Present` where a moving box of an expected class reaches into the sector;
+    - `Unqueried` where another moving box does, which the filter leaves out and may be of such a class;
     - `Absent` otherwise.
 
     Its miss rate is the expectation over the sector, with 1 where the camera does not see and the mean over
@@ -120,7 +137,7 @@ class VisionQuery:
     ) -> None:
         self.camera = camera
         self.miss_rate = miss_rate or default_miss_rates()
-        self.keep = keep or DetectionFilter()
+        self.keep = replace(keep or DetectionFilter(), image_height_px=camera.height_px)
         self._degradation = degradation if callable(degradation) else lambda stamp_ns: degradation
         self.view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
@@ -128,22 +145,39 @@ class VisionQuery:
         self._asked = detections is not None
         self.beyond = self.outside = 0
         log = within_images(camera, NO_LOOKS if detections is None else detections)
-        self._other_ns: int | None = None
+        # When the first image came with a box, with one that counts, and with one called else than a car.
+        self._first_ns: dict[str, int] = {}
+        self._noted: dict[str, Callable[[DetectionFrame], object]] = {
+            "box": len,
+            "counted": lambda frame: len(frame) and len(frame.select(self.keep)),
+            "other": lambda frame: {*map(class_name, frame.labels)} - {"car"},
+        }
+        self._note(log)
         self._take(replace(log, frames=tuple(_most_likely(frame, self.keep) for frame in log.frames)))
+        self._warned = False
+        self._warn(sys.maxsize - 1)
 
     def _take(self, log: DetectionLog) -> None:
         self.detections = log
-        self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
-        # When it first called something else than a car. Background subtraction never does: asked for a truck
-        # it would not find one.
-        if self._other_ns is None:
-            stamped = zip(log.stamps_ns, log.frames, strict=True)
-            others = (int(stamp_ns) for stamp_ns, frame in stamped if set(frame.labels) - {"car"})
-            self._other_ns = next(others, None)
+        self._last: tuple[int, tuple[Sighting, ...], tuple[Sighting, ...]] = (-1, (), ())
+
+    def _note(self, log: DetectionLog) -> None:
+        for name, holds in self._noted.items():
+            if name not in self._first_ns:
+                stamped = zip(log.stamps_ns.tolist(), log.frames, strict=True)
+                self._first_ns |= next(({name: ns} for ns, frame in stamped if holds(frame)), {})
+
+    def _warn(self, stamp_ns: int) -> None:
+        """Warn once of a camera of which no box counts, some time after the first of them."""
+        due = stamp_ns - self._first_ns.get("box", stamp_ns) >= _WARNED_AFTER_NS
+        if due and not self._warned and self._fault(stamp_ns):
+            self._warned, log = True, self.detections
+            names = sorted({name for frame in log.frames for name in frame.labels})
+            _LOG.warning("%s: %s; classes: %.200s", log.source, NONE_COUNTS, ", ".join(names))
 
     def go_on(self, before: "VisionQuery") -> None:
         """Take over what another query of the same camera remembers: its last images and its labels."""
-        self._asked, self._other_ns = before._asked, before._other_ns
+        self._asked, self._first_ns = before._asked, dict(before._first_ns)
         self._take(before.detections)
 
     def see(self, stamp_ns: int, frame: DetectionFrame) -> None:
@@ -179,9 +213,11 @@ class VisionQuery:
         if (np.abs(before.stamps_ns[max(at - 1, 0) : at + 1] - taken_ns) < LEAST_APART_NS).any():
             return
         self._asked = True
+        self._note(DetectionLog((found,), np.array([taken_ns])))
         frames = (*before.frames[:at], _most_likely(found, self.keep), *before.frames[at:])[-REMEMBERED:]
         stamps_ns = np.insert(before.stamps_ns, at, taken_ns)[-REMEMBERED:]
         self._take(DetectionLog(frames, stamps_ns, before.source))
+        self._warn(taken_ns)
 
     def taken_ns(self, stamp_ns: int) -> int:
         """Return when an image was taken, on the clock of the sound, from its stamp by the camera's clock."""
@@ -233,8 +269,12 @@ class VisionQuery:
             return Unqueried("sector outside the field of view")
         clutter = self._clutter(d)
         moving = (one for one in self.sightings(stamp_ns) if one.moving and one.label in labels)
-        found = any(sector.touches(one.azimuth_rad, one.width_rad) for one in moving)
-        return Present(beta, clutter) if found else Absent(beta, clutter)
+        if any(sector.touches(one.azimuth_rad, one.width_rad) for one in moving):
+            return Present(beta, clutter)
+        unread = self._unread(stamp_ns, labels)
+        if any(sector.touches(one.azimuth_rad, one.width_rad) for one in unread):
+            return _UNREAD
+        return Absent(beta, clutter)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         """Return the boxes that the filter keeps in the image at `stamp_ns`, parked ones included.
@@ -254,12 +294,7 @@ class VisionQuery:
         >>> VisionQuery(PinholeCamera.ovad(), detections=None).sightings(0)
         ()
         """
-        frame = self._frame(stamp_ns)
-        if frame is None:
-            return ()
-        if frame != self._last[0]:
-            self._last = (frame, self._look(frame))
-        return self._last[1]
+        return self._read(stamp_ns)[1]
 
     def last_look(self, stamp_ns: int) -> Look | None:
         """Return what the whole image at `stamp_ns` says: whether anything that moves is in view.
@@ -284,18 +319,43 @@ class VisionQuery:
             return None
         beta = self.miss_rate_over(self.view, stamp_ns, None)
         moving = any(sighting.moving for sighting in self.sightings(stamp_ns))
-        answer = (Present if moving else Absent)(beta, self._clutter(self._degradation(stamp_ns)))
-        return Look(SENSOR, int(self.detections.stamps_ns[frame]), answer)
+        answer: CoEvidence = (Present if moving else Absent)(beta, self._clutter(self._degradation(stamp_ns)))
+        taken_ns = int(self.detections.stamps_ns[frame])
+        # One answer is for the whole view: beside a box that is not read, nothing else is missed in it.
+        if self._unread(stamp_ns, self.keep.labels):
+            answer = _UNREAD
+        return Look(SENSOR, taken_ns, answer, fault=self._fault(taken_ns))
 
     def _frame(self, stamp_ns: int) -> int | None:
         return self.detections.latest(stamp_ns, nanoseconds(MAX_IMAGE_AGE_S))
 
-    def _look(self, number: int) -> tuple[Sighting, ...]:
+    def _fault(self, stamp_ns: int) -> str | None:
+        """Return what is wrong with a camera until the first of its boxes counts."""
+        first, counted = (self._first_ns.get(name, sys.maxsize) for name in ("box", "counted"))
+        return NONE_COUNTS if first <= stamp_ns < counted else None
+
+    def _unread(self, stamp_ns: int, labels: Collection[str]) -> list[Sighting]:
+        """Return the moving boxes that the filter leaves out and that may be of one of these classes."""
+        return [one for one in self._read(stamp_ns)[2] if may_be(one.label, labels)]
+
+    def _read(self, stamp_ns: int) -> tuple[int, tuple[Sighting, ...], tuple[Sighting, ...]]:
+        """Return the number of the image at a time, the boxes that count, and the moving ones left out."""
+        frame = self._frame(stamp_ns)
+        if frame is None:
+            return -1, (), ()
+        if frame != self._last[0]:
+            kept, still = kept_and_parked(self.detections, frame, self.keep)
+            others = left_out(self.detections, frame, self.keep)
+            moving = np.zeros(len(others), dtype=bool)
+            self._last = frame, self._sightings(frame, kept, still), self._sightings(frame, others, moving)
+        return self._last
+
+    def _sightings(self, number: int, places: IntArray, still: BoolArray) -> tuple[Sighting, ...]:
         frame = self.detections.frames[number]
-        kept, still = kept_and_parked(self.detections, number, self.keep)
+        rows = zip(frame.boxes_px[places], places, frame.scores[places].tolist(), still.tolist(), strict=True)
         return tuple(
-            self.camera.sighting(frame.boxes_px[i], frame.labels[i], float(frame.scores[i]), moving=not stood)
-            for i, stood in zip(kept, still.tolist(), strict=True)
+            self.camera.sighting(box_px, class_name(frame.labels[i]), score, moving=not stood)
+            for box_px, i, score, stood in rows
         )
 
     def miss_rate_over(self, sector: Sector, stamp_ns: int, labels: Collection[str] | None) -> float:
@@ -305,7 +365,8 @@ class VisionQuery:
         return 1.0 if beta is None else beta
 
     def _asked_for(self, expected: Collection[str] | None, stamp_ns: int) -> Collection[str]:
-        calls_all_cars = self._other_ns is None or stamp_ns < self._other_ns
+        # Background subtraction always does: asked for a truck it would not find one.
+        calls_all_cars = stamp_ns < self._first_ns.get("other", sys.maxsize)
         if expected is None or (expected and calls_all_cars):
             return self.keep.labels
         return expected

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.adapters.camera.detections import DetectionFilter
+from worldstate.adapters.camera.detections import OVAD_HEIGHT_PX, DetectionFilter
 from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
 from worldstate.adapters.files.array_file import checked_array, read_array
 from worldstate.adapters.files.file_io import read_json, read_record, refused_as_file, write_json
@@ -288,9 +288,12 @@ def _setup(record: CameraRecord, folder: Path) -> CameraSetup:
     if (rate_hz := record.image_rate_hz) is not None:
         in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True)
     detections, rates = (_beside(folder, file) for file in (record.detections, record.miss_rates))
-    in_range("camera.min_box_px", record.min_box_px, 0.0, math.inf)
     in_range("camera.min_score", record.min_score, 0.0, 1.0)
-    boxes = DetectionFilter(frozenset(record.classes), record.min_score, record.min_box_px)
+    boxes = DetectionFilter(frozenset(record.classes), record.min_score)
+    if record.min_box_px is not None:
+        # Of the camera's own images, where the filter counts in those of OVAD.
+        least_px = in_range("camera.min_box_px", record.min_box_px, 0.0, math.inf)
+        boxes = replace(boxes, min_height_px=least_px * OVAD_HEIGHT_PX / record.height_px)
     return CameraSetup(detections, rate_hz, rates, boxes, record.labels)
 
 

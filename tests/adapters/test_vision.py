@@ -101,10 +101,11 @@ def test_only_the_expected_class_counts() -> None:
 
 
 @pytest.mark.parametrize("how", [{"score": 0.74}, {"label": "truck"}])
-def test_what_the_filter_drops_is_not_there(how: dict[str, object]) -> None:
+def test_what_the_filter_drops_is_neither_there_nor_absent(how: dict[str, object]) -> None:
     asked = query(crossing(700.0, 20.0, **how))
     assert asked.sightings(nanoseconds(2.0)) == ()
-    assert isinstance(asked.ask(nanoseconds(2.0), bearing(0.0)), Absent)
+    assert isinstance(asked.ask(nanoseconds(2.0), bearing(0.0)), Unqueried)
+    assert isinstance(asked.ask(nanoseconds(2.0), bearing(-0.5)), Absent)
 
 
 def test_a_coarse_bearing_asks_the_whole_side() -> None:

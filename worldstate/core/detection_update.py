@@ -69,7 +69,7 @@ def new_looks(
             since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
             new.append((one, min(max(since_s, 0.0) / settings.look_interval_s, 1.0)))
             memory.looks[look.sensor] = CountedLook(
-                look.stamp_ns, measurement.source, look.answer, look.sector_rad
+                look.stamp_ns, measurement.source, look.answer, look.sector_rad, look.fault
             )
         elif not in_time or (last is not None and last.source != measurement.source):
             when = "was counted before" if in_time else "is of another time"

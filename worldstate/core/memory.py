@@ -10,7 +10,7 @@ from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Track, Tracks
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
-from worldstate.ground.serialisation import Count, Probability, Via
+from worldstate.ground.serialisation import ADDED, Count, Probability, Via
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing, Heard
 from worldstate.state import Context, Event, Relation
@@ -70,6 +70,7 @@ class CountedLook:
     source: str
     answer: CoEvidence = field(default=Unqueried("messages search nothing"))
     sector_rad: tuple[float, float] | None = None  # Where it searched; None for the view of the context
+    fault: str | None = field(default=None, metadata=ADDED)
 
 
 @dataclass

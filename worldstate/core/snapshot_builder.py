@@ -267,6 +267,8 @@ def _health(sensor: str, stamp_ns: int, fault: str | None, now_ns: int) -> Senso
 
 def _look_fault(look: CountedLook) -> str | None:
     answer = look.answer
+    if look.fault is not None:
+        return look.fault
     if isinstance(answer, Unqueried) or answer.miss_rate < MOSTLY_MISSED:
         return None
     return f"misses {answer.miss_rate:.0%} of what is in view"

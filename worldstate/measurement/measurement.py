@@ -187,6 +187,8 @@ class Look:
         Whether anything that moves is in view, with the miss and the clutter rate of the whole view.
     sector_rad : (float, float) or None
         Where it looked: from this azimuth to the left until that one. None for the view of the context.
+    fault : str or None
+        What is known to be wrong with the sensor, in words; the snapshot says it.
 
     Raises
     ------
@@ -204,11 +206,12 @@ class Look:
     stamp_ns: int
     answer: CoEvidence
     sector_rad: tuple[float, float] | None = field(default=None, metadata=ADDED)
+    fault: str | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         named("sensor", self.sensor)
         object.__setattr__(self, "stamp_ns", integer_ns("stamp_ns", self.stamp_ns))
-        check_fields(self, answer=CoEvidence)
+        check_fields(self, answer=CoEvidence, fault=str | None)
         if self.sector_rad is not None:
             object.__setattr__(self, "sector_rad", pair("sector_rad", self.sector_rad, math.tau))
 

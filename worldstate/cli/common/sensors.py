@@ -72,9 +72,9 @@ def add_lens_options(parser: argparse.ArgumentParser, group: "argparse._Argument
     base_link, metres, or "fx" and "cx" of a calibration in place of the field of view; optional "yaw_deg"
     (left), "pitch_deg" (up), "roll_deg" (left side up), "stamp_offset_s" (added to the stamps of its images:
     the clock of the sound); of its images "image_rate_hz" (10); of its boxes "classes" (["car",
-    "motorcycle"]), "min_score" (0.75) and "min_box_px" (100: boxes must be higher); "miss_rates", a file that
-    `worldstate model detector` wrote; "labels" (["car"]), the classes of an ONNX model. "cameras" of --car
-    have the same keys.
+    "motorcycle"; names of other data sets are known), "min_score" (0.75) and "min_box_px" (0.082 of the
+    height, as 100 of 1216: boxes must be higher); "miss_rates", as `worldstate model detector` wrote them;
+    "labels" (["car"]), the classes of an ONNX model. "cameras" of --car have the same keys.
     """
     describe(parser, add_lens_options)
     lens = "its lens and place (default: OVAD's, with OVAD's array), or the name of one of --car (the first)"
@@ -233,19 +233,24 @@ def camera_source(
 
 
 def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
-    """Say how many boxes count and why the others do not; None without a camera."""
-    from worldstate.adapters.camera.detections import COUNTS_TOLD, count_boxes
+    """Say how many boxes count and why the others do not, of several cameras each; None without a camera."""
+    from worldstate.adapters.camera.detections import count_boxes, told_counts
 
+    if source.co_evidence is not None:
+        cameras = source.co_evidence.cameras.items()
+        each = {name: count_boxes(one.detections, one.keep) for name, one in cameras}
+        return each if as_json else [f"{name}: {told_counts(counts)}" for name, counts in each.items()]
     if source.detections is None:
         return None
-    counts = count_boxes(source.detections, source.settings.boxes)
+    height_px = source.camera.height_px
+    counts = count_boxes(source.detections, replace(source.settings.boxes, image_height_px=height_px))
     if not counts["frames"]:
         told = "no image was looked at, so that the camera counts as not asked (--images N)"
         print(f"worldstate: {told}", file=sys.stderr)
     elif not counts["empty"] and not counts["parked"]:
         told = "no image is without a box: are those missing in which nothing was found (--images N)?"
         print(f"worldstate: {told}", file=sys.stderr)
-    return counts if as_json else COUNTS_TOLD.format(**counts)
+    return counts if as_json else told_counts(counts)
 
 
 def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetector":

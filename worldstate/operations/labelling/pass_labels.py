@@ -6,7 +6,7 @@ A track is one vehicle, by its leading and trailing edge.
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -94,6 +94,7 @@ def _moving_boxes(
     log: DetectionLog, camera: PinholeCamera, keep: DetectionFilter
 ) -> Iterator[tuple[float, list[AzimuthBox]]]:
     focal_px = 0.5 * camera.width_px / math.tan(camera.half_angle_rad)
+    keep = replace(keep, image_height_px=camera.height_px)
     for number, stamp_ns in enumerate(log.stamps_ns.tolist()):
         kept, still = kept_and_parked(log, number, keep)
         frame, time_s, boxes = log.frames[number], seconds(stamp_ns), []

@@ -1,0 +1,51 @@
+"""Class names of detectors and data sets, mapped onto the road users that the library asks for."""
+
+import json
+import re
+from collections.abc import Collection, Mapping
+from functools import lru_cache
+from importlib.resources import files
+
+_TABLE = json.loads((files("worldstate") / "data" / "class_names.json").read_text("utf-8"))
+# The eighty names of COCO: YOLO text counts them from 0, COCO's numbers from 1 with ten left out.
+YOLO_NAMES: tuple[str, ...] = tuple(_TABLE["coco"])
+COCO_CATEGORIES = dict(zip(sorted({*range(1, 91)} - {*_TABLE["numbers_left_out"]}), YOLO_NAMES, strict=True))
+ROAD_USERS = frozenset(_TABLE["classes"])
+_MOTOR_VEHICLES = ROAD_USERS - {"person", "bicycle"}
+# Numbers in the place of a name are Ultralytics'. Only those of motor vehicles are read: another data set may
+# mean a car by 0 or 1, and what is not known is no absence.
+_NUMBERED = {str(i): name for i, name in enumerate(YOLO_NAMES) if name in _MOTOR_VEHICLES}
+_KNOWN: Mapping[str, str] = (
+    {name: name for name in (*YOLO_NAMES, *_TABLE["no_vehicle"])}
+    | {other: name for name, others in _TABLE["classes"].items() for other in others}
+    | _NUMBERED
+)
+
+
+@lru_cache(maxsize=1024)
+def class_name(label: str) -> str:
+    """Return the class of a name in the library's words; one that no data set has in lower case.
+
+    Examples
+    --------
+    >>> [class_name(one) for one in ("Car", "REGULAR_VEHICLE", "vehicle.bus.rigid", "7", "Milk-Float")]
+    ['car', 'car', 'bus', 'truck', 'milk float']
+    """
+    name = " ".join(re.split(r"[\W_]+", label.casefold())).strip()
+    return _KNOWN.get(name, name)
+
+
+def may_be(name: str, asked: Collection[str]) -> bool:
+    """Tell whether a box of a class may be of one that is asked for.
+
+    A detector calls one van a car and another a truck: a motor vehicle may be any other. A class that no data
+    set has may be anything; a person or a traffic light is no car.
+
+    Examples
+    --------
+    >>> [may_be(one, {"car"}) for one in ("truck", "milk float", "person", "traffic light")]
+    [True, True, False, False]
+    """
+    if name in asked or name not in _KNOWN:
+        return True
+    return name in _MOTOR_VEHICLES and any(one in _MOTOR_VEHICLES or one not in _KNOWN for one in asked)

@@ -1,0 +1,259 @@
+"""A box that does not count is no absence: classes by data set, sizes by image, and what is left out."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.abduction import SignatureEvidence
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.adapters.acoustic import asked_again
+from worldstate.adapters.camera.class_names import class_name, may_be
+from worldstate.adapters.camera.detections import (
+    DetectionFilter,
+    DetectionFrame,
+    DetectionLog,
+    coco_log,
+    count_boxes,
+    read_yolo_text,
+    told_counts,
+)
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.vision_query import NONE_COUNTS, SeveralCameras, VisionQuery
+from worldstate.adapters.vehicle.car_file import read_camera_setup
+from worldstate.core.filter import WorldFilter
+from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.measurement.measurement import Bearing, Measurement
+
+# Of each data set: car, motorcycle, bus, truck, train, bicycle, person; then what is none of these.
+NAMES = {
+    "coco": ("car", "motorcycle", "bus", "truck", "train", "bicycle", "person", "traffic light"),
+    "kitti": ("Car Van", "", "", "Truck", "Tram", "Cyclist", "Pedestrian Person_sitting", ""),
+    "bdd100k": ("car", "motorcycle motor", "bus", "truck", "train", "bike", "pedestrian", "traffic sign"),
+    "nuscenes": (
+        "vehicle.car", "vehicle.motorcycle", "vehicle.bus.bendy vehicle.bus.rigid", "vehicle.truck", "",
+        "vehicle.bicycle", "human.pedestrian.adult pedestrian", "movable_object.trafficcone barrier",
+    ),
+    "open images": ("Car Taxi Ambulance", "Motorcycle", "Bus", "Truck", "Train", "Bicycle", "Girl", "Tree"),
+    "argoverse": (
+        "VEHICLE REGULAR_VEHICLE EMERGENCY_VEHICLE", "MOTORCYCLE MOPED MOTORCYCLIST", "BUS SCHOOL_BUS",
+        "LARGE_VEHICLE BOX_TRUCK TRUCK_CAB", "RAILED_VEHICLE", "BICYCLE BICYCLIST", "PEDESTRIAN", "SIGN",
+    ),
+    "ultralytics": ("2", "3", "5", "7", "6", "", "", ""),
+}  # fmt: skip
+CLASSES = ("car", "motorcycle", "bus", "truck", "train", "bicycle", "person", None)
+NAMED = [
+    (source, name, one)
+    for source, row in NAMES.items()
+    for names, one in zip(row, CLASSES, strict=True)
+    for name in names.replace("traffic ", "traffic-").split()
+]
+# What may be a motor vehicle and is no class of the library.
+UNKNOWN = (
+    "Misc",
+    "DontCare",
+    "rider",
+    "other vehicle",
+    "TRAILER",
+    "vehicle.construction",
+    "Land vehicle",
+    "0",
+    "91",
+)
+CAMERA = PinholeCamera.ovad()
+AT_NS = nanoseconds(2.0)
+AHEAD = Bearing(0.0, 0.05)
+
+
+def moving(label: str, score: float = 0.9, height_px: float = 200.0, first_px: float = 700.0) -> DetectionLog:
+    """A box that crosses the middle of the image after two seconds."""
+    frames = []
+    for k in range(40):
+        left = first_px + 10.0 * k
+        boxes = np.array([[left, 500.0, left + 200.0, 500.0 + height_px]])
+        frames.append(DetectionFrame(boxes, np.array([score]), (label,)))
+    return DetectionLog.at_rate(frames, 10.0)
+
+
+def answers(
+    log: DetectionLog, keep: DetectionFilter | None = None, camera: PinholeCamera = CAMERA
+) -> list[object]:
+    asked = VisionQuery(camera, log, keep=keep)
+    look = asked.last_look(AT_NS)
+    assert look is not None
+    return [asked.ask(AT_NS, AHEAD), asked.sightings(AT_NS), look]
+
+
+@pytest.mark.parametrize(("source", "name", "expected"), NAMED)
+def test_names_of_every_data_set(source: str, name: str, expected: str | None) -> None:
+    for spelt in (name, name.upper(), name.lower(), name.replace("_", " "), name.replace("_", "-")):
+        if expected is not None:
+            assert class_name(spelt) == expected
+        assert may_be(class_name(spelt), {"car"}) == (expected not in {"bicycle", "person", None})
+    kind = type(answers(moving(name))[0])
+    if expected in {"car", "motorcycle"}:
+        assert kind is Present
+    else:
+        assert kind is (Absent if expected in {"bicycle", "person", None} else Unqueried)
+
+
+@pytest.mark.parametrize("name", [*UNKNOWN, "Milk Float"])
+def test_a_class_that_is_not_known_is_no_absence(name: str) -> None:
+    said, boxes, look = answers(moving(name))
+    assert isinstance(said, Unqueried) and boxes == ()
+    assert isinstance(look.answer, Unqueried) and look.fault == NONE_COUNTS  # type: ignore[attr-defined]
+    assert isinstance(answers(moving(name), DetectionFilter({name.upper()}))[0], Present)
+
+
+def test_numbers_are_those_of_the_form(tmp_path) -> None:
+    rows = [{"image_id": 0, "category_id": k, "bbox": [0, 0, 9, 9], "score": 0.9} for k in (3, 8, 10, 90, 95)]
+    labels = coco_log(tmp_path, rows).frames[0].labels
+    assert labels == ("car", "truck", "traffic light", "toothbrush", "95")
+    line = "{} 0.5 0.5 0.1 0.2 0.9"
+    (tmp_path / "000000.txt").write_text("\n".join(line.format(k) for k in (2, 7, 9, 79, 80)))
+    labels = read_yolo_text(tmp_path, (640, 480)).frames[0].labels
+    assert labels == ("car", "truck", "traffic light", "toothbrush", "80")
+    (tmp_path / "classes.txt").write_text("Van\r\nPedestrian\r\nMisc\r\n")
+    (tmp_path / "000000.txt").write_text("\n".join(line.format(k) for k in (0, 1, 2)))
+    labels = read_yolo_text(tmp_path, (640, 480)).frames[0].labels
+    assert [class_name(one) for one in labels] == ["car", "person", "misc"]
+
+
+@given(st.sampled_from([(a, b) for _, a, one in NAMED for _, b, other in NAMED if one and one == other]))
+@settings(deadline=None)
+def test_synonyms_change_nothing(names: tuple[str, str]) -> None:
+    one, other = (answers(moving(name), DetectionFilter({"car", "bus"})) for name in names)
+    assert one == other
+
+
+def scaled(log: DetectionLog, by: float) -> DetectionLog:
+    return replace(log, frames=tuple(replace(one, boxes_px=one.boxes_px * by) for one in log.frames))
+
+
+@given(
+    by=st.sampled_from([0.25, 0.5, 2.0]),  # Exact: no box changes its side of the least height
+    height_px=st.floats(50.0, 150.0),
+    step_px=st.floats(0.0, 2.0),
+    keep=st.sampled_from([DetectionFilter(), DetectionFilter(min_height_px=60.0)]),
+)
+@settings(deadline=None)
+def test_image_and_boxes_scaled_together_change_nothing(
+    by: float, height_px: float, step_px: float, keep: DetectionFilter
+) -> None:
+    frames = [
+        DetectionFrame(
+            np.array([[900.0 + step_px * k, 500.0, 1000.0, 500.0 + height_px]]), np.array([0.9]), ("car",)
+        )
+        for k in range(40)
+    ]
+    log = DetectionLog.at_rate(frames, 10.0)
+    width_px, height = round(by * CAMERA.width_px), round(by * CAMERA.height_px)
+    small = replace(CAMERA, width_px=width_px, height_px=height)
+    (said, seen, look), (other, also, again) = answers(log, keep), answers(scaled(log, by), keep, small)
+    assert said == other and look == again
+    assert [one.moving for one in seen] == [one.moving for one in also]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("height_px", "least_px"), [(1216, 100.0), (402, 33.06), (608, 50.0), (2432, 200.0)])
+def test_the_least_height_scales_with_the_image(height_px: int, least_px: float) -> None:
+    keep = replace(DetectionFilter(), image_height_px=height_px)
+    boxes = np.array([[0.0, 0.0, 9.0, least_px - 0.1], [0.0, 0.0, 9.0, least_px + 0.1]])
+    frame = DetectionFrame(boxes, np.full(2, 0.9), ("car", "Car"))
+    assert frame.select(keep).tolist() == [1]
+    # The laboratory's sixty pixels are those of OVAD's images.
+    assert replace(DetectionFilter(min_height_px=60.0), image_height_px=1216).scale == 1.0
+
+
+def test_a_stated_least_height_is_of_the_cameras_own_images(tmp_path) -> None:
+    lens = '{"width_px": 640, "height_px": 402, "fx": 500, "position_m": [0, 0, 0]%s}'
+    for more, least_px in (("", 100 * 402 / 1216), (', "min_box_px": 50', 50.0)):
+        (tmp_path / "camera.json").write_text(lens % more)
+        camera, setup = read_camera_setup(tmp_path / "camera.json")
+        keep = VisionQuery(camera, None, keep=setup.boxes).keep
+        assert keep.min_height_px * keep.scale == pytest.approx(least_px)
+
+
+HEARD = SignatureEvidence(("left", "right"), hidden=(2.0, -1.0), visible=1.0, none=-2.0)
+
+
+def in_view(log: DetectionLog | None, hops: Sequence[int]) -> list[tuple[float, ...]]:
+    """Return P(in view) and the existence of what is seen, after each hop of a sound from ahead."""
+    vision, world, told = None if log is None else VisionQuery(CAMERA, log), WorldFilter(), []
+    for hop in hops:
+        heard = Measurement(
+            nanoseconds(hop / 10), HEARD, Unqueried("no camera"), AHEAD, NotUsable("not measured")
+        )
+        world = world.update(asked_again(heard, vision))
+        seen = [one.existence_probability for one in world.state.entities if one.status == "visible"]
+        told.append((world.state.cues[0].hypotheses.visible, *seen))
+    return told
+
+
+@given(
+    score=st.floats(0.01, 1.0),
+    height_px=st.floats(1.0, 300.0),
+    label=st.sampled_from(["car", "truck", "Milk Float", "DontCare"]),
+)
+@settings(deadline=None, max_examples=25)
+def test_a_box_left_out_never_lowers_the_chance_of_what_is_in_view(
+    score: float, height_px: float, label: str
+) -> None:
+    hops = range(12, 24)
+    seen, alone = (in_view(log, hops) for log in (moving(label, score, height_px), None))
+    assert all(a[0] >= b[0] - 1e-9 for a, b in zip(seen, alone, strict=True))
+
+
+@given(score=st.floats(0.01, 0.74), label=st.sampled_from(["car", "truck", "Milk Float"]))
+@settings(deadline=None, max_examples=25)
+def test_a_vehicle_whose_box_no_longer_counts_is_not_missed(score: float, label: str) -> None:
+    counted, left = moving("car"), moving(label, score)
+    beside = DetectionFrame(np.array([[100.0, 500.0, 200.0, 700.0]]), np.array([0.9]), ("car",))
+    frames = (*counted.frames[:17], *(joined(one, beside) for one in left.frames[17:]))
+    unseen = DetectionLog(frames[:17], counted.stamps_ns[:17])
+    seen, alone = (in_view(log, range(12, 22)) for log in (replace(counted, frames=frames), unseen))
+    assert seen[-1][1] == pytest.approx(alone[-1][1])  # Carried as without an image
+
+
+def joined(one: DetectionFrame, other: DetectionFrame) -> DetectionFrame:
+    boxes, scores = np.vstack([one.boxes_px, other.boxes_px]), np.concatenate([one.scores, other.scores])
+    return DetectionFrame(boxes, scores, one.labels + other.labels)
+
+
+@pytest.mark.parametrize("label", ["car", "truck"])
+def test_a_parked_box_that_does_not_count_was_read(label: str) -> None:
+    boxes = np.array([[900.0, 500.0, 1000.0, 550.0]])
+    log = DetectionLog.at_rate([DetectionFrame(boxes, np.array([0.9]), (label,))] * 40, 10.0)
+    assert isinstance(answers(log)[0], Absent)
+
+
+def test_a_source_of_which_no_box_counts_is_impaired_until_one_does(caplog) -> None:
+    log = moving("truck")
+    good = moving("car").frames
+    later = replace(log, frames=(*log.frames[:25], *good[25:]))
+    with caplog.at_level(logging.WARNING):
+        VisionQuery(CAMERA, later)
+        assert not caplog.records
+        vision = VisionQuery(CAMERA, log)
+    assert NONE_COUNTS in caplog.text and "truck" in caplog.text
+    asked = VisionQuery(CAMERA, later)
+    faults = [asked.last_look(nanoseconds(t)).fault for t in (2.4, 2.5)]  # type: ignore[union-attr]
+    assert faults == [NONE_COUNTS, None]
+    live = VisionQuery(CAMERA, None)
+    live.see(AT_NS, log.frames[20])
+    assert live.last_look(AT_NS) == vision.last_look(AT_NS)
+    caplog.clear()
+    for k in range(120):
+        live.see(nanoseconds(2.1 + 0.1 * k), log.frames[k % 40])
+    assert caplog.text.count(NONE_COUNTS) == 1
+    (look,) = SeveralCameras({"front": vision}).looks(AT_NS)
+    assert look.look.fault == NONE_COUNTS
+    heard = Measurement(AT_NS, HEARD, Unqueried("no camera"), AHEAD, NotUsable("not measured"))
+    state = WorldFilter().update(asked_again(heard, vision)).state
+    camera = next(one for one in state.sensors if one.sensor == "camera")
+    assert (camera.condition, camera.reason) == ("impaired", NONE_COUNTS)
+    assert "none counts" in told_counts(count_boxes(log, vision.keep))
+    assert "none counts" not in told_counts(count_boxes(later, vision.keep))
