@@ -187,7 +187,7 @@ def _timeline(arguments: argparse.Namespace, recordings: Sequence[CornerRecordin
     named = {one.name: one for one in recordings if not one.hazard_free}
     if arguments.timeline not in named:
         raise InvalidArgumentError(f"--timeline: expected an approach, got {arguments.timeline}")
-    recording, chain = named[arguments.timeline], ovad_chain(read_model(None))
+    recording, chain = named[arguments.timeline], ovad_chain(read_model(None), path="seven_on_time")
     trial = heard(chain, recording)
     images = approach_images(recording.video, trial)
     title = f"Approach {recording.name} at {recording.junction}, from the {recording.side}"
