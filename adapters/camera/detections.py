@@ -282,6 +282,19 @@ class DetectionLog:
             return None
         return index
 
+    def left_out(self, frame: int, keep: DetectionFilter) -> IntArray:
+        """Return the indices of the moving boxes of an image that do not count; a score of 0 is no box.
+
+        Examples
+        --------
+        >>> low = DetectionFrame(np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.5]), ("car",))
+        >>> DetectionLog.at_rate([low], 10.0).left_out(0, DetectionFilter())
+        array([0])
+        """
+        here = self.frames[frame]
+        others = np.setdiff1d(np.flatnonzero(here.scores > 0.0), here.select(keep))
+        return others[~parked(self, frame, here.boxes_px[others], keep.scale)]
+
 
 def _rate_hz(stated: float | None) -> float:
     rate_hz = IMAGE_RATE_HZ if stated is None else stated
@@ -310,13 +323,6 @@ def kept_and_parked(log: DetectionLog, frame: int, keep: DetectionFilter) -> tup
     here = log.frames[frame]
     kept = here.select(keep)
     return kept, parked(log, frame, here.boxes_px[kept], keep.scale)
-
-
-def left_out(log: DetectionLog, frame: int, keep: DetectionFilter) -> IntArray:
-    """Return the indices of the moving boxes of an image that do not count; a score of 0 is no box."""
-    here = log.frames[frame]
-    others = np.setdiff1d(np.flatnonzero(here.scores > 0.0), here.select(keep))
-    return others[~parked(log, frame, here.boxes_px[others], keep.scale)] if others.size else others
 
 
 COUNTS_TOLD = (

@@ -20,20 +20,12 @@ from worldstate.abduction.co_evidence import (
 )
 from worldstate.core.filter import MOST_BOXES
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
-from worldstate.ground.typing import BoolArray, IntArray
+from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 
 from .class_names import class_name, may_be
-from .detections import (
-    BORDER_PX,
-    PARKED_S,
-    DetectionFilter,
-    DetectionFrame,
-    DetectionLog,
-    kept_and_parked,
-    left_out,
-)
+from .detections import BORDER_PX, PARKED_S, DetectionFilter, DetectionFrame, DetectionLog, kept_and_parked
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
@@ -44,7 +36,7 @@ SAMPLES = 8
 # this lies outside, or half of them reach beyond, some by more than this share of the width.
 _MOST_OUTSIDE, _FAR_BEYOND, _FEW_BOXES = 0.1, 0.01, 4
 _LOG = logging.getLogger(__name__)
-# A box that may be what is asked for and does not count: nobody has read what is there.
+# A box that may be what is asked for and does not count: what is there was not read.
 _UNREAD = Unqueried("a box there does not count, by its class, score or size")
 NONE_COUNTS = "none of its boxes has counted yet, by class, score or size"
 # A vehicle that drives up is too small for some seconds: of a running camera a warning waits so long.
@@ -207,6 +199,7 @@ class VisionQuery:
         found, beyond = frame.cut(_size_px(self.camera))
         if beyond and not len(found):
             raise InputFileError(before.source, _other_size(self.camera, frame))
+        _check_pixels(before.source, found.boxes_px)
         self.beyond, self.outside = self.beyond + beyond, self.outside + len(frame) - len(found)
         # A look that comes late is put in its place: one that is stamped ahead keeps no other out.
         at = int(np.searchsorted(before.stamps_ns, taken_ns))
@@ -272,7 +265,8 @@ class VisionQuery:
         if any(sector.touches(one.azimuth_rad, one.width_rad) for one in moving):
             return Present(beta, clutter)
         unread = self._unread(stamp_ns, labels)
-        if any(sector.touches(one.azimuth_rad, one.width_rad) for one in unread):
+        # Boxes none of which has counted yet may be of images of another size: where they are is not known.
+        if any(self._fault(stamp_ns) or sector.touches(one.azimuth_rad, one.width_rad) for one in unread):
             return _UNREAD
         return Absent(beta, clutter)
 
@@ -345,7 +339,7 @@ class VisionQuery:
             return -1, (), ()
         if frame != self._last[0]:
             kept, still = kept_and_parked(self.detections, frame, self.keep)
-            others = left_out(self.detections, frame, self.keep)
+            others = self.detections.left_out(frame, self.keep)
             moving = np.zeros(len(others), dtype=bool)
             self._last = frame, self._sightings(frame, kept, still), self._sightings(frame, others, moving)
         return self._last
@@ -415,6 +409,7 @@ def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
     """
     boxes_px = np.concatenate([np.empty((0, 4)), *(frame.boxes_px for frame in log.frames)])
     by_px = np.abs(boxes_px - np.clip(boxes_px, 0.0, np.tile(_size_px(camera), 2))).max(axis=1, initial=0.0)
+    _check_pixels(log.source, boxes_px)
     if not (beyond := int((by_px > BORDER_PX).sum())):
         return log
     parts = [frame.cut(_size_px(camera)) for frame in log.frames]
@@ -427,6 +422,13 @@ def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
     _LOG.warning(told, log.source, beyond, outside)
     kept = [i for i, (frame, count) in enumerate(parts) if len(frame) or not count]
     return replace(log, frames=tuple(parts[i][0] for i in kept), stamps_ns=log.stamps_ns[kept])
+
+
+def _check_pixels(source: str, boxes_px: FloatArray) -> None:
+    """Refuse boxes all of which lie within the first pixel: they are in parts of the image."""
+    if 0.0 < boxes_px.max(initial=0.0) <= 1.0:
+        problem = "expected boxes in pixels, got parts of the image (0 to 1)"
+        raise InputFileError(source, f"{problem}: multiply them by its width and height")
 
 
 def _size_px(camera: PinholeCamera) -> tuple[int, int]:

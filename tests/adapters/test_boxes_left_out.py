@@ -26,6 +26,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import NONE_COUNTS, SeveralCameras, VisionQuery
 from worldstate.adapters.vehicle.car_file import read_camera_setup
 from worldstate.core.filter import WorldFilter
+from worldstate.ground.errors import InputFileError
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing, Measurement
 
@@ -221,6 +222,16 @@ def test_a_vehicle_whose_box_no_longer_counts_is_not_missed(score: float, label:
 def joined(one: DetectionFrame, other: DetectionFrame) -> DetectionFrame:
     boxes, scores = np.vstack([one.boxes_px, other.boxes_px]), np.concatenate([one.scores, other.scores])
     return DetectionFrame(boxes, scores, one.labels + other.labels)
+
+
+def test_boxes_that_cannot_be_placed_are_no_absence_anywhere() -> None:
+    parts = scaled(moving("car"), 1.0 / CAMERA.width_px)
+    with pytest.raises(InputFileError, match="expected boxes in pixels"):
+        VisionQuery(CAMERA, parts)
+    with pytest.raises(InputFileError, match="expected boxes in pixels"):
+        VisionQuery(CAMERA, None).see(AT_NS, parts.frames[20])
+    # Of images a quarter as large as the camera's: there the box stands elsewhere.
+    assert isinstance(answers(scaled(moving("car"), 0.25))[0], Unqueried)
 
 
 @pytest.mark.parametrize("label", ["car", "truck"])

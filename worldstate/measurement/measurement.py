@@ -143,7 +143,7 @@ class Sighting:
     std_rad : float
         Standard deviation of the azimuth.
     label : str
-        Class name as the detector says it.
+        Class name, in the library's words if it is of a known data set.
     score : float
         Detector confidence in [0, 1].
     width_rad : float
