@@ -31,12 +31,12 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.given_spectra import GivenSpectra, SpectrumFrontEnd
-from worldstate.frontend.health.channel_health import ArrayHealth
+from worldstate.frontend.health.common_sound import NOTHING_IN_COMMON
 from worldstate.frontend.hop_spectra import falling
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground import NotUsable, OutOfDomainError, wrap_angle
+from worldstate.ground import LEAST_HEARD, NotUsable, OutOfDomainError, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
 from worldstate.measurement.measurement import MeasurementAdapter
@@ -247,7 +247,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             approach=refused,
             sequence=refused if isinstance(self._sequence, SequenceReader) else self._sequence,
             source=self.source,
-            fault=_array_fault(frame.health),
+            fault=_array_fault(frame),
             heard=heard,
         )
 
@@ -377,8 +377,11 @@ def _approach(frame: AcousticFrame) -> Approach | NotUsable:
     return looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
 
 
-def _array_fault(health: ArrayHealth | NotUsable) -> str | None:
-    """Return how many microphones have which fault, None where none has one."""
+def _array_fault(frame: AcousticFrame) -> str | None:
+    """Return how many microphones have which fault, or that they share no sound; None if all is well."""
+    health = frame.health
+    if frame.heard is not None and frame.heard < LEAST_HEARD and frame.unheard == NOTHING_IN_COMMON:
+        return NOTHING_IN_COMMON
     if isinstance(health, NotUsable) or not health.faults:
         return None
     counts = Counter(one.fault.value for one in health.faults)

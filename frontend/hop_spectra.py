@@ -18,6 +18,7 @@ from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steer
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
+from worldstate.frontend.health.common_sound import NOTHING_IN_COMMON, CommonSound
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
 from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array
@@ -87,6 +88,7 @@ class HopSums:
     pairs: Complex128Array  # shape (30,): Pair sums of the published feature
     energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
     health: ArrayHealth  # Faults of the array, and the microphones used
+    common: float | None = None  # Coherence over that of a diffuse field, None where it decides nothing
 
     @property
     def n_frames(self) -> int:
@@ -129,6 +131,7 @@ class HopSpectra:
         self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not monitored")
         heard_hz = bin_frequencies_hz(self.feature_bins, sample_rate_hz, nfft)
         self.monitor = ChannelMonitor(array, heard_hz) if settings.watch_channels else None
+        self._common = CommonSound(array, heard_hz) if settings.watch_channels else None
         self.ego_noise: EgoNoise | None = None
         if settings.ego_noise:
             split = ElevationSplit.of(array, frequencies)
@@ -149,6 +152,7 @@ class HopSpectra:
         health = self._unmonitored
         if self.monitor is not None:
             health = self.monitor.push(recorded, energies, powers, matrices)
+        common = self._common.push(matrices, len(spectra), health.mask.keep) if self._common else None
         health.mask.silence(whitened)
         srp = self._steered(spectra, whitened, health.mask)
         pairs = pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
@@ -156,7 +160,7 @@ class HopSpectra:
         mean_square = energies.sum(axis=0) / max(len(energies), 1)
         share = float(lost.mean())
         reason = "lost samples" if share else None
-        return HopSums(heard, share, 1.0 - share, reason, centre, srp, pairs, mean_square, health)
+        return HopSums(heard, share, 1.0 - share, reason, centre, srp, pairs, mean_square, health, common)
 
     def _heard_frames(self, lost: BoolArray, n_new: int) -> BoolArray:
         """Return which new frames hold no lost sample; lost has shape (n,)."""
@@ -301,6 +305,9 @@ _NOISE_DB = (6.0, 12.0)
 _JUMP_DB, _JUMP_HOPS = (6.0, 10.0), 3
 # Fall below the loudest hop of a noise by which it ends; what lasts ten seconds is the place's own.
 _END_DB, _LONGEST_HOPS = 5.0, 100
+# Coherence over that of a diffuse field: of a clean simulated street, 4 to 56 microphones, 0.3 and more, of
+# 4,202 hops of real ones 0.28 and more, of a quiet street under independent noise 10 dB louder below 0.1.
+_IN_COMMON = (0.15, 0.25)
 # Excess of the lowest quarter of the bands over the highest that only wind has.
 _WIND_DB = 10.0
 
@@ -338,10 +345,24 @@ class NoiseMeter:
         self._recent.clear()
         self._jump = None
 
-    def push(self, levels: FloatArray, coherence: float) -> tuple[float, str | None]:
-        """Take log-energies (bands,) and the coherence of a hop; return its share and what takes the rest."""
+    def push(
+        self, levels: FloatArray, coherence: float, common: float | None = None
+    ) -> tuple[float, str | None]:
+        """Take log-energies (bands,) and the coherence of a hop; return its share and what takes the rest.
+
+        `common` is the coherence over that of a diffuse field; what is not common is not the place's own.
+        """
         level_db = levels * _DB
-        self._memory.append(np.append(level_db, coherence))
+        heard = 1.0 if common is None else 1.0 - falling(common, _IN_COMMON)
+        if heard < LEAST_HEARD and not self._memory:
+            return heard, NOTHING_IN_COMMON
+        share, reason = self._masked(level_db, coherence, learn=heard >= LEAST_HEARD)
+        return (share, reason) if share <= heard else (heard, NOTHING_IN_COMMON)
+
+    def _masked(self, level_db: FloatArray, coherence: float, learn: bool) -> tuple[float, str | None]:
+        """Return the share that noise above this place's usual leaves; learn what is usual if it is heard."""
+        if learn:
+            self._memory.append(np.append(level_db, coherence))
         if self._n_hops < _EVERY_HOPS or self._n_hops % _EVERY_HOPS == 0:
             heard, rank = np.array(self._memory), int(_QUIET_SHARE * (len(self._memory) - 1))
             self._quiet = np.partition(heard[:, :BANDS], rank, axis=0)[rank]

@@ -90,7 +90,8 @@ class AcousticFrame:
         of the window is left. Hops of which less than .2 could be heard are left out of everything here.
         None where it is not measured: of given spectra.
     unheard : str or None
-        Why the rest could not: "lost samples", "wind" or "noise far above this place's usual".
+        Why the rest could not: "lost samples", "wind", "noise far above this place's usual" or "no sound
+        common to the microphones".
     excess_db : float
         Level of the newest hop above the quiet street, a mean over bands, decibels.
 
@@ -373,7 +374,8 @@ class FrontEnd:
         if not newest.n_frames:
             noise.skip()
             return self._levels
-        share, reason = noise.push(levels, float(self._segment([newest], [newest]).mean()))
+        coherence = float(self._segment([newest], [newest]).mean())
+        share, reason = noise.push(levels, coherence, newest.common)
         self._hops[-1] = newest = newest.masked(share, reason)
         if newest.n_frames:
             self._levels = levels

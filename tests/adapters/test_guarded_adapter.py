@@ -1,6 +1,7 @@
 """A guard in the acoustic adapter: foreign sounds say less, warning signals as much, snapshots say why."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from worldstate.abduction.road_users import DomainGuard, Familiar, Foreign, Warn
 from worldstate.adapters.acoustic import FOREIGN, AcousticAdapter
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.measurement.measurement import Heard
@@ -18,6 +21,9 @@ from worldstate.state.world_state import WorldState
 
 RATE_HZ = 6000
 ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])
+# Noise of the microphones stands for sound: with watched channels it is not heard.
+UNWATCHED = FrontEndSettings(nfft=feature_nfft(RATE_HZ), watch_channels=False)
+unwatched = partial(AcousticAdapter, ARRAY, RATE_HZ, front_end_settings=UNWATCHED)
 STEADY, SHARED = MEASURES.index("line holds"), MEASURES.index("together 2.2")
 
 
@@ -60,9 +66,9 @@ def sounds() -> dict[type, np.ndarray]:
 
 @pytest.mark.parametrize("kind", [Familiar, Foreign, WarningSignal])
 def test_only_foreign_sounds_lose_their_evidence_and_the_snapshot_says_so(kind: type) -> None:
-    measured = AcousticAdapter(ARRAY, RATE_HZ, Alarmed(), guard=guard()).measure(sounds()[kind])
+    measured = unwatched(Alarmed(), guard=guard()).measure(sounds()[kind])
     assert [one.domain for one in measured[:11]] == [None] * 11
-    last, plain = measured[-1], AcousticAdapter(ARRAY, RATE_HZ, Alarmed()).measure(sounds()[kind])[-1]
+    last, plain = measured[-1], unwatched(Alarmed()).measure(sounds()[kind])[-1]
     assert isinstance(last.domain, kind)
     said = [value - plain.signature.none for value in plain.signature.hidden]
     heard = [value - last.signature.none for value in last.signature.hidden]
@@ -82,10 +88,10 @@ def test_only_foreign_sounds_lose_their_evidence_and_the_snapshot_says_so(kind: 
 
 
 def test_a_foreign_sound_is_not_taken_for_silence() -> None:
-    adapter = AcousticAdapter(ARRAY, RATE_HZ, Silent(), guard=guard())
+    adapter = unwatched(Silent(), guard=guard())
     foreign = [one for one in adapter.measure(sounds()[Foreign]) if isinstance(one.domain, Foreign)]
     warned = WorldFilter()
-    for one in AcousticAdapter(ARRAY, RATE_HZ, Alarmed()).measure(sounds()[Familiar]):
+    for one in unwatched(Alarmed()).measure(sounds()[Familiar]):
         warned = warned.update(one)
     later = [replace(one, stamp_ns=warned.stamp_ns + 10**8 * (i + 1)) for i, one in enumerate(foreign[:5])]
     carried, silent, waited = warned, warned, warned.predict_to(later[-1].stamp_ns)
@@ -104,4 +110,4 @@ def test_a_guard_of_other_measures_is_refused() -> None:
         *(one.foreign, one.signals, one.weights, one.biases, one.threshold),
     )
     with pytest.raises(OutOfDomainError, match="guard"):
-        AcousticAdapter(ARRAY, RATE_HZ, Alarmed(), guard=renamed)
+        unwatched(Alarmed(), guard=renamed)

@@ -22,7 +22,7 @@ from worldstate.ground.typing import Float32Array
 RATE_HZ = 16_000
 ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
 RNG = np.random.default_rng(5)
-SOUND = (0.1 * RNG.standard_normal((3 * RATE_HZ, 3))).astype(np.float32)
+SOUND = (0.1 * RNG.standard_normal((3 * RATE_HZ, 3)).cumsum(axis=1)).astype(np.float32)
 CAR = DetectionFrame(np.array([[300.0, 200.0, 380.0, 260.0]]), np.array([0.9]), ("car",))
 TRUCK = DetectionFrame(np.array([[300.0, 200.0, 380.0, 260.0]]), np.array([0.9]), ("truck",))
 

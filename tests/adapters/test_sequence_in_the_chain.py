@@ -41,7 +41,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three seconds of noise that swells, and a made-up model of it with a sequence."""
     place, rng = tmp_path_factory.mktemp("sequence"), np.random.default_rng(0)
     swelling = 0.01 * np.exp(np.sin(np.arange(3 * RATE_HZ) / RATE_HZ))[:, None]
-    soundfile.write(place / "sound.wav", swelling * rng.standard_normal((3 * RATE_HZ, 3)), RATE_HZ)
+    sound = rng.standard_normal((3 * RATE_HZ, 3)).cumsum(axis=1)
+    soundfile.write(place / "sound.wav", swelling * sound, RATE_HZ)
     expert = Expert("mean", np.zeros(60), np.ones(60), 0.2 * rng.normal(size=(6, 60)), np.zeros(6))
     windows = EnsembleModel(
         *((expert,), np.full(6, 1 / 6), SiteReference(*np.zeros((3, 60))), np.zeros(60)),

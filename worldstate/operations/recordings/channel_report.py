@@ -12,6 +12,7 @@ import numpy as np
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Dropout, Fault
+from worldstate.frontend.health.common_sound import NOTHING_IN_COMMON
 from worldstate.frontend.health.position_check import NOTHING_AGAINST, PositionVerdict
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
@@ -133,12 +134,19 @@ class RecordingHealth:
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
     sample_rate: RateEstimate | None = None  # By another clock
     positions: PositionVerdict = NOTHING_AGAINST
+    unheard: float = 0.0  # Share of the hops in which no microphone hears what another hears
 
     @property
     def is_healthy(self) -> bool:
         """Whether nothing was wrong."""
         rate_is_wrong = self.sample_rate is not None and self.sample_rate.is_wrong
-        return self.positions.fits and not (self.verdicts or self.n_dropouts or rate_is_wrong)
+        well = self.positions.fits and not self.is_deaf
+        return well and not (self.verdicts or self.n_dropouts or rate_is_wrong)
+
+    @property
+    def is_deaf(self) -> bool:
+        """Whether in most hops no microphone hears what another hears."""
+        return self.unheard > 0.5
 
     def hears_waves(self, n_channels: int) -> BoolArray:
         """Channels whose sound is that of the others, wherever they stand, (M,)."""
@@ -169,7 +177,7 @@ class HealthLog:
     """
 
     def __init__(self) -> None:
-        self._n_hops = 0
+        self._n_hops, self._n_unheard = 0, 0
         self._seen: dict[tuple[int, Fault], ChannelVerdict] = {}
         self._dropouts: list[Dropout] = []
         self._latest: ArrayHealth | None = None
@@ -177,6 +185,7 @@ class HealthLog:
     def add(self, frame: AcousticFrame) -> None:
         """Take one hop; frames without a health report count as healthy."""
         self._n_hops += 1
+        self._n_unheard += frame.unheard == NOTHING_IN_COMMON
         health = frame.health
         if isinstance(health, NotUsable):
             return
@@ -196,7 +205,8 @@ class HealthLog:
         latest = self._latest
         dropouts, count = tuple(self._dropouts[:_LISTED_DROPOUTS]), latest.n_dropouts if latest else 0
         coherence = latest.coherence if latest else NotUsable("nothing heard")
-        return RecordingHealth(self._verdicts(), dropouts, count, self._n_hops, coherence)
+        unheard = self._n_unheard / max(self._n_hops, 1)
+        return RecordingHealth(self._verdicts(), dropouts, count, self._n_hops, coherence, unheard=unheard)
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
@@ -393,6 +403,7 @@ def _conclusion(health: RecordingHealth) -> str:
     for verdict in health.verdicts:
         kinds.setdefault(verdict.fault.value, set()).add(verdict.channel + 1)
     parts = [f"{kind} {', '.join(map(str, sorted(found)))}" for kind, found in kinds.items()]
+    parts += [f"{NOTHING_IN_COMMON} (wind, sample format, leads)"] if health.is_deaf else []
     parts += [] if health.positions.fits else ["sound and positions do not belong together"]
     masked = len(health.masked_channels)
     left_out = f"; {masked} left out by the front-end" if masked else ""
