@@ -103,7 +103,7 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(log, tmp_path, monkeypatch,
 )
 def test_the_sound_is_drawn_on_the_clock_of_its_states(tmp_path, monkeypatch, first_s, last_s, sound_s):
     """A single click lies where it was heard, two seconds after the first sample."""
-    sound = np.random.default_rng(0).normal(0.0, 1e-4, (32_000, 2))
+    sound = np.random.default_rng(0).normal(0.0, 1e-4, (32_000, 1)) * np.ones(2)
     sound[16_000:16_400] += np.random.default_rng(1).normal(0.0, 0.5, (400, 1))
     soundfile.write(tmp_path / "click.wav", sound, 8000)
     (tmp_path / "pair.csv").write_text("0,0.2,1\n0,-0.2,1\n")

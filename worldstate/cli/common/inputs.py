@@ -111,7 +111,7 @@ def _sound_and_own_array(
     from worldstate.adapters.audio.sound_file import as_sound
     from worldstate.adapters.ros.bag_input import read_sound
 
-    stated = arguments.audio_format
+    stated = vars(arguments).get("audio_format")  # Not an option of what draws a log
     if (bag := bag_of(arguments)) is not None:
         pcm = None if stated is None else _pcm("--audio-format", stated, io.BytesIO(), str(bag))
         return read_sound(bag, topics_of(arguments).get("audio"), pcm)
