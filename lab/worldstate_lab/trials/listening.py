@@ -209,7 +209,8 @@ def frame_row(frame: AcousticFrame) -> tuple[Any, ...]:
     """Keep of a hop what methods read, so that an hour of sound stays within some ten megabytes."""
     slope = np.nan if isinstance(frame.looming, NotUsable) else frame.looming.log_slope_hz
     # Of the decision window, not of the shorter one that the bearing is read from: the paper's prominence.
-    prominence = float(frame.srp.max() / np.median(frame.srp))
+    median = float(np.median(frame.srp))
+    prominence = float(frame.srp.max()) / median if median else 1.0  # Nothing was heard
     return frame.feature, prominence, slope, frame.bearing_rad
 
 
