@@ -25,7 +25,7 @@ from worldstate_lab.evaluation.ablation_rows import (
     ablation_table,
     evaluate_ablation,
 )
-from worldstate_lab.metrics.intervals import deal_folds
+from worldstate_lab.metrics.intervals import deal_folds, draw_weights, middle, ratio, stratified_draws
 
 from .hearing import Chain, heard
 from .recordings import CornerRecording
@@ -139,10 +139,23 @@ def product_row(streams: Sequence[HopTable], rng: np.random.Generator, alpha: fl
         "lead_s": found["lead_s"],
         "onsets": sum(len(rising_edges(alarms[one.name])) for one in free),
         "advisory_share": found["hazard_free_share"],
-        "aware": mean_of(np.concatenate([aware[one.name][in_view[one.name]] for one in approaches])),
+        **_aware_of(approaches, aware, rng),
         "vision_only": mean_of(np.concatenate([one.seen[in_view[one.name]] for one in approaches])),
         **{f"hazard_free_aware_{site}": mean_of(np.concatenate(some)) for site, some in by_site.items()},
     }
+
+
+def _aware_of(
+    approaches: Sequence[HopTable], aware: Mapping[str, BoolArray], rng: np.random.Generator
+) -> Figures:
+    """Return the share of hops with the vehicle in view that are aware, with its interval over approaches."""
+    in_view = [one.after_sight() for one in approaches]
+    hits = np.array([aware[one.name][seen].sum() for one, seen in zip(approaches, in_view, strict=True)])
+    hops = np.array([seen.sum() for seen in in_view])
+    draws = stratified_draws([str(one.about["site"]) for one in approaches], rng)
+    weights = draw_weights(draws, len(approaches))
+    low, high = middle(ratio(weights @ hits, weights @ hops))
+    return {"aware": float(hits.sum() / hops.sum()), "aware_low": low, "aware_high": high}
 
 
 def _aware(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float) -> dict[str, BoolArray]:
