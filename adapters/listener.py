@@ -367,10 +367,12 @@ class Listener:
     def measured(self, block: Float32Array | None) -> Iterator[tuple[AcousticFrame, Measurement]]:
         """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
         hear = self._adapter.front_end
+        begins_ns = self._now_ns()
         self._samples += 0 if block is None else len(block)
         ahead, self._ahead = self._ahead, []
         for stamp_ns, name, take in ahead:
-            if self._is_near(stamp_ns, name):
+            # A block may be long, and what lies within it is as near to the sound as can be.
+            if begins_ns <= stamp_ns <= self._now_ns() or self._is_near(stamp_ns, name):
                 take()
         for frames in [hear.finish()] if block is None else map(hear.process, self._parts(block)):
             for frame in frames:

@@ -304,3 +304,12 @@ def test_the_sound_that_looks_are_held_against_starts_and_skips_as_stated() -> N
     for at_s in (1000.1, 1500.1):
         listener.look(nanoseconds(at_s), NONE)
     assert listener.world.state.delivery.refused == 1
+
+
+def test_what_lies_within_a_long_block_is_near_to_its_sound() -> None:
+    listener = Listener(ovad_array(), 48_000)
+    for k in range(60):
+        listener.look(nanoseconds(0.1 * k), NONE)
+    state = listener.push(np.tile(NOISE, (60, 1)))[-1]
+    assert state.delivery.refused == 0
+    assert {one.sensor: one.condition for one in state.sensors}["camera"] == "working"
