@@ -1,31 +1,55 @@
-"""A run with a fault every second: an hour in `make slow`, or WORLDSTATE_SOAK_S seconds."""
+"""A run with a fault every second or sooner: an hour in `make slow`, or WORLDSTATE_SOAK_S seconds."""
 
 import json
 import os
+import re
+import resource
 import socket
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from snapshot_laws import broken_laws
 
+from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
+from worldstate.adapters.live import live_listening
+from worldstate.adapters.live.live_sensors import ImageLooks, _code, image_channel, signed
 from worldstate.adapters.live.live_sound import SoundBlock
 from worldstate.adapters.state_log import read_log
 from worldstate.cli.main import main
+from worldstate.measurement.odometry import Odometry
 
-RATE, BLOCK = 8_000, 200
+RATE, BLOCK, HOP_NS = 8_000, 200, 100_000_000
 LONG_S = float(os.environ.get("WORLDSTATE_SOAK_S", "3600"))
-WELL = {"boxes": [[300, 200, 360, 260]], "scores": [0.9], "classes_str": ["car"]}
-NONSENSE = (
-    b"", b"\xff\xfe", b"[" * 60_000, b"{}", b"null", json.dumps(WELL | {"age_s": 1e308}).encode(),
-    json.dumps(WELL | {"age_s": 5.0}).encode(), json.dumps(WELL | {"boxes": [[600, 0, 900, 9]]}).encode(),
-    json.dumps(WELL | {"scores": [2]}).encode(), b'{"speed_mps": 1e30}', b'{"speed_mps": 1, "x_m": 3}',
-    json.dumps({key: value * 900 for key, value in WELL.items()}).encode(),
+SECRET = b"sixteen bytes or more"
+LOOK = {"boxes": [[300, 200, 360, 260]], "scores": [0.9], "classes_str": ["car"]}
+MANY = {
+    "boxes": np.random.default_rng(0).integers([0, 0, 300, 200], [290, 190, 640, 480], (1000, 4)).tolist(),
+    "scores": [0.9] * 1000,
+    "classes_str": ["car"] * 1000,
+}
+ODOMETRY = {"speed_mps": 0.0}
+NONSENSE = (b"", b"\xff\xfe", b"[" * 60_000, b"{}", b"null", b'{"number": 1e999}', b"\0" * 9)
+RANGES = (
+    LOOK | {"age_s": 1e308}, LOOK | {"age_s": 5.0}, LOOK | {"boxes": [[600, 0, 900, 9]]},
+    LOOK | {"boxes": [[1e308, -1e308, 3, float("inf")]]}, LOOK | {"scores": [2]},
+    LOOK | {"scores": [float("nan")]},
 )  # fmt: skip
+SPEEDS = ({"speed_mps": 1e30}, {"speed_mps": float("nan")}, {"speed_mps": 1, "x_m": 3}, {"speed_mps": None})
+SAMPLES = np.nan, np.inf, -1e30, 1e6, 0.5
+# What a callback of one's own gives in place of its boxes.
+GIVEN = (
+    None,
+    RuntimeError("a detector that fails"),
+    "boxes",
+    DetectionFrame(np.zeros((0, 4)), np.zeros(0), ()),
+)
 
 
 class Faulty:
@@ -33,10 +57,16 @@ class Faulty:
 
     channels, sample_rate_hz, speed, overflows, name = 4, RATE, 1.0, 0, "faulty"
 
-    def __init__(self, ports: tuple[int, int], websocket: int) -> None:
-        self.ports, self.websocket, self.faults, self.bytes = ports, websocket, 0, []
+    def __init__(self, ports: tuple[int, int], websocket: int, key: bytes | None, length_s: float) -> None:
+        self.ports, self.websocket, self._key, self._length_s = ports, websocket, key, length_s
+        # Blocks from one fault to the next: a second of a long run
+        self.every = 40 if length_s > 60.0 else 14
+        self.kinds = [name for name in vars(Faulty) if name.startswith("_fault_")]
+        self.faults, self.bytes, self.images = Counter[str](), list[int](), image_channel()
         self._rng, self._stopped = np.random.default_rng(5), threading.Event()
-        self._dripping: list[socket.socket] = []
+        self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._dripping, self._held, self._ahead = list[socket.socket](), list[SoundBlock](), list[int]()
+        self._last, self._incoherent = b"", False
 
     def start(self, into) -> None:
         self._thread = threading.Thread(target=self._run, args=(into,), daemon=True)
@@ -45,49 +75,71 @@ class Faulty:
     def stop(self) -> None:
         self._stopped.set()
         self._thread.join()
-        for one in self._dripping:
+        self._restore()
+        for one in (*self._dripping, self._sender):
             one.close()
 
+    def detect(self, image):
+        """Fail as a detector of one's own may."""
+        given = GIVEN[int(image[0, 0, 0]) % len(GIVEN)]
+        if isinstance(given, Exception):
+            raise given
+        return given
+
+    def beside(self, source, *hand_in):
+        """Yield the steps of a run in which a program of one's own takes looks and odometry, too."""
+        looks, self.sound = ImageLooks(self.images, self, source.sound.stamp_ns, (640, 480)), source.sound
+
+        def tell(listener) -> int:
+            for far_ns in self._ahead[:]:
+                self._ahead.remove(far_ns)
+                stamp_ns = source.sound.stamp_ns(time.monotonic()) + far_ns
+                listener.look(stamp_ns, DetectionFrame(np.zeros((0, 4)), np.zeros(0), ()))
+                listener.add(Odometry("far", stamp_ns, 0.0, 0.0))
+            return looks.deliver(listener.look)
+
+        return live_steps(source, *hand_in, tell)
+
     def _run(self, into) -> None:
-        begun_s, number, sender = time.monotonic(), 0, socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        begun_s, number = time.monotonic(), 0
         while not self._stopped.wait(max(begun_s + number / 40 - time.monotonic(), 0.0)):
-            samples = self._rng.normal(0.0, 0.1, (BLOCK, 4)).astype(np.float32)
-            blocks = [SoundBlock(samples, BLOCK * number, begun_s + (number + 1) / 40)]
-            if number % 40 == 39:
-                blocks = self._spoilt(blocks[0])
+            noise = self._rng.normal(0.0, 0.1, (BLOCK, 4))
+            samples = noise if self._incoherent else 0.1 * noise + self._rng.normal(0.0, 0.1, (BLOCK, 1))
+            blocks = [SoundBlock(samples.astype(np.float32), BLOCK * number, begun_s + (number + 1) / 40)]
+            if number % self.every == self.every - 1:
+                self._disturb()
+            if number % self.every == self.every - 1 and number < 40 * (self._length_s - 3.0):
+                kind = self.kinds[self.faults.total() % len(self.kinds)]
+                self.faults[kind.removeprefix("_fault_")] += 1
+                given = getattr(self, kind)(blocks[0])
+                blocks = blocks if given is None else given
             for block in blocks:
                 into.put(block)
             if number % 4 == 0:
-                for port, told in zip(self.ports, (WELL | {"age_s": 0.02}, {"speed_mps": 0.0}), strict=True):
-                    sender.sendto(json.dumps(told).encode(), ("127.0.0.1", port))
+                self._last = self._tell(0, LOOK | {"age_s": 0.02})
+                self._tell(1, ODOMETRY)
             number += 1
 
-    def _spoilt(self, block: SoundBlock) -> list[SoundBlock]:
-        """Return what comes in place of a block."""
-        self.faults += 1
-        self._disturb()
-        kind, samples, first, at_s = self.faults % 9, block.samples, block.first, block.captured_s
-        samples[kind, kind % 4] = (np.nan, np.inf, -1e30, 1e6, 0.5, 0.1, 0.2, 0.3, 0.4)[kind]
-        if kind == 7:
-            self._stopped.wait(0.7)
-        return {
-            4: [],  # lost
-            5: [block, block],
-            6: [SoundBlock(samples, first - 1_000_000, at_s)],
-            7: [block],  # after a stall
-            8: [SoundBlock(samples[:, :2], first, at_s), SoundBlock(samples, first + 10**9, at_s)],
-        }.get(kind, [block])
+    def _tell(self, port: int, record, **told) -> bytes:
+        """Send a record as the detector or the car does; return the datagram."""
+        name, text = ("detections", "odometry")[port], json.dumps(record).encode()
+        if self._key is not None:
+            text = signed(record, self._key, told.get("name", name))
+            if "sent_s" in told:
+                again = json.loads(text.split(b"\n")[0]) | {"sent_s": told["sent_s"]}
+                text = self._coded(json.dumps(again).encode())
+        self._sender.sendto(text, ("127.0.0.1", self.ports[port]))
+        return text
+
+    def _coded(self, text: bytes) -> bytes:
+        return text if self._key is None else text + b"\n" + _code(self._key, text)
 
     def _disturb(self) -> None:
-        """Send nonsense and a flood, ask the websocket as a page and never to the end, and take the log."""
+        """Undo the last fault; send rubbish, and ask the websocket as a page and never to the end."""
         self.bytes.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            for port in self.ports:
-                stranger.sendto(NONSENSE[self.faults % len(NONSENSE)], ("127.0.0.1", port))
-                for _ in range(200):
-                    stranger.sendto(b"rubbish", ("127.0.0.1", port))
-        if self.faults % 50 == 3:
-            Path("s.jsonl").unlink()
+        self._incoherent = False
+        self._restore()
+        self._rubbish(200)
         # The server is closed before the microphones.
         with suppress(OSError):
             self._dripping.append(socket.create_connection(("127.0.0.1", self.websocket), 5.0))
@@ -95,7 +147,102 @@ class Faulty:
         while len(self._dripping) > 20:
             self._dripping.pop(0).close()
         with suppress(OSError), socket.create_connection(("127.0.0.1", self.websocket), 5.0) as page:
-            page.sendall(b"GET / HTTP/1.1\r\nOrigin: https://evil.example\r\n\r\n"[: 7 * self.faults])
+            page.sendall(b"GET / HTTP/1.1\r\nOrigin: https://evil.example\r\n\r\n"[: 7 * self.faults.total()])
+
+    def _restore(self) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+
+    def _rubbish(self, datagrams: int) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            for number in range(2 * datagrams):
+                stranger.sendto(b"rubbish", ("127.0.0.1", self.ports[number % 2]))
+
+    def _spoilt(self, block: SoundBlock, first: int = 0, captured_s: float = 0.0) -> SoundBlock:
+        return SoundBlock(block.samples, block.first + first, block.captured_s + captured_s)
+
+    # Each returns what comes in place of a block, None for the block itself.
+
+    def _fault_samples_out_of_range(self, block):
+        block.samples[7, self.faults.total() % 4] = SAMPLES[self.faults.total() % len(SAMPLES)]
+
+    def _fault_block_lost(self, block):
+        return []
+
+    def _fault_block_repeated(self, block):
+        return [block, block]
+
+    def _fault_count_jumps_back(self, block):
+        return [self._spoilt(block, first=-1_000_000)]
+
+    def _fault_count_jumps_ahead(self, block):
+        return [self._spoilt(block, first=10**9)]
+
+    def _fault_channels_missing(self, block):
+        return [SoundBlock(block.samples[:, :2], block.first, block.captured_s)]
+
+    def _fault_stall_and_burst(self, block):
+        self._stopped.wait(0.7)  # what was due meanwhile comes at once
+
+    def _fault_clock_jumps_ahead(self, block):
+        return [self._spoilt(block, captured_s=3600.0)]
+
+    def _fault_clock_jumps_back(self, block):
+        return [self._spoilt(block, captured_s=-3600.0)]
+
+    def _fault_incoherent_noise(self, block):
+        self._incoherent = True
+
+    def _fault_class_names(self, block):
+        for names in (["Voiture"], ["CAR "], ["\x1b[2J"], [""], ["car\0"]):
+            self._tell(0, LOOK | {"classes_str": names})
+
+    def _fault_many_boxes(self, block):
+        for _ in range(10):
+            self._tell(0, MANY)
+
+    def _fault_datagrams_out_of_range(self, block):
+        for record in RANGES:
+            self._tell(0, record)
+        for record in SPEEDS:
+            self._tell(1, record)
+        for text in NONSENSE:
+            for port in self.ports:
+                self._sender.sendto(self._coded(text), ("127.0.0.1", port))
+
+    def _fault_datagrams_again(self, block):
+        for _ in range(20):
+            self._sender.sendto(self._last, ("127.0.0.1", self.ports[0]))
+
+    def _fault_datagrams_redirected(self, block):
+        self._tell(0, ODOMETRY, name="odometry")
+        self._tell(1, LOOK, name="detections")
+
+    def _fault_datagrams_of_another_time(self, block):
+        for late_s in (-3600.0, -6.0, 6.0, 3600.0, 1e308):
+            self._tell(0, LOOK, sent_s=time.time() + late_s)
+
+    def _fault_flood(self, block):
+        self._rubbish(5_000)
+
+    def _fault_log_unwritable(self, block):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1, resource.RLIM_INFINITY))
+
+    def _fault_log_deleted(self, block):
+        number = self.faults["log_deleted"]
+        os.link("s.jsonl", f"kept/{number}.jsonl")  # so that all of its states can be read at the end
+        for name in ("s.jsonl", "s.mcap"):
+            Path(name).unlink()
+
+    def _fault_callbacks(self, block):
+        for value in range(len(GIVEN)):
+            self.images.put((time.monotonic(), np.full((480, 640, 3), value, np.uint8)))
+        self.images.put((time.monotonic(), None))
+
+    def _fault_far_ahead(self, block):
+        self._ahead += [3_600_000_000_000, 10**18, -3_600_000_000_000]
+
+
+live_steps = live_listening.live_steps
 
 
 def free_port(kind=socket.SOCK_DGRAM) -> int:
@@ -104,35 +251,57 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
         return free.getsockname()[1]
 
 
-@pytest.mark.parametrize("length_s", [8.0, pytest.param(LONG_S, marks=pytest.mark.slow)])
-def test_a_run_with_a_fault_every_second_goes_on(length_s, tmp_path, capsys, monkeypatch):
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize(
+    ("length_s", "key"),
+    [
+        (12.0, SECRET),
+        pytest.param(12.0, None, marks=pytest.mark.long),
+        pytest.param(LONG_S, SECRET, marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_with_a_fault_every_second_goes_on(length_s, key, tmp_path, capsys, caplog, monkeypatch):
     ports, websocket = (free_port(), free_port()), free_port(socket.SOCK_STREAM)
-    feed = Faulty(ports, websocket)
+    feed = Faulty(ports, websocket, key, length_s)
     monkeypatch.setattr("worldstate.adapters.live.live_sound.PortAudioInput", lambda *given: feed)
+    monkeypatch.setattr(live_listening, "live_steps", feed.beside)
     (tmp_path / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
     lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
     (tmp_path / "lens.json").write_text(json.dumps(lens))
+    (tmp_path / "key").write_bytes(SECRET)
+    (tmp_path / "kept").mkdir()
     told = ["--detections", f"127.0.0.1:{ports[0]}", "--odometry", f"127.0.0.1:{ports[1]}"]
     given = ["--array", "mics.csv", "--camera", "lens.json", "--rate", str(RATE), "--uncalibrated", *told]
     kept = ["--out", "s.jsonl", "--export", "mcap=s.mcap", "--save-state", "belief.json"]
     ends = ["--export", f"foxglove={websocket}", "--duration", str(length_s), "--json"]
     monkeypatch.chdir(tmp_path)
-    assert main(["live", *given, *kept, *ends]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert feed.faults >= 0.9 * length_s - 1
-    assert report["detections_refused"] + report["odometry_refused"] > 100 * feed.faults
+    assert main(["live", *given, *kept, *ends, *(["--key", "key"] if key else [])]) == 0
+    printed = capsys.readouterr()
+    report, faults = json.loads(printed.out), feed.faults.total()
+    assert "Traceback" not in printed.err
+    assert set(feed.faults) == {name.removeprefix("_fault_") for name in feed.kinds}
+    assert faults >= 0.9 * 40 / feed.every * (length_s - 3.0) - 1
+    assert report["detections_refused"] + report["odometry_refused"] > 100 * faults
     assert report["detections_dropped"] <= 64  # of the first second
     assert report["states"] == pytest.approx(10 * length_s, abs=0.02 * 10 * length_s + 12)
-    before = None
-    assert (tmp_path / "s.jsonl").exists()  # begun again each time
-    for _, state in read_log(tmp_path / "s.jsonl"):
-        assert before is None or state.stamp_ns - before.stamp_ns == 100_000_000
-        assert broken_laws(state, before) == []
-        before = state
-    assert before.delivery.refused > 0.5 * feed.faults
-    for name in ("s.jsonl", "s.mcap"):
-        *_, (_, last) = read_log(tmp_path / name)
-        assert last == before
-    assert read_checkpoint(tmp_path / "belief.json").world.stamp_ns == before.stamp_ns
+    logs = [*(f"kept/{number}.jsonl" for number in range(1, feed.faults["log_deleted"] + 1)), "s.jsonl"]
+    states = [state for log in logs for _, state in read_log(Path(log))]
+    for before, state in pairwise(states):
+        assert broken_laws(state, before if state.stamp_ns - before.stamp_ns == HOP_NS else None) == []
+    # All that is missing was counted as lost, or left out of a gap in the sound.
+    lost = sum(int(one) for one in re.findall(r"s\.jsonl: (\d+) records were lost", caplog.text))
+    assert len(states) + lost == report["states"]
+    left_out = feed.sound.start_ns // HOP_NS
+    assert (states[-1].stamp_ns - states[0].stamp_ns) // HOP_NS + 1 == len(states) + lost + left_out
+    assert states[-1].delivery.refused > 0.5 * faults
+    # MCAP that could not be written ends there, until it begins anew.
+    *_, (_, last) = read_log(tmp_path / "s.mcap")
+    assert last in states[-60:]
+    assert read_checkpoint(tmp_path / "belief.json").world.stamp_ns == states[-1].stamp_ns
     # Buffers are full after a minute.
     assert max(feed.bytes[60:], default=0) < max(feed.bytes[:60]) + (64 << 20)
+    figures = {"faults": feed.faults, "lost in logs": lost, "hops left out": left_out, "states": len(states)}
+    with capsys.disabled():
+        memory = {"first_mib": feed.bytes[0] >> 20, "last_mib": feed.bytes[-1] >> 20}
+        memory["largest_mib"] = max(feed.bytes) >> 20
+        print(json.dumps(report | figures | memory, indent=1) if length_s > 60.0 else "", end="")
