@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Unpack
 
@@ -26,7 +26,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.given_spectra import GivenSpectra, SpectrumFrontEnd
 from worldstate.frontend.settings import HOP_RATE_HZ
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, WorldstateError
 from worldstate.ground.checks import one_of
 from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import nanoseconds, seconds
@@ -34,7 +34,7 @@ from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
-from .own_parts import OtherModality
+from .own_parts import OtherModality, checked_frame, checked_timed
 from .source import ListenerParts, Source, SourceParts, check_clocks, check_mounting, open_source
 
 _LOG = logging.getLogger(__name__)
@@ -42,6 +42,8 @@ _LOG = logging.getLogger(__name__)
 PUSHED = "pushed sound"
 # Half a hop.
 PARTS_PER_SECOND = 20
+# What waits for its sound at most: ten minutes of odometry at 100 Hz, and boxes of the largest file.
+MOST_AHEAD, MOST_AHEAD_BYTES = 1 << 16, 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +188,8 @@ class Listener:
         self._waiting = _Waiting(source.others, self._since_ns)
         self._part = max(int(sample_rate_hz / PARTS_PER_SECOND), 1)
         self._first_ns, self._samples, self._warned = source.start_ns, 0, set[str]()
-        self._ahead: list[tuple[int, str, Callable[[], None]]] = []
+        self._ahead: list[tuple[int, str, Callable[[], int], int]] = []  # In the order of their stamps
+        self._ahead_bytes = 0
         senses = None if source.before is None else source.before.senses
         if isinstance(senses, Senses) and start_s is None:
             self._go_on(senses)
@@ -228,10 +231,10 @@ class Listener:
         """Take odometry, positions or measurements of other sensors; each counts from its own stamp on.
 
         What is stamped more than two seconds before the sound, or after what is pushed next, is refused and
-        counted.
+        counted; so is what comes while 65,536 wait for their sound.
         """
         for one in told:
-            self._take(one.stamp_ns, one.source, partial(self._waiting.add, (one,)))
+            self._take(checked_timed("add", one).stamp_ns, one.source, partial(self._waiting.add, one))
 
     def skip(self, lost_ns: int) -> None:
         """Let time go on by sound that was lost and is not pushed as silence.
@@ -271,7 +274,8 @@ class Listener:
         """Take what a running detector found in an image; of several cameras the one is named.
 
         One that was taken more than two seconds before the sound, or after what is pushed next, is refused,
-        and so are boxes outside the image; `WorldState.delivery` counts them.
+        and so are boxes outside the image, and what comes while 65,536 looks or 64 MiB of them wait for their
+        sound; `WorldState.delivery` counts them.
 
         Parameters
         ----------
@@ -285,43 +289,58 @@ class Listener:
         Raises
         ------
         InvalidArgumentError
-            If there is no such camera, or none was given, where the array is not OVAD's.
+            If there is no such camera, or none was given, where the array is not OVAD's; or if it is none.
         InputFileError
-            If all boxes lie outside the image.
+            If all boxes lie outside the image; a look that waits for its sound is refused then, and counted.
         """
         if self._blind:
             check_mounting(self._source.array)
             self._blind = False
         query = self._cameras[one_of("camera", camera, self._cameras)]
-        self._take(query.taken_ns(stamp_ns), camera, partial(self._see, query, stamp_ns, frame))
+        held_bytes = checked_frame("look", frame).boxes_px.nbytes + sum(map(len, frame.labels))
+        self._take(query.taken_ns(stamp_ns), camera, partial(_seen, query, stamp_ns, frame), held_bytes)
 
-    def _see(self, query: VisionQuery, stamp_ns: int, frame: DetectionFrame) -> None:
-        before = query.outside
-        query.see(stamp_ns, frame)
-        self.refuse(query.outside - before)
+    def _take(self, stamp_ns: int, name: str, take: Callable[[], int], held_bytes: int = 0) -> None:
+        """Take what is near the sound; what is ahead of it waits for its own."""
+        if stamp_ns <= self._now_ns() + LAG_NS:
+            if self._is_near(stamp_ns, name):
+                self.refuse(take())
+        elif len(self._ahead) < MOST_AHEAD and self._ahead_bytes + held_bytes <= MOST_AHEAD_BYTES:
+            self._ahead_bytes += held_bytes
+            insort(self._ahead, (stamp_ns, name, take, held_bytes), key=itemgetter(0))
+        else:
+            self._refuse(name, f"comes while {len(self._ahead)} wait for their sound is refused")
 
-    def _take(self, stamp_ns: int, name: str, take: Callable[[], None]) -> None:
-        """Take what is near the sound; what is ahead of it waits for the sound that is pushed next."""
-        if stamp_ns > self._now_ns() + LAG_NS:
-            self._ahead.append((stamp_ns, name, take))
-        elif self._is_near(stamp_ns, name):
-            take()
+    def _take_due(self) -> None:
+        """Take what has waited for the sound that was pushed."""
+        while self._ahead and self._ahead[0][0] <= self._now_ns():
+            stamp_ns, name, take, held_bytes = self._ahead.pop(0)
+            self._ahead_bytes -= held_bytes
+            try:
+                if self._is_near(stamp_ns, name):
+                    self.refuse(take())
+            except WorldstateError as error:
+                self._refuse(name, f"cannot be read is refused: {error}")
 
     def _now_ns(self) -> int:
         """Return the time of the sound up to which it was pushed."""
         return self._first_ns + nanoseconds(self._samples / self._rate_hz)
 
     def _is_near(self, stamp_ns: int, name: str) -> bool:
-        """Return whether a stamp is near the sound that was pushed; else count it, and warn of the first."""
-        now_ns = self._now_ns()
-        if abs(stamp_ns - now_ns) <= LAG_NS:
-            return True
+        """Return whether a stamp is near the sound that was pushed; else count it."""
+        far_ns = stamp_ns - self._now_ns()
+        if near := abs(far_ns) <= LAG_NS:
+            return near
+        told = f"is stamped {seconds(far_ns):.1f} s from the sound is refused, and all that is more than"
+        self._refuse(name, f"{told} {seconds(LAG_NS):.0f} s")
+        return near
+
+    def _refuse(self, name: str, problem: str) -> None:
+        """Count an input, and warn of the first of a sensor."""
         self.refuse(1)
         if name not in self._warned:
-            told = "%s: what is stamped %.1f s from the sound is refused, and all that is more than %.0f s"
-            _LOG.warning(told, name, seconds(stamp_ns - now_ns), seconds(LAG_NS))
+            _LOG.warning("%s: what %s", name, problem)
         self._warned.add(name)
-        return False
 
     def checkpoint(self) -> Checkpoint:
         """Return what another listener goes on from at the next sample, to the bit.
@@ -367,18 +386,16 @@ class Listener:
     def measured(self, block: Float32Array | None) -> Iterator[tuple[AcousticFrame, Measurement]]:
         """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
         hear = self._adapter.front_end
-        begins_ns = self._now_ns()
-        self._samples += 0 if block is None else len(block)
-        ahead, self._ahead = self._ahead, []
-        for stamp_ns, name, take in ahead:
-            # A block may be long, and what lies within it is as near to the sound as can be.
-            if begins_ns <= stamp_ns <= self._now_ns() or self._is_near(stamp_ns, name):
-                take()
-        for frames in [hear.finish()] if block is None else map(hear.process, self._parts(block)):
+        for part in [None] if block is None else self._parts(block):
+            frames = hear.finish() if part is None else hear.process(part)
+            self._samples += 0 if part is None else len(part)
+            self._take_due()
             for frame in frames:
                 # What the belief to go on from has taken in already only fills the windows.
                 if frame.stamp_ns > self._since_ns:
                     yield frame, self._adapter.interpret(frame)
+        while self._ahead and not self._is_near(*self._ahead[-1][:2]):
+            self._ahead_bytes -= self._ahead.pop()[-1]
 
     def _parts(self, block: Float32Array) -> Iterator[Float32Array]:
         """Cut a block so that no two hops end in one part."""
@@ -523,6 +540,13 @@ def learn_passes(street: StreetListener | None, state: WorldState) -> None:
             street.passed(arm)
 
 
+def _seen(query: VisionQuery, stamp_ns: int, frame: DetectionFrame) -> int:
+    """Take a look; return how many of its boxes are refused."""
+    before = query.outside
+    query.see(stamp_ns, frame)
+    return query.outside - before
+
+
 class _Waiting:
     """Measurements of other sensors that wait for their time, oldest first."""
 
@@ -533,11 +557,12 @@ class _Waiting:
         self._next = next(self._recorded, None)
         self._told: list[Timed] = []
 
-    def add(self, told: Iterable[Timed]) -> None:
-        """Take what has just been measured."""
-        for one in told:
-            if one.stamp_ns > self._after_ns:
-                insort(self._told, one, key=attrgetter("stamp_ns"))
+    def add(self, told: Timed) -> int:
+        """Take what has just been measured; return 1 if it is refused, as so many wait."""
+        if told.stamp_ns <= self._after_ns or len(self._told) >= MOST_AHEAD:
+            return int(told.stamp_ns > self._after_ns)
+        insort(self._told, told, key=attrgetter("stamp_ns"))
+        return 0
 
     def until(self, stamp_ns: int) -> Iterator[Timed]:
         """Yield what was measured up to a time and has not been yielded before."""

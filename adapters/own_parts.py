@@ -160,6 +160,14 @@ def checked_frame(name: str, found: object) -> DetectionFrame:
     return found
 
 
+def checked_timed(name: str, told: object) -> Timed:
+    """Return what another sensor measured; refuse None and whatever else is no measurement."""
+    if not isinstance(told, Timed):
+        expected = "Measurement, PositionScan or Odometry"
+        raise InvalidArgumentError(f"{name}: expected {expected}, got {told!r:.60}")
+    return told
+
+
 @contextmanager
 def own_exporter(name: str, part: ExporterPart, target: str) -> Iterator[Callable[[WorldState], object]]:
     """Open what an exporter of a package lends, whose errors have its name."""
@@ -202,7 +210,4 @@ def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Timed]:
             one = next(told, None)
         if one is None:
             return
-        if not isinstance(one, Timed):
-            expected = "Measurement, PositionScan or Odometry"
-            raise InvalidArgumentError(f"{name}: expected {expected}, got {one!r:.60}")
-        yield one
+        yield checked_timed(name, one)

@@ -2,7 +2,9 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -313,3 +315,63 @@ def test_what_lies_within_a_long_block_is_near_to_its_sound() -> None:
     state = listener.push(np.tile(NOISE, (60, 1)))[-1]
     assert state.delivery.refused == 0
     assert {one.sensor: one.condition for one in state.sensors}["camera"] == "working"
+
+
+def three() -> Listener:
+    return Listener(ARRAY, 8_000, camera=PinholeCamera.ovad(), settings=ANYTHING)
+
+
+def boxes(number: int, left: float = 300.0) -> DetectionFrame:
+    places = np.tile([left, 200.0, left + 80.0, 360.0], (number, 1))
+    return DetectionFrame(places, np.full(number, 0.9), ("car",) * number)
+
+
+def test_what_was_told_before_a_long_block_is_taken_when_its_sound_comes() -> None:
+    sound = np.random.default_rng(1).normal(0.0, 0.01, (20 * 8_000, 3))
+    told = [(nanoseconds(0.1 * k + 0.05), boxes(int(k % 3 == 0))) for k in range(200)]
+    at_once, hop_by_hop = three(), three()
+    for look in told:
+        at_once.look(*look)
+    states = at_once.push(sound)
+    expected = iter(states)
+    for look, block in zip(told, np.split(sound, 200), strict=True):
+        hop_by_hop.look(*look)
+        for state in hop_by_hop.push(block):
+            assert state == next(expected)
+    assert states[-1].delivery.refused == 0
+
+
+def test_a_look_that_was_told_ahead_and_cannot_be_read_costs_itself() -> None:
+    listener = three()
+    for at_s in (2.5, 2.6, 2.7):
+        listener.look(nanoseconds(at_s), boxes(1, left=9_000.0 if at_s == 2.6 else 300.0))
+    states = listener.push(np.random.default_rng(1).normal(0.0, 0.01, (3 * 8_000, 3)))
+    assert len(states) == 20
+    assert states[-1].delivery.refused == 1
+    assert max(view.stamp_ns for view in states[-1].searched) == nanoseconds(2.7)
+
+
+@pytest.mark.parametrize(
+    ("at_s", "told", "tries", "refused"),
+    [
+        (1.0, Odometry("wheels", 0, 1.0), 200, 100),
+        (3.0, Odometry("wheels", 0, 1.0), 200, 100),
+        (3.0, boxes(0), 200, 100),
+        (3.0, boxes(1), 200, 100),
+        (3.0, boxes(100_000), 50, 31),  # 3.5 MB each of 64 MiB
+        (3.0, replace(boxes(1), labels=("x" * 1_000_000,)), 100, 33),
+        (1.0, boxes(100_000), 50, 0),  # of near ones those of a second are kept, with 64 boxes
+    ],
+)
+def test_what_waits_for_sound_that_is_not_pushed_is_bounded_and_counted(
+    at_s: float, told: Any, tries: int, refused: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worldstate.adapters.listener.MOST_AHEAD", 100)
+    listener = three()
+    for k in range(tries):
+        stamp_ns = nanoseconds(at_s) + 10 * k
+        if isinstance(told, Odometry):
+            listener.add(replace(told, stamp_ns=stamp_ns))
+        else:
+            listener.look(stamp_ns, told)
+    assert listener.push(np.zeros((9_000, 3)))[0].delivery.refused == refused
