@@ -4,7 +4,13 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from worldstate.adapters.export.log_messages import IMAGE_TOPIC, SNAPSHOT_TOPIC, SOUND_TOPIC, read_messages
+from worldstate.adapters.export.log_messages import (
+    IMAGE_TOPIC,
+    MCAP_MAGIC,
+    SNAPSHOT_TOPIC,
+    SOUND_TOPIC,
+    read_messages,
+)
 from worldstate.adapters.export.scene import CompressedImage, RawAudio
 from worldstate.adapters.files.file_io import plain_file, refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
@@ -16,7 +22,7 @@ from worldstate.state import WorldState
 # A hop: the last decision of a recording ends up to so long before it does.
 _SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
-_MAGIC, _HEADER_BYTES, _ROS_PROFILE = b"\x89MCAP", 64, b"\x04\x00\x00\x00ros2"
+_HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
 
@@ -52,7 +58,7 @@ def _is_own_mcap(path: Path) -> bool:
     with plain_file(path, "snapshots") as file:
         head = file.read(_HEADER_BYTES)
     # The name of a rotated one may end with a number.
-    return (path.suffix.lower() == ".mcap" or head.startswith(_MAGIC)) and _ROS_PROFILE not in head
+    return (path.suffix.lower() == ".mcap" or head.startswith(MCAP_MAGIC)) and _ROS_PROFILE not in head
 
 
 def read_state_near(path: Path, stamp_ns: int, *, anywhere: bool = False) -> WorldState:

@@ -1,6 +1,7 @@
 """Recordings, read in blocks and checked when they are opened: one file, a file a microphone, a pipe."""
 
 import logging
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -262,7 +263,8 @@ def _open_file(path: Path) -> Any:
     try:
         if (plain := _open_plain(path)) is not None:
             return plain
-        file = soundfile.SoundFile(path)
+        # It encodes names itself, and refuses those that are no UTF-8.
+        file = soundfile.SoundFile(os.fsencode(path) if os.name == "posix" else path)
     except (soundfile.SoundFileError, OSError, TypeError) as error:
         way = _WAYS_ON.get(path.suffix.lower(), "")
         raise InputFileError(path, f"expected {_EXPECTED} audio, found something else{way}") from error

@@ -345,6 +345,7 @@ def _is_cut(path: Path) -> bool:
         return head != magic
 
 
+MCAP_MAGIC = b"\x89MCAP"
 # Of an MCAP file: its magic number, the head of every record, and that of a chunk up to its compression.
 _MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
 # Of a message: its channel and number, then its time.

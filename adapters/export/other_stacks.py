@@ -23,6 +23,7 @@ import numpy as np
 
 from worldstate.adapters.files.file_io import FileOpener, GrowingFile, line_writer
 from worldstate.ground import FloatArray, InvalidArgumentError, seconds
+from worldstate.ground.checks import host_and_port
 from worldstate.ground.extras import check_extra, optional
 from worldstate.state import Entity, WorldState
 from worldstate.state.sensor import Ego
@@ -481,13 +482,10 @@ def odas_socket(address: str, *, live: bool = False) -> Iterator[Callable[[World
     A listener that is slow is waited for, and one that leaves is an error; not so in a `live` run, where a
     `LiveSender` drops what is not taken.
     """
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
-        raise InvalidArgumentError(f"--export odas: expected HOST:PORT, got {address}")
-    tracks, target = OdasTracks(), (host, int(port))
+    tracks, target = OdasTracks(), host_and_port("--export odas", address, 1)
     try:
         connection = socket.create_connection(target, TAKEN_S)
-    except OSError as error:
+    except (OSError, TypeError, UnicodeError) as error:
         # It has no file name, by which the command would name it.
         raise InvalidArgumentError(f"--export odas: expected a listener at {address} ({error})") from error
     if live:

@@ -297,7 +297,9 @@ def _odas_rows(path: Path, text: str, begin: int) -> _Rows:
     if block is None or block[0].count("{") != len(rows) or any(len(row) != 3 for row in rows):
         raise InputFileError(path, "expected mics = ( { mu = ( x, y, z ); ... }, ... ) as in ODAS")
     numbers = [one.strip() for one in used[1].split(",")] if used else []
-    return _Rows(rows, channels=tuple(int(one) if one.isdecimal() else one for one in numbers))
+    return _Rows(
+        rows, channels=tuple(int(one) if one.isdecimal() and len(one) < 10 else one for one in numbers)
+    )
 
 
 def _json_rows(path: Path, data: bytes) -> _Rows:

@@ -70,7 +70,10 @@ def check_target(path: str | Path) -> Path:
     Traceback (most recent call last):
     worldstate.ground.errors.InputFileError: /dev/null: expected a file to write to, found a device or pipe
     """
-    target = Path(os.path.realpath(path))
+    try:
+        target = Path(os.path.realpath(path))
+    except ValueError as error:
+        raise InputFileError(path, f"expected a file to write to ({error})") from error
     if not target.parent.is_dir():
         raise InputFileError(path, f"expected an existing folder {target.parent} to write into")
     if target.is_dir():

@@ -25,6 +25,7 @@ from worldstate.adapters.files.odometry_file import OdometryRecord
 from worldstate.adapters.own_parts import checked_frame
 from worldstate.core.fixed_lag import LAG_NS
 from worldstate.ground import InputFileError, InvalidArgumentError, WorldstateError, in_range
+from worldstate.ground.checks import host_and_port
 from worldstate.ground.errors import OwnPartError
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import decode, decode_json
@@ -295,15 +296,13 @@ class OdometrySocket(DatagramSocket[OdometryRecord]):
 
 def _bound_socket(address: str, option: str) -> socket.socket:
     """Return a socket for datagrams at HOST:PORT."""
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or int(port) >= 1 << 16:
-        raise InvalidArgumentError(f"{option}: expected HOST:PORT to listen at, got {address}")
+    target = host_and_port(option, address)
     listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with suppress(OSError):
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
     try:
-        listening.bind((host, int(port)))
-    except OSError as error:
+        listening.bind(target)
+    except (OSError, TypeError, UnicodeError) as error:  # of a host, too, that is no name
         listening.close()
         problem = f"expected a free address, got {address} ({error})"
         raise InvalidArgumentError(f"{option}: {problem}") from error

@@ -16,9 +16,9 @@ from worldstate.adapters.audio import sound_file
 from worldstate.adapters.audio.plain_samples import LOOK_BYTES, MAX_CHANNELS, Encoding
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.datasets.ovad import AUDIO_NAME
-from worldstate.adapters.export.log_messages import check_chunks
+from worldstate.adapters.export.log_messages import MCAP_MAGIC, check_chunks
 from worldstate.adapters.files.array_file import named_arrays
-from worldstate.adapters.files.file_io import MAX_BYTES, in_order, read_text, refused_as_file
+from worldstate.adapters.files.file_io import MAX_BYTES, in_order, plain_file, read_text, refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, WorldstateError, seconds
@@ -120,8 +120,11 @@ def open_bag(path: Path) -> Iterator[BagReader]:
     from rosbags.highlevel import AnyReader
 
     with refused_as_bag(path):
-        for file in path.glob("*.mcap") if path.is_dir() else [path] * (path.suffix == ".mcap"):
-            check_chunks(file)
+        for file in (one for one in (path.iterdir() if path.is_dir() else [path]) if not one.is_dir()):
+            with plain_file(file, "a file of a bag") as opened:
+                named = file.suffix == ".mcap" or opened.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+            if named:
+                check_chunks(file)
         if (metadata := path / METADATA_NAME).is_file():
             _check_packing(metadata, metadata.stat().st_mtime_ns)
         # Bags of before ROS 2 Iron hold no definitions; then those that ship here count.

@@ -96,6 +96,7 @@ CONTRADICTED = {
         "mics = ( { mu = ( 0, 1, exit ); }, { mu = ( 0, 0, 1 ); } );",
         "got ' exit '",
     ),
+    "odas with a channel beyond": (ODAS.replace("MAP", "1, 2, " + "9" * 5000), "channels"),
     "odas with too many channels": (ODAS.replace("MAP", "1, 2, 3, 4"), "channels: expected 3 different"),
 }
 

@@ -316,3 +316,8 @@ def test_a_chunk_that_grows_is_refused_by_the_readers_of_logs_and_of_bags(kind, 
     chunk_bomb(tmp_path / "bomb.mcap", codec, frame(), claimed)
     for read in (lambda path: list(read_messages(path, SNAPSHOT_TOPIC)), bag):
         refused_by("bomb.mcap", read, tmp_path)
+    # The metadata of a folder may name its files otherwise.
+    (folder := tmp_path / "folder").mkdir()
+    (tmp_path / "bomb.mcap").rename(folder / "bomb.dat")
+    with pytest.raises(WorldstateError, match=r"bomb\.dat: expected"):
+        bag(folder)

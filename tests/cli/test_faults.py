@@ -441,7 +441,13 @@ CAR = "run real.wav --car car.json"
         ("run real.wav --car pipe", None),
         ("run real.wav --resume pipe --array mics.csv", None),
         ("run bag.mcap", None),
+        ("run bag", None),
+        ("log replay bag", None),
         ("explain pipe", None),
+        ("run real.wav --array mics.csv --out o\0.jsonl", None),
+        ("array check real.wav --array mics.csv --figure f\0.png", None),
+        ("demo --out d\0", None),
+        ("live --play real.wav --array mics.csv --allow h\0st", None),
         ("log replay bag.mcap", None),
         ("live --play real.wav --array mics.csv --uncalibrated --key pipe --odometry 127.0.0.1:0", None),
         (CAR, {"array": {"file": "pipe"}}),
@@ -456,6 +462,10 @@ def test_a_pipe_a_device_and_a_nul_are_refused_at_once(line, car, files, capsys)
     soundfile.write("real.wav", np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000)
     Path("mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
     os.mkfifo("bag.mcap")
+    Path("bag").mkdir()
+    os.mkfifo("bag/bag.db3")
+    information = {"version": 5, "storage_identifier": "sqlite3", "relative_file_paths": ["bag.db3"]}
+    Path("bag/metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": information}))
     if car is not None:
         Path("car.json").write_text(json.dumps(car))
     with within(20.0):
@@ -463,6 +473,39 @@ def test_a_pipe_a_device_and_a_nul_are_refused_at_once(line, car, files, capsys)
             [*line.split(), *(["--uncalibrated"] if line.startswith("run") else [])], files, capsys
         )
     assert "device or pipe" in said or "null byte" in said
+
+
+LIVE = "live --play real.wav --array mics.csv --uncalibrated"
+
+
+HOSTS = "", "\udcff", "h" * 300, "..", "h" * 64 + ".org"
+PORTS = "9" * 5, "9" * 4000, "9" * 5000, "-1", "x"
+
+
+@pytest.mark.parametrize("option", ["--detections", "--odometry", "--export=odas", "--allow"])
+def test_an_address_that_is_none_is_refused(option, files, capsys):
+    soundfile.write("real.wav", np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000)
+    Path("mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    named = [*((host, "9000") for host in HOSTS), *(("127.0.0.1", port) for port in PORTS)]
+    for host, port in named if option != "--allow" else named[1 : len(HOSTS)]:
+        assert main([*LIVE.split(), f"{option}={host if option == '--allow' else f'{host}:{port}'}"]) == 2
+        *notices, last = capsys.readouterr().err.splitlines()
+        assert last.startswith("worldstate: ")
+        assert notices == [] or option == "--odometry"
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="names are UTF-8 there")
+def test_a_sound_file_whose_name_is_no_text_is_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    name = os.fsdecode(b"caf\xe9.wav")
+    with Path(name).open("wb") as file:
+        soundfile.write(file, np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000, format="WAV")
+    Path("mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    for words in (["run"], ["array", "check"]):
+        assert (
+            main([*words, name, "--array", "mics.csv", *(["--uncalibrated"] if words == ["run"] else [])]) < 2
+        )
+    assert "Traceback" not in capsys.readouterr().err
 
 
 ODD = "\x1b[2J\x1b]0;mine\x07\x9b\u202e"

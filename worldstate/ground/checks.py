@@ -203,3 +203,17 @@ def _called(kind: Any) -> str:
 def _shown(value: object) -> str:
     # A whole number of thousands of digits has no text.
     return type(value).__name__ if isinstance(value, int) and abs(value) >= 1 << 63 else f"{value!r:.40}"
+
+
+def host_and_port(name: str, address: str, lowest: int = 0) -> tuple[str, int]:
+    """Split HOST:PORT.
+
+    Examples
+    --------
+    >>> host_and_port("--odometry", "127.0.0.1:9100")
+    ('127.0.0.1', 9100)
+    """
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdecimal() and len(port) < 6 and lowest <= int(port) < 1 << 16):
+        raise InvalidArgumentError(f"{name}: expected HOST:PORT, got {address!r:.60}")
+    return host, int(port)

@@ -338,7 +338,7 @@ def _check_schema(stamp: object, layout: Layout) -> None:
     if name != layout.schema or not isinstance(version, str) or version.split(".")[0] != major:
         got = f"{name} {version}"[:80] if isinstance(stamp, dict) else _shown(stamp)
         found, advice = str(version).split(".")[0], ""
-        if name == layout.schema and found.isdecimal():
+        if name == layout.schema and found.isdecimal() and len(found) < 10:
             advice = ": an earlier worldstate wrote it, write it anew with this one or read it with that one"
             if int(found) > int(major):
                 advice = ": a later worldstate wrote it, install that one to read it"

@@ -25,6 +25,8 @@ from worldstate.ground.version import __version__
 from .output import CommandResult, print_result, printable, say
 
 _WIDTH = 80  # of the overview, characters
+# No system has longer paths, and Python reads no number of more digits than 4,300.
+_LONGEST_WORD = 4096
 _HELP = "-h", "--help"
 
 
@@ -209,6 +211,8 @@ def _discard_unwritable_output() -> None:
 
 def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandParser], None]) -> int:
     """Run the command that is called and print what it found; return its exit code."""
+    if any("\0" in word or len(word) > _LONGEST_WORD for word in words):
+        raise InvalidArgumentError(f"words: expected at most {_LONGEST_WORD} characters each, no null byte")
     called = program.called(words)
     if called is None:
         return _without_command(program, [*words, ""])
