@@ -83,8 +83,9 @@ locked: $(VENV)/.test $(VENV)/.docs
 	mv out.locked locked.txt
 
 # Known vulnerabilities of those versions. It needs an index of advisories: a version that could not be looked up
-# is a failure, else an audit of nothing would pass.
+# is a failure, and so is a list without any, else an audit of nothing would pass.
 audit:
+	grep -q '^[A-Za-z].*==' locked.txt
 	$(PYTHON) -m venv out/audit
 	out/audit/bin/pip install -q --disable-pip-version-check pip-audit
 	out/audit/bin/pip-audit --strict -r locked.txt --no-deps --disable-pip
