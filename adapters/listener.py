@@ -27,7 +27,7 @@ from worldstate.frontend.given_spectra import GivenSpectra, SpectrumFrontEnd
 from worldstate.frontend.settings import HOP_RATE_HZ
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError, WorldstateError
-from worldstate.ground.checks import one_of
+from worldstate.ground.checks import in_range, one_of
 from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
@@ -266,9 +266,18 @@ class Listener:
         if isinstance(self._reader, SequenceReader):
             self._reader.miss(round(seconds(lost_ns) * HOP_RATE_HZ))
 
-    def refuse(self, inputs: int) -> None:
-        """Count so many inputs that were refused before they reached the belief."""
-        self.world = self.world.refused(inputs)
+    def refuse(self, inputs: int, name: str = "", problem: str = "") -> None:
+        """Count so many inputs that were refused before they reached the belief; warn of the first of a name.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If it is no number, or negative.
+        """
+        self.world = self.world.refused(int(in_range("inputs", inputs, 0, 2**53)))
+        if problem and name not in self._warned:
+            _LOG.warning("%s: what %s", name, problem)
+            self._warned.add(name)
 
     def look(self, stamp_ns: int, frame: DetectionFrame, camera: str = SENSOR) -> None:
         """Take what a running detector found in an image; of several cameras the one is named.
@@ -309,7 +318,7 @@ class Listener:
             self._ahead_bytes += held_bytes
             insort(self._ahead, (stamp_ns, name, take, held_bytes), key=itemgetter(0))
         else:
-            self._refuse(name, f"comes while {len(self._ahead)} wait for their sound is refused")
+            self.refuse(1, name, f"comes while {len(self._ahead)} wait for their sound is refused")
 
     def _take_due(self) -> None:
         """Take what has waited for the sound that was pushed."""
@@ -320,7 +329,7 @@ class Listener:
                 if self._is_near(stamp_ns, name):
                     self.refuse(take())
             except WorldstateError as error:
-                self._refuse(name, f"cannot be read is refused: {error}")
+                self.refuse(1, name, f"cannot be read is refused: {error}")
 
     def _now_ns(self) -> int:
         """Return the time of the sound up to which it was pushed."""
@@ -332,15 +341,8 @@ class Listener:
         if near := abs(far_ns) <= LAG_NS:
             return near
         told = f"is stamped {seconds(far_ns):.1f} s from the sound is refused, and all that is more than"
-        self._refuse(name, f"{told} {seconds(LAG_NS):.0f} s")
+        self.refuse(1, name, f"{told} {seconds(LAG_NS):.0f} s")
         return near
-
-    def _refuse(self, name: str, problem: str) -> None:
-        """Count an input, and warn of the first of a sensor."""
-        self.refuse(1)
-        if name not in self._warned:
-            _LOG.warning("%s: what %s", name, problem)
-        self._warned.add(name)
 
     def checkpoint(self) -> Checkpoint:
         """Return what another listener goes on from at the next sample, to the bit.

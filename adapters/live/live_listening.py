@@ -12,7 +12,7 @@ import numpy as np
 
 from worldstate.adapters.listener import Listener, Step, listened
 from worldstate.adapters.source import Source
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError, OwnPartError
 
 from .live_sound import LiveSound
 
@@ -34,7 +34,7 @@ def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[
     """Yield every hop of a source whose sound is a `LiveSound`, as soon as it is known.
 
     `hand_in` is called before every block of sound, for what other sensors have given, and returns how much
-    of it was refused.
+    of it was refused; a call that fails, or returns something else, counts as one.
     """
     sound = source.sound
     if not isinstance(sound, LiveSound):
@@ -45,7 +45,14 @@ def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[
         if sound.start_ns > start_ns:
             listener.skip(sound.start_ns - start_ns)
             start_ns = sound.start_ns
-        listener.refuse(sum(one(listener) for one in hand_in) + sound.refused - told)
+        for one in hand_in:
+            try:
+                listener.refuse(one(listener))
+            except OwnPartError:
+                raise
+            except Exception as error:  # of the caller's own function, which may raise anything
+                listener.refuse(1, "hand_in", f"fails is refused: {error!r}")
+        listener.refuse(sound.refused - told)
         told = sound.refused
         for step in listener.steps(block):
             latency_s = sound.age_s(step.frame.sample_index)

@@ -6,6 +6,7 @@ machine, and what a detector finds in its images.
 
 import hmac
 import json
+import math
 import socket
 import threading
 import time
@@ -363,10 +364,12 @@ class ImageLooks:
         Return how many were refused.
         """
         before = self.refused
-        for captured_s, image in self._waiting():
+        for waiting in self._waiting():
             try:
-                stamp_ns = self._stamp_ns(captured_s)
-                take(stamp_ns, self._found(stamp_ns, image))
+                if not (isinstance(waiting, tuple) and len(waiting) == 2):
+                    raise InvalidArgumentError(f"camera: expected a time and an image, got {waiting!r:.60}")
+                stamp_ns = self._stamp_ns(in_range("camera: time", waiting[0], -math.inf, math.inf))
+                take(stamp_ns, self._found(stamp_ns, waiting[1]))
             except OwnPartError:
                 raise
             except WorldstateError as error:
@@ -399,7 +402,7 @@ class ImageLooks:
         return self._health.level
 
     def _check_size(self, image: ImageArray) -> None:
-        if not (isinstance(image, np.ndarray) and image.ndim == 3):
+        if not (isinstance(image, np.ndarray) and image.ndim == 3 and image.dtype == np.uint8):
             raise InvalidArgumentError(f"--camera: expected images, got {type(image).__name__}")
         got = image.shape[1], image.shape[0]
         if got != self._size_px:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -86,6 +87,11 @@ class BoundedChannel(Generic[T]):
             self._raise_failure()
             return None
 
+    @property
+    def ended(self) -> bool:
+        """Whether it is closed and empty."""
+        return self._closed and not self._items
+
     def take_all(self) -> list[T]:
         """Return all that waits, the oldest first, without waiting."""
         with self._changed:
@@ -146,6 +152,11 @@ class SoundBlock:
     samples: Float32Array  # Shape (n, M), full scale 1
     first: int  # Number of the first of them since the start, lost ones counted
     captured_s: float  # When the last of them was captured, on the clock of `time.monotonic`
+
+
+NO_SOUND = SoundBlock(np.zeros((0, 0), np.float32), 0, 0.0)
+# Of `time.monotonic`, which begins at a boot: beyond is no time, and its nanoseconds overflow.
+_LATEST_S = 1e9
 
 
 def block_samples(sample_rate_hz: int) -> int:
@@ -247,24 +258,25 @@ class LiveSound(Audio):
             while True:
                 wait_s = STALL_S if self._behind is not None else 1.0 / BLOCKS_PER_SECOND
                 try:
-                    block = self._channel.take(wait_s)
+                    given: object = self._channel.take(wait_s)
                 except TimeoutError:
-                    block = SoundBlock(np.zeros((0, 0), np.float32), 0, 0.0)
-                if block is None:
+                    given = NO_SOUND
+                if given is None and self._channel.ended:
                     return
+                block = self._checked(given)
                 missing_s = self._missing(block) / self.sample_rate_hz
                 if HEARD_SILENCE_S + 1.0 / HOP_RATE_HZ < missing_s <= LONGEST_GAP_S:
                     block = self._channel.take_newest(block)
-                given: Iterator[Float32Array]
+                parts: Iterator[Float32Array]
                 if len(block.samples) and self._fits(block):
-                    captured_s, given = block.captured_s, self._sound(block)
+                    captured_s, parts = block.captured_s, self._sound(block)
                 elif time.monotonic() - accepted_s >= wait_s:
                     captured_s, self._behind = time.monotonic(), None
                     stalled_s = (captured_s - self._captured_s) * self._feed.speed
-                    given = self._zeros(round(min(max(stalled_s, 0.0), LONGEST_GAP_S) * self.sample_rate_hz))
+                    parts = self._zeros(round(min(max(stalled_s, 0.0), LONGEST_GAP_S) * self.sample_rate_hz))
                 else:
                     continue
-                for samples in given:
+                for samples in parts:
                     self.frames += len(samples)
                     self._captured_s = captured_s
                     if self._keep is not None:
@@ -297,15 +309,23 @@ class LiveSound(Audio):
         # What the device counts after a stall says nothing of the time before.
         return 0 if self._behind is None else block.first + self._behind - self.frames
 
+    def _checked(self, given: object) -> SoundBlock:
+        """Return a block that a feed gave; count what is no block of these microphones, None too."""
+        if isinstance(given, SoundBlock):
+            samples, first, captured_s = given.samples, given.first, given.captured_s
+            known = isinstance(first, int | np.integer) and isinstance(captured_s, Real)
+            floats = isinstance(samples, np.ndarray) and samples.dtype.kind == "f"
+            fits = given is NO_SOUND or (floats and samples.shape[1:] == (self.channels,))
+            if known and fits and abs(captured_s) < _LATEST_S:
+                return given
+        self.refused += 1
+        return NO_SOUND
+
     def _fits(self, block: SoundBlock) -> bool:
         """Return whether a block is the next one of the stream; count it where it is not."""
         # Zeros already stand for what a device has held back while it stalled.
         late = self._behind is None and block.captured_s <= self._captured_s
-        if (
-            late
-            or block.samples.shape[1:] != (self.channels,)
-            or not 0 <= self._missing(block) <= LONGEST_GAP_S * self.sample_rate_hz
-        ):
+        if late or not 0 <= self._missing(block) <= LONGEST_GAP_S * self.sample_rate_hz:
             self.refused += 1
             return False
         if self._behind is None:

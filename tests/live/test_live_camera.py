@@ -240,6 +240,25 @@ def test_a_callback_that_fails_or_gives_none_costs_its_image(source, own):
     assert [seen.label for seen in camera.sightings(nanoseconds(0.6))] == ["car"]
 
 
+IMAGE = np.zeros((480, 640, 3), np.uint8)
+NO_IMAGES = (
+    *(None, 5, "image", (), (0.1,), (0.1, IMAGE, 1), [0.1, IMAGE], IMAGE),
+    *((at_s, IMAGE) for at_s in (None, "now", 1j, float("nan"), float("inf"), 1e308)),
+    *((0.1, image) for image in (None, "image", IMAGE.tolist(), IMAGE[0], IMAGE[:, :, None])),
+    *((0.1, IMAGE.astype(kind)) for kind in (float, object, bool, np.int16)),
+)
+
+
+@pytest.mark.parametrize("given", NO_IMAGES, ids=range(len(NO_IMAGES)))
+def test_what_is_no_image_costs_itself(source, given):
+    camera, images = replace(source, detections=NO_LOOKS).camera_channel(), image_channel()
+    looks = ImageLooks(images, Counting(), nanoseconds, (640, 480))
+    for one in (given, (0.2, IMAGE)):
+        images.put(one)
+    assert looks.deliver(camera.see) == looks.refused == 1
+    assert camera.last_look(nanoseconds(0.2)) is not None
+
+
 def test_a_camera_that_ends_with_an_error_counts_once(source):
     images = image_channel()
     looks = ImageLooks(images, Counting(), nanoseconds, (640, 480))

@@ -76,6 +76,14 @@ def test_what_is_lost_is_silence_of_the_same_length():
         block(100 * RATE + 200),  # a device that slept
         SoundBlock(np.full((200, 3), 0.5, np.float32), 200, 0.0),
         SoundBlock(np.full(200, 0.5, np.float32), 200, 0.0),
+        *(SoundBlock(samples, 200, 0.0) for samples in (None, [[0.5] * 4] * 200, np.float32(0.5))),
+        *(SoundBlock(block(0).samples.astype(kind), 200, 0.0) for kind in (object, str, complex, bool)),
+        SoundBlock(np.full((200, 4), 900, np.int16), 200, 0.0),
+        *(SoundBlock(block(0).samples, first, 0.0) for first in (None, "200", 200.5, np.nan)),
+        *(SoundBlock(block(0).samples, 200, at_s) for at_s in (None, "0", np.nan, np.inf, 1e308, 1j)),
+        None,
+        "samples",
+        (block(0).samples, 200, 0.0),
     ],
 )
 def test_a_block_that_is_not_the_next_is_left_out_and_counted(wrong):
@@ -152,6 +160,19 @@ def test_what_the_sound_refused_is_told_in_the_snapshot(source):
     sound = LiveSound(Scripted(*blocks[:45], blocks[44], *blocks[45:]))
     told = [live.step.state.delivery.refused for live in live_steps(replace(source, sound=sound))]
     assert told == [0, 0, 1, 2, 2, 2]
+
+
+@pytest.mark.parametrize("given", [None, "one", -1, float("nan"), 1.5e300, ZeroDivisionError("own"), [1]])
+def test_a_function_of_ones_own_that_fails_counts_and_the_run_goes_on(source, given, caplog):
+    def hand_in(listener):
+        if isinstance(given, Exception):
+            raise given
+        return given
+
+    *_, last = live_steps(played(source, speed=20.0), lambda listener: 0, hand_in)
+    assert last.step.state.stamp_ns == 2_000_000_000
+    assert last.step.state.delivery.refused == 81  # one a block, and one at the end
+    assert caplog.text.count("hand_in") == 1
 
 
 def test_blocks_that_nobody_took_are_overruns():
