@@ -96,8 +96,12 @@ class DetectionFrame:
         object.__setattr__(self, "labels", tuple(self.labels))
         left, top, right, bottom = self.boxes_px.T
         # Written so that NaN, for which every comparison is false, is refused.
-        if not ((left <= right) & (top <= bottom) & (self.scores >= 0.0) & (self.scores <= 1.0)).all():
-            raise InvalidArgumentError("boxes: expected x1 <= x2, y1 <= y2 and scores in [0, 1]")
+        fit = (left <= right) & (top <= bottom) & (self.scores >= 0.0) & (self.scores <= 1.0)
+        if not fit.all():
+            first = int(np.argmin(fit))
+            got = f"{self.boxes_px[first].tolist()} with {self.scores[first]:g}"
+            problem = "expected x1 <= x2, y1 <= y2 and scores in [0, 1]"
+            raise InvalidArgumentError(f"boxes[{first}]: {problem}, got {got}")
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -440,8 +444,8 @@ def _ovad_log(name: Path, document: object, frame_rate_hz: float | None) -> Dete
 class _OvadFrame:
     """What OVAD's file holds of one image."""
 
-    boxes: tuple[tuple[float, float, float, float], ...]
-    scores: tuple[Probability, ...]
+    boxes: FloatArray
+    scores: FloatArray
     classes_str: tuple[str, ...]
     stamp_ns: Count | None = None
 
@@ -452,8 +456,7 @@ class _OvadFrame:
         self.frame()  # which refuses boxes that cannot be
 
     def frame(self) -> DetectionFrame:
-        boxes_px = np.array(self.boxes, dtype=np.float64).reshape(-1, 4)
-        return DetectionFrame(boxes_px, np.array(self.scores), self.classes_str)
+        return DetectionFrame(self.boxes, self.scores, self.classes_str)
 
 
 def frame_of(record: object, where: str) -> DetectionFrame:
