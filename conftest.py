@@ -4,7 +4,9 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+import soundfile
 from hypothesis import settings
 from worldstate_lab.cli.main import main as study
 
@@ -63,6 +65,18 @@ def approach(tmp_path_factory) -> Approach:
     root = tmp_path_factory.mktemp("approach")
     write_array_xml(root / "mics.xml", ovad_array())
     return Approach(simulate_approach(root / "recording", seed=1), root / "mics.xml")
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory) -> Path:
+    """Return a folder with two seconds of noise, the places of its four microphones, and a camera's lens."""
+    folder = tmp_path_factory.mktemp("street")
+    noise = np.random.default_rng(4).normal(0.0, 0.1, (16_000, 4)).astype(np.float32)
+    soundfile.write(folder / "street.wav", noise, 8_000, subtype="PCM_24")
+    (folder / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
+    (folder / "lens.json").write_text(json.dumps(lens))
+    return folder
 
 
 @pytest.fixture(scope="session")

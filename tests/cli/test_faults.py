@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -458,9 +459,9 @@ CAR = "run real.wav --car car.json"
         (CAR, {"array": {"file": "mics.csv"}, "odometry": "o\0.csv"}),
     ],
 )
-def test_a_pipe_a_device_and_a_nul_are_refused_at_once(line, car, files, capsys):
-    soundfile.write("real.wav", np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000)
-    Path("mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+def test_a_pipe_a_device_and_a_nul_are_refused_at_once(line, car, street, files, capsys):
+    shutil.copy(street / "street.wav", "real.wav")
+    shutil.copy(street / "mics.csv", "mics.csv")
     os.mkfifo("bag.mcap")
     Path("bag").mkdir()
     os.mkfifo("bag/bag.db3")
@@ -483,9 +484,9 @@ PORTS = "9" * 5, "9" * 4000, "9" * 5000, "-1", "x"
 
 
 @pytest.mark.parametrize("option", ["--detections", "--odometry", "--export=odas", "--allow"])
-def test_an_address_that_is_none_is_refused(option, files, capsys):
-    soundfile.write("real.wav", np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000)
-    Path("mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+def test_an_address_that_is_none_is_refused(option, street, files, capsys):
+    shutil.copy(street / "street.wav", "real.wav")
+    shutil.copy(street / "mics.csv", "mics.csv")
     named = [*((host, "9000") for host in HOSTS), *(("127.0.0.1", port) for port in PORTS)]
     for host, port in named if option != "--allow" else named[1 : len(HOSTS)]:
         assert main([*LIVE.split(), f"{option}={host if option == '--allow' else f'{host}:{port}'}"]) == 2
@@ -495,12 +496,11 @@ def test_an_address_that_is_none_is_refused(option, files, capsys):
 
 
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="names are UTF-8 there")
-def test_a_sound_file_whose_name_is_no_text_is_read(tmp_path, monkeypatch, capsys):
+def test_a_sound_file_whose_name_is_no_text_is_read(street, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     name = os.fsdecode(b"caf\xe9.wav")
-    with Path(name).open("wb") as file:
-        soundfile.write(file, np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000, format="WAV")
-    Path("mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    shutil.copy(street / "street.wav", name)
+    shutil.copy(street / "mics.csv", "mics.csv")
     for words in (["run"], ["array", "check"]):
         assert (
             main([*words, name, "--array", "mics.csv", *(["--uncalibrated"] if words == ["run"] else [])]) < 2

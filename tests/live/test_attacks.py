@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 
 from worldstate.adapters.audio.sound_file import RawPcm
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
@@ -40,18 +39,6 @@ while True:
         sent += 1
     time.sleep(0.002)
 """
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("street")
-    noise = np.random.default_rng(4).normal(0.0, 0.1, (2 * RATE, 4)).astype(np.float32)
-    soundfile.write(folder / "street.wav", noise, RATE, subtype="PCM_24")
-    (folder / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
-    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
-    (folder / "lens.json").write_text(json.dumps(lens))
-    (folder / "key").write_bytes(SECRET)
-    return folder
 
 
 def free_port() -> int:
@@ -85,7 +72,14 @@ def fresh_looks(street, folder, seconds: float, keyed: bool, *flood: int) -> flo
     port, folder = free_port(), folder / "-".join(map(str, (0, *flood)))
     folder.mkdir()
     play = "--play", "street.wav", "--array", "mics.csv", "--uncalibrated", "--duration", str(seconds)
-    seen = "--detections", f"127.0.0.1:{port}", "--camera", "lens.json", *(["--key", "key"] if keyed else [])
+    seen = (
+        "--detections",
+        f"127.0.0.1:{port}",
+        "--camera",
+        "lens.json",
+        *(["--key", str(folder / "key")] if keyed else []),
+    )
+    (folder / "key").write_bytes(SECRET)
     kept = "--out", str(folder / "s.jsonl"), "--save-state", str(folder / "belief.json"), "--json"
     script = [sys.executable, "-m", "worldstate", "live", *play, *seen, *kept]
     process = subprocess.Popen(script, cwd=street, stdout=subprocess.PIPE)

@@ -32,15 +32,6 @@ from worldstate.state import WorldState
 RATE = 8_000
 
 
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("street")
-    noise = np.random.default_rng(4).normal(0.0, 0.1, (2 * RATE, 4)).astype(np.float32)
-    soundfile.write(folder / "street.wav", noise, RATE, subtype="PCM_24")
-    (folder / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
-    return folder
-
-
 def command(street, *more):
     play = "--play", str(street / "street.wav"), "--array", str(street / "mics.csv"), "--uncalibrated"
     return ["live", *play, *map(str, more)]

@@ -10,9 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
-import soundfile
 
 from worldstate.adapters.files.checkpoint_file import (
     Checkpoint,
@@ -216,11 +214,9 @@ def wait_until(holds: Callable[[], object]) -> None:
         time.sleep(0.005)
 
 
-def test_a_short_secret_is_refused(tmp_path, capsys):
+def test_a_short_secret_is_refused(street, tmp_path, capsys):
     (tmp_path / "key").write_text("short\n")
-    (tmp_path / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
-    soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0.0, 0.1, (16_000, 4)), 8_000)
-    play = "--play", str(tmp_path / "a.wav"), "--array", str(tmp_path / "mics.csv"), "--uncalibrated"
+    play = "--play", str(street / "street.wav"), "--array", str(street / "mics.csv"), "--uncalibrated"
     assert main(["live", *play, "--odometry", "127.0.0.1:0", "--key", str(tmp_path / "key")]) == 2
     assert "at least 16 bytes" in capsys.readouterr().err
 

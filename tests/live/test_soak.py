@@ -260,18 +260,26 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
         pytest.param(LONG_S, SECRET, marks=pytest.mark.slow),
     ],
 )
-def test_a_run_with_a_fault_every_second_goes_on(length_s, key, tmp_path, capsys, caplog, monkeypatch):
+def test_a_run_with_a_fault_every_second_goes_on(
+    length_s, key, street, tmp_path, capsys, caplog, monkeypatch
+):
     ports, websocket = (free_port(), free_port()), free_port(socket.SOCK_STREAM)
     feed = Faulty(ports, websocket, key, length_s)
     monkeypatch.setattr("worldstate.adapters.live.live_sound.PortAudioInput", lambda *given: feed)
     monkeypatch.setattr(live_listening, "live_steps", feed.beside)
-    (tmp_path / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
-    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
-    (tmp_path / "lens.json").write_text(json.dumps(lens))
     (tmp_path / "key").write_bytes(SECRET)
     (tmp_path / "kept").mkdir()
     told = ["--detections", f"127.0.0.1:{ports[0]}", "--odometry", f"127.0.0.1:{ports[1]}"]
-    given = ["--array", "mics.csv", "--camera", "lens.json", "--rate", str(RATE), "--uncalibrated", *told]
+    given = [
+        "--array",
+        str(street / "mics.csv"),
+        "--camera",
+        str(street / "lens.json"),
+        "--rate",
+        str(RATE),
+        "--uncalibrated",
+        *told,
+    ]
     kept = ["--out", "s.jsonl", "--export", "mcap=s.mcap", "--save-state", "belief.json"]
     ends = ["--export", f"foxglove={websocket}", "--duration", str(length_s), "--json"]
     monkeypatch.chdir(tmp_path)
