@@ -28,11 +28,12 @@ def class_name(label: str) -> str:
 
     Examples
     --------
-    >>> [class_name(one) for one in ("Car", "REGULAR_VEHICLE", "vehicle.bus.rigid", "7", "Milk-Float")]
-    ['car', 'car', 'bus', 'truck', 'milk float']
+    >>> [class_name(one) for one in ("Car", "LargeVehicle", "vehicle.bus.rigid", "7.0", "Milk-Float")]
+    ['car', 'truck', 'bus', 'truck', 'milk float']
     """
-    name = " ".join(re.split(r"[\W_]+", label.casefold())).strip()
-    return _KNOWN.get(name, name)
+    spelt = label.removesuffix(".0"), re.sub(r"(?<=[a-z])(?=[A-Z])", " ", label)
+    name, parted = (" ".join(re.split(r"[\W_]+", one.casefold())).strip() for one in spelt)
+    return next((_KNOWN[one] for one in (name, parted, name.removesuffix("s")) if one in _KNOWN), name)
 
 
 def may_be(name: str, asked: Collection[str]) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from worldstate.adapters.files.file_io import in_order, read_json, read_text, refused_as_file
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
 from worldstate.ground.checks import check_shape
-from worldstate.ground.serialisation import Check, Count, Probability, decode
+from worldstate.ground.serialisation import Check, Count, Probability, Via, decode
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 
 from .class_names import COCO_CATEGORIES, ROAD_USERS, YOLO_NAMES, class_name
@@ -38,10 +38,15 @@ MOT_CLASSES: Mapping[float, str] = {
 }  # fmt: skip
 MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
 # Roboflow puts a hash of the image behind its name.
-_HASH = re.compile(r"(_(jpe?g|png|bmp))?\.rf\.\w+$")
-_NUMBERED = re.compile(r"(.*?)(\d{1,18})", re.ASCII)
+_HASH = re.compile(r"(_(jpe?g|png|bmp|webp|tiff?|gif))?\.rf\.\w+$", re.IGNORECASE)
+_NUMBERED = re.compile(r"(?!-\d+$)(.*?)(\d{1,19})", re.ASCII)
 # What exporters put beside labels.
 _NO_LABELS = frozenset({"classes.txt", "README.txt", "README.dataset.txt", "README.roboflow.txt"})
+# What others call the time of an image.
+_TIMES = {f"{name}{unit}" for name in ("stamp", "timestamp", "time") for unit in ("", "_s", "_ms", "_us")}
+_FORMS = "`worldstate run --help-all` lists the forms that detections may have"
+# Car and bus if categories are counted from 0 as by YOLO, bicycle and airplane from 1 as by COCO.
+_UNSURE = frozenset({"2", "5"})
 # Fewer numbers than these may have a common step by chance.
 _LEAST_NUMBERS = 3
 
@@ -55,6 +60,16 @@ Row = tuple[tuple[float, float, float, float], float, str]
 MAX_NUMBER = 1e9
 Place = Annotated[float, Check("a number below 1e9", lambda value: abs(value) < MAX_NUMBER)]
 Extent = Annotated[float, Check("a number in [0, 1e9)", lambda value: 0.0 <= value < MAX_NUMBER)]
+
+
+def _name(value: object) -> str:
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise ValueError(f"expected a name or a number, got {value!r:.40}")
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# Of a class, category or image; some write numbers.
+Name = Annotated[str, Via(object, _name, _name)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +115,7 @@ class DetectionFrame:
         if not fit.all():
             first = int(np.argmin(fit))
             got = f"{self.boxes_px[first].tolist()} with {self.scores[first]:g}"
-            problem = "expected x1 <= x2, y1 <= y2 and scores in [0, 1]"
+            problem = "expected x1 <= x2, y1 <= y2 (corners, no width and height) and scores in [0, 1]"
             raise InvalidArgumentError(f"boxes[{first}]: {problem}, got {got}")
 
     def __len__(self) -> int:
@@ -427,8 +442,10 @@ def _ovad_log(name: Path, document: object, frame_rate_hz: float | None) -> Dete
     rows = document.get("detections_per_frame") if isinstance(document, dict) else None
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
-        others = 'results of COCO, or its "images" and "annotations"; YOLO (a folder) or MOTChallenge (.txt)'
-        raise InputFileError(name, f"{problem}; or {others}")
+        raise InputFileError(name, f"{problem}; {_FORMS}")
+    keys = {*rows[0]} if rows and isinstance(rows[0], dict) else set()
+    if "stamp_ns" not in keys and (times := sorted(keys & _TIMES)):
+        raise InputFileError(name, f'frame 0: expected times as "stamp_ns", whole nanoseconds, got {times}')
     with refused_as_file(name):
         read = [decode(_OvadFrame, row, f"frame {number}") for number, row in enumerate(rows)]
         frames, stamps = [one.frame() for one in read], [one.stamp_ns for one in read]
@@ -468,8 +485,8 @@ def frame_of(record: object, where: str) -> DetectionFrame:
 class _CocoResult:
     """One box of a COCO results file."""
 
-    image_id: int
-    category_id: int
+    image_id: Name
+    category_id: Name
     bbox: tuple[Place, Place, Extent, Extent]
     score: Probability | None = None  # Labels have none
 
@@ -478,9 +495,11 @@ class _CocoResult:
 class _CocoId:
     """An image, or a category with its name."""
 
-    id: int
+    id: Name
     name: str | None = None
     file_name: str | None = None
+    width: int | None = None
+    height: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -548,39 +567,52 @@ def read_any_detections(
         return read_yolo_text(name, size_px, frame_rate_hz, n_images)
     if name.suffix.lower() == ".txt":
         return read_mot_text(name, frame_rate_hz, n_images)
-    document = read_json(name, "a detections file", MAX_BYTES)
-    if isinstance(document, list) or (isinstance(document, dict) and {"images", "annotations"} & {*document}):
-        return coco_log(name, document, frame_rate_hz, n_images)
+    try:
+        document = read_json(name, "a detections file", MAX_BYTES)
+        of_coco = isinstance(document, dict) and {"images", "annotations"} & {*document}
+        if of_coco or isinstance(document, list):
+            return coco_log(name, document, frame_rate_hz, n_images, size_px)
+    except InputFileError as error:
+        raise InputFileError(error.path, f"{error.problem}; {_FORMS}") from error
     if n_images is not None:
         raise InputFileError(name, "expected no number of images (--images): the file has every image")
     return _ovad_log(name, document, frame_rate_hz)
 
 
 def coco_log(
-    path: Path, document: object, frame_rate_hz: float | None = None, n_images: int | None = None
+    path: Path,
+    document: object,
+    frame_rate_hz: float | None = None,
+    n_images: int | None = None,
+    size_px: tuple[int, int] | None = None,
 ) -> DetectionLog:
     """Return the log of COCO results, or of an object of ``"images"`` and results as ``"annotations"``.
 
     A result is ``{"image_id", "category_id", "bbox": [x, y, w, h], "score"}``; image i is taken i / rate
-    after the start, and without a score it counts as 1. Listed images whose ids count from 1 or are arbitrary
-    stand in the order of the numbers that their ``"file_name"`` end in.
+    after the start, and without a score it counts as 1. Images whose ids count from 1, are arbitrary or names
+    stand in the order of the numbers that their ``"file_name"`` or id ends in; a listed
+    size has to be `size_px`. Categories without names are COCO's, counted from 1; if one is 0, YOLO's.
     """
     with refused_as_file(path):
         held = document if isinstance(document, dict) else {"annotations": document}
         listed, read = "images" in held, decode(_CocoFile, held, "COCO")
-        named = {one.id: one.name for one in read.categories or () if one.name is not None}
-        names = {**COCO_CATEGORIES, **named}
-        numbers = _listed_numbers(read.images or ())
-        rows: dict[int, list[Row]] = {number: [] for number in numbers.values()}
+        images = read.images if read.images is not None else _unlisted(read.annotations)
+        for one in images:
+            if size_px is not None and (one.width or size_px[0], one.height or size_px[1]) != size_px:
+                expected = f"expected images of the camera's {size_px[0]} x {size_px[1]} px"
+                way_on = "width_px and height_px of the camera are those of its images"
+                raise InvalidArgumentError(f"{expected}, got {one.width} x {one.height}: {way_on}")
+        numbers, names = _image_numbers(images, listed=listed), _category_names(read)
+        rows: dict[int, list[Row]] = {number: [] for number in numbers.values()} if listed else {}
         for result in read.annotations:
-            if listed and result.image_id not in numbers:
+            if result.image_id not in numbers:
                 problem = f"expected the images of all boxes listed, {result.image_id} is not"
                 raise InvalidArgumentError(problem)
             left, top, width, height = result.bbox
-            label = names.get(result.category_id, str(result.category_id))
+            label = names.get(result.category_id, result.category_id)
             score = 1.0 if result.score is None else result.score
             row = (left, top, left + width, top + height), score, label
-            rows.setdefault(numbers.get(result.image_id, result.image_id), []).append(row)
+            rows.setdefault(numbers[result.image_id], []).append(row)
     if unscored := sum(one.score is None for one in read.annotations):
         _LOG.warning("%s: %d boxes without a score count with 1.0", path, unscored)
     if listed and n_images is not None:
@@ -588,16 +620,40 @@ def coco_log(
     return _log(path, rows, frame_rate_hz, sorted(rows) if listed else n_images)
 
 
-def _listed_numbers(images: Sequence[_CocoId]) -> dict[int, int]:
-    """Return which image after the start each listed id is."""
-    ids = [one.id for one in images]
-    numbers = image_numbers([one.file_name or "" for one in images])
-    if numbers is None or 0 in ids or numbers == ids:
-        return {one: one - _first(ids) for one in ids}
+def _unlisted(results: Sequence[_CocoResult]) -> tuple[_CocoId, ...]:
+    """Return the images that results name, once each."""
+    return tuple(map(_CocoId, dict.fromkeys(one.image_id for one in results)))
+
+
+def _category_names(read: _CocoFile) -> dict[str, str]:
+    """Return the names of categories by their ids: as listed, else COCO's or, where one is 0, YOLO's."""
+    if read.categories is not None:
+        return {one.id: one.name for one in read.categories if one.name is not None}
+    used = {one.category_id for one in read.annotations}
+    if "0" in used:
+        return {str(i): name for i, name in enumerate(YOLO_NAMES)}
+    # Without a car the two ways to count cannot be told apart.
+    unsure = {} if "3" in used else {one: f"category {one}" for one in _UNSURE}
+    return {str(i): name for i, name in COCO_CATEGORIES.items()} | unsure
+
+
+def _image_numbers(images: Sequence[_CocoId], *, listed: bool) -> dict[str, int]:
+    """Return which image after the start each id is."""
+    if not images:
+        return {}
+    ids = image_numbers([one.id for one in images])
+    numbers = image_numbers([one.file_name or one.id for one in images])
+    if ids is not None and (numbers is None or 0 in ids or numbers == ids):
+        first = _first(ids) if listed else 0
+        return {one.id: number - first for one, number in zip(images, ids, strict=True)}
+    if numbers is None:
+        some = ", ".join(one.id for one in images[:2])
+        expected = 'expected different ids that end in a number, or "images" with such a "file_name"'
+        raise InvalidArgumentError(f"{expected}, got {some:.80}")
     places = {number: place for place, number in enumerate(sorted(numbers))}
     # A list with gaps is of some images of a video, whose numbers then are those in it; or they are times.
-    whole = len(_between(numbers)) == len(ids) or max(numbers) >= MAX_FRAMES
-    return {one: places[number] if whole else number for one, number in zip(ids, numbers, strict=True)}
+    whole = len(_between(numbers)) == len(images) or max(numbers) >= MAX_FRAMES
+    return {one.id: places[n] if whole else n for one, n in zip(images, numbers, strict=True)}
 
 
 def _first(numbers: Collection[int]) -> int:

@@ -35,6 +35,7 @@ SAMPLES = 8
 # Trackers and boxes of whole objects reach beyond an image. Of the boxes of larger images a larger share than
 # this lies outside, or half of them reach beyond, some by more than this share of the width.
 _MOST_OUTSIDE, _FAR_BEYOND, _FEW_BOXES = 0.1, 0.01, 4
+_FEW_PX = 2.0
 _LOG = logging.getLogger(__name__)
 # A box that may be what is asked for and does not count: what is there was not read.
 _UNREAD = Unqueried("a box there does not count, by its class, score or size")
@@ -425,8 +426,8 @@ def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
 
 
 def _check_pixels(source: str, boxes_px: FloatArray) -> None:
-    """Refuse boxes all of which lie within the first pixel: they are in parts of the image."""
-    if 0.0 < boxes_px.max(initial=0.0) <= 1.0:
+    """Refuse boxes all of which lie within the first two pixels: they are in parts of the image."""
+    if 0.0 < boxes_px.max(initial=0.0) <= _FEW_PX:  # detectors reach a little beyond 1
         problem = "expected boxes in pixels, got parts of the image (0 to 1)"
         raise InputFileError(source, f"{problem}: multiply them by its width and height")
 

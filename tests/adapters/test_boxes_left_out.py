@@ -44,7 +44,11 @@ NAMES = {
         "VEHICLE REGULAR_VEHICLE EMERGENCY_VEHICLE", "MOTORCYCLE MOPED MOTORCYCLIST", "BUS SCHOOL_BUS",
         "LARGE_VEHICLE BOX_TRUCK TRUCK_CAB", "RAILED_VEHICLE", "BICYCLE BICYCLIST", "PEDESTRIAN", "SIGN",
     ),
-    "ultralytics": ("2", "3", "5", "7", "6", "", "", ""),
+    "ultralytics": ("2 2.0", "3 3.0", "5", "7", "6", "", "", ""),
+    "machine ids": ("/m/0k4j", "/m/04_sv", "/m/01bjv", "/m/07r04", "/m/07jdr", "/m/0199g", "/m/01g317", ""),
+    "waymo": ("TYPE_VEHICLE", "", "", "", "", "TYPE_CYCLIST", "TYPE_PEDESTRIAN", "TYPE_SIGN"),
+    "visdrone": ("cars vans", "motors", "", "trucks HGV", "", "bicycles", "people", ""),
+    "voc": ("", "motorbike", "", "", "", "", "", "aeroplane tvmonitor"),
 }  # fmt: skip
 CLASSES = ("car", "motorcycle", "bus", "truck", "train", "bicycle", "person", None)
 NAMED = [
@@ -102,6 +106,12 @@ def test_names_of_every_data_set(source: str, name: str, expected: str | None) -
         assert kind is (Absent if expected in {"bicycle", "person", None} else Unqueried)
 
 
+@pytest.mark.parametrize(("source", "name", "expected"), [one for one in NAMED if "_" in one[1]])
+def test_words_may_be_joined_by_capitals(source: str, name: str, expected: str | None) -> None:
+    joined_words = "".join(word.capitalize() for word in name.split("_"))
+    assert source == "machine ids" or class_name(joined_words) == class_name(name)
+
+
 @pytest.mark.parametrize("name", [*UNKNOWN, "Milk Float"])
 def test_a_class_that_is_not_known_is_no_absence(name: str) -> None:
     said, boxes, look = answers(moving(name))
@@ -114,6 +124,12 @@ def test_numbers_are_those_of_the_form(tmp_path) -> None:
     rows = [{"image_id": 0, "category_id": k, "bbox": [0, 0, 9, 9], "score": 0.9} for k in (3, 8, 10, 90, 95)]
     labels = coco_log(tmp_path, rows).frames[0].labels
     assert labels == ("car", "truck", "traffic light", "toothbrush", "95")
+    # Counted from 0; and numbers that may be counted either way, which are then no class that is known.
+    for used, expected in (((0, 2, 7), ["person", "car", "truck"]), ((1, 2, 5), ["person", None, None])):
+        labels = coco_log(tmp_path, [{**rows[0], "category_id": k} for k in used]).frames[0].labels
+        assert [name if class_name(name) in CLASSES else None for name in labels] == expected
+        assert all(may_be(class_name(name), {"car"}) for name in labels[1:])
+    assert coco_log(tmp_path, [{**rows[0], "category_id": "Van"}]).frames[0].labels == ("Van",)
     line = "{} 0.5 0.5 0.1 0.2 0.9"
     (tmp_path / "000000.txt").write_text("\n".join(line.format(k) for k in (2, 7, 9, 79, 80)))
     labels = read_yolo_text(tmp_path, (640, 480)).frames[0].labels
@@ -225,13 +241,22 @@ def joined(one: DetectionFrame, other: DetectionFrame) -> DetectionFrame:
 
 
 def test_boxes_that_cannot_be_placed_are_no_absence_anywhere() -> None:
-    parts = scaled(moving("car"), 1.0 / CAMERA.width_px)
-    with pytest.raises(InputFileError, match="expected boxes in pixels"):
-        VisionQuery(CAMERA, parts)
-    with pytest.raises(InputFileError, match="expected boxes in pixels"):
-        VisionQuery(CAMERA, None).see(AT_NS, parts.frames[20])
+    for most in (0.57, 1.0, 1.004):  # a detector's boxes may reach beyond the image
+        parts = scaled(moving("car"), most / 1290.0)
+        with pytest.raises(InputFileError, match="expected boxes in pixels"):
+            VisionQuery(CAMERA, parts)
+        with pytest.raises(InputFileError, match="expected boxes in pixels"):
+            VisionQuery(CAMERA, None).see(AT_NS, parts.frames[20])
     # Of images a quarter as large as the camera's: there the box stands elsewhere.
     assert isinstance(answers(scaled(moving("car"), 0.25))[0], Unqueried)
+
+
+@pytest.mark.parametrize("size_px", [(640, 402), (1280, 720), (1936, 1217), (3840, 2412)])
+def test_listed_images_have_the_size_of_the_cameras(size_px: tuple[int, int], tmp_path) -> None:
+    listed = {"images": [{"id": 0, "width": size_px[0], "height": size_px[1]}], "annotations": []}
+    assert len(coco_log(tmp_path, listed, size_px=size_px)) == 1
+    with pytest.raises(InputFileError, match=f"got {size_px[0]} x {size_px[1]}: width_px and height_px"):
+        coco_log(tmp_path, listed, size_px=(1936, 1216))
 
 
 @pytest.mark.parametrize("label", ["car", "truck"])

@@ -177,6 +177,10 @@ NAMES: dict[str, tuple[Sequence[str], Sequence[int] | None]] = {
     "numbers alone": (("000000", "000001", "000002"), (0, 1, 2)),
     "without leading zeros": (("f8", "f9", "f10"), range(11)),
     "Roboflow": ([f"cam_000{i}_jpg.rf.{n}" for i, n in ((1, "4f1e77"), (2, "08c5"), (3, "1"))], (0, 1, 2)),
+    "Roboflow, of other images": (
+        [f"{i:04d}_{kind}.rf.0{i}" for i, kind in ((1, "webp"), (2, "JPG"), (4, "tiff"))],
+        (1, 2, 4),
+    ),
     "Roboflow, of a part": ([f"cam_{i:04d}_png.rf.{n}" for i, n in ((3, "4f1e"), (5, "08c5"))], (3, 5)),
     "hashes": (("4f1e77aa0b3c", "08c5d2219e71"), None),
     "two cameras": (("left_0001", "right_0001"), None),
@@ -222,7 +226,7 @@ def test_a_folder_with_empty_files_has_a_file_for_every_image(tmp_path: Path) ->
 
 FRAMES = [f"frame_{i:04d}.jpg" for i in range(20)]
 # Ids and file names of a list of images, and the tenths of a second at which these were taken.
-LISTED: dict[str, tuple[Sequence[int], Sequence[str | None], Sequence[int]]] = {
+LISTED: dict[str, tuple[Sequence[int | str], Sequence[str | None], Sequence[int]]] = {
     "from 0": (range(4), [None] * 4, range(4)),
     "from 0, some": ((0, 2, 3), [None] * 3, (0, 2, 3)),
     "from 1": (range(1, 5), [None] * 4, range(4)),
@@ -234,6 +238,10 @@ LISTED: dict[str, tuple[Sequence[int], Sequence[str | None], Sequence[int]]] = {
     "arbitrary, cut from a longer video": ((7, 9, 8), FRAMES[10:13], range(3)),
     "arbitrary, some of a video": ((7, 9, 8), (FRAMES[0], FRAMES[4], FRAMES[9]), (0, 4, 9)),
     "named by times": ((3, 2, 1), ("1700000000.jpg", "1700000012.jpg", "1700000025.jpg"), range(3)),
+    "ids are names": ([name[:10] for name in FRAMES[:4]], [None] * 4, range(4)),
+    "ids are names of a part": (("v_0", "v_7", "v_3"), [None] * 3, (0, 7, 3)),
+    "ids are numbers as text": (("1", "2", "3"), [None] * 3, range(3)),
+    "ids are hashes": (("0a1f", "93bc", "77ee"), FRAMES[:3], range(3)),
     "Roboflow": ((5, 6), ("a_0002_jpg.rf.ff.jpg", "a_0001_jpg.rf.0e.jpg"), (1, 0)),
 }
 
@@ -252,6 +260,33 @@ def test_listed_images_stand_in_the_order_of_their_names(tmp_path: Path, name: s
     places = [int(frame.boxes_px[0, 0]) for frame in log.frames]
     taken = dict(zip(places, (log.stamps_ns // 10**8).tolist(), strict=True))
     assert [taken[place] for place in range(len(ids))] == [*expected]
+
+
+@pytest.mark.parametrize(
+    "ids", [("0a1f", "93bc"), ("left_1", "right_1"), (-1, -2), (1700000000000000000, 1700000000100000000)]
+)
+def test_ids_that_state_no_order_are_refused_with_the_way_on(tmp_path: Path, ids: tuple[object, ...]) -> None:
+    boxes = [{"image_id": i, "category_id": 3, "bbox": [0, 0, 9, 9], "score": 0.9} for i in ids]
+    for written in (boxes, {"images": [{"id": i} for i in ids], "annotations": boxes}):
+        (tmp_path / "c.json").write_text(json.dumps(written))
+        with pytest.raises(InputFileError, match=r'"file_name"|"stamp_ns"'):
+            read_any_detections(tmp_path / "c.json")
+
+
+def test_results_may_name_their_images(tmp_path: Path) -> None:
+    boxes = [
+        {"image_id": f"street_{i}", "category_id": 3, "bbox": [i, 0, 9, 9], "score": 0.9} for i in (3, 0, 13)
+    ]
+    (tmp_path / "c.json").write_text(json.dumps(boxes))
+    log = read_any_detections(tmp_path / "c.json", 10.0)
+    assert [i for i, frame in enumerate(log.frames) if len(frame)] == [0, 3, 13]
+
+
+@pytest.mark.parametrize("name", ["timestamp", "stamp", "time_s", "timestamp_ms"])
+def test_times_by_another_name_are_not_passed_over(tmp_path: Path, name: str) -> None:
+    (tmp_path / "d.json").write_text(json.dumps({"detections_per_frame": [EMPTY | {name: 1.7e9}] * 9}))
+    with pytest.raises(InputFileError, match=f'"stamp_ns", whole nanoseconds, got .*{name}'):
+        read_any_detections(tmp_path / "d.json")
 
 
 def test_boxes_without_scores_count_with_one_and_that_is_said(

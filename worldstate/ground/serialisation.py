@@ -475,7 +475,7 @@ def _whole(data: object) -> int:
 
 _text = _checked(_as_is, Check("text", lambda value: isinstance(value, str)))
 _flag = _checked(_as_is, Check("true or false", lambda value: isinstance(value, bool)))
-_SCALARS: dict[Hint, Read] = {float: _finite, int: _whole, str: _text, bool: _flag}
+_SCALARS: dict[Hint, Read] = {float: _finite, int: _whole, str: _text, bool: _flag, object: _as_is}
 
 
 def _refused(expected: str, data: object) -> _RefusedError:
