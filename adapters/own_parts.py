@@ -199,7 +199,7 @@ def part_and_target(option: str, text: str) -> tuple[str, str]:
 def other_modality(option: str, text: str) -> OtherModality:
     """Return what NAME=FILE reads, by the package that brings NAME."""
     name, path = part_and_target(option, text)
-    return partial(_checked, load_part("worldstate.measurements", name, option), Path(path), name)
+    return partial(_checked, load_part("worldstate.measurements", name, option), Path(path), name=name)
 
 
 def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Timed]:

@@ -34,6 +34,7 @@ from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
 from worldstate.state import Context
 
@@ -420,6 +421,12 @@ def open_source(
 
 # Of a pipe or of microphones, whose end is not known, seconds.
 _ONE_DAY_S = 86_400.0
+# Stamps closer together are in another unit, and so are those of what begins with the sound and lasts so many
+# times as long.
+_SHORTEST_STEP_S, _MOST_LONGER = 5e-4, 100.0
+# Share of the stamps, and of the sound, that has the other beside it: below it a line warns. Of images at a
+# rate that is assumed or stated, and of all stamps: a camera may stop earlier.
+_TOGETHER = 0.97, 0.9, 0.6
 # From UTC to TAI, from UTC to GPS, and between these, seconds: clocks that were set by different sources.
 _TIME_SCALES_S, _SAME_S = (37.0, 18.0, 19.0), 1.0
 # Of cameras that take fewer images than assumed; images go on after the sound by less than a second.
@@ -442,21 +449,44 @@ def check_clocks(source: Source, length_s: float | None) -> None:
             _check_rate(log, seconds(int(log.stamps_ns[-1])) - begins_s - offset_s, length_s)
         together_s = offset_s + begins_s - seconds(int(log.stamps_ns[0]))
         way_on = f'"stamp_offset_s": {together_s:.1f} of its camera would make both begin together'
-        _check_stamps(log.source, log.stamps_ns.tolist(), begins_s, ends_s, way_on)
-    for told in filter(None, ([*other()] for other in source.others)):
+        least = _TOGETHER[0 if log.assumed else 1 if log.counted_hz else 2]
+        _check_stamps(log.source, log.stamps_ns / 1e9, (begins_s, ends_s), way_on, least)
+    for other in source.others:
+        if not (told := [*other()]):
+            _LOG.warning("%s: no measurement in it", getattr(other, "keywords", {}).get("name", "a sensor"))
+            continue
         more_s = begins_s - seconds(told[0].stamp_ns)
         way_on = f"{more_s:.1f} s more would make both begin together; --start (start_s) moves the sound"
-        _check_stamps(told[0].source, [one.stamp_ns for one in told], begins_s, ends_s, way_on)
+        times_s = np.array([seconds(one.stamp_ns) for one in told])
+        _check_stamps(told[0].source, times_s, (begins_s, ends_s), way_on, _TOGETHER[-1])
 
 
-def _check_stamps(name: str, stamps_ns: Sequence[int], begins_s: float, ends_s: float, way_on: str) -> None:
-    """Refuse stamps none of which lies within the sound, or that are off by a time scale from end to end."""
-    first_s, last_s = seconds(stamps_ns[0]), seconds(stamps_ns[-1])
-    off_s, off_at_end_s = first_s - begins_s, last_s - ends_s
-    scale = any(max(abs(abs(off_s) - one), abs(off_at_end_s - off_s)) < _SAME_S for one in _TIME_SCALES_S)
-    if scale or not any(begins_s <= seconds(stamp_ns) <= ends_s for stamp_ns in stamps_ns):
+def _check_stamps(
+    name: str, times_s: FloatArray, sound_s: tuple[float, float], way_on: str, least: float
+) -> None:
+    """Refuse times none of which lies within the sound, in other units, or off by a time scale; see `least`.
+
+    A line warns if less than that share of them, or of the sound, has the others beside it.
+    """
+    (begins_s, ends_s), first_s, last_s = sound_s, float(times_s[0]), float(times_s[-1])
+    length_s, span_s, within = (
+        ends_s - begins_s,
+        last_s - first_s,
+        (begins_s <= times_s) & (times_s <= ends_s),
+    )
+    step_s, off_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 1.0, first_s - begins_s
+    slow = abs(off_s) < _SAME_S < step_s and span_s > _MOST_LONGER * length_s
+    if step_s < _SHORTEST_STEP_S or slow:
+        problem = f"expected stamps in nanoseconds, times in seconds, got {len(times_s)} in {span_s:.3g} s"
+        raise InputFileError(name, f"{problem} beside {length_s:.1f} s of sound: in another unit?")
+    scale = any(max(abs(abs(off_s) - one), abs(span_s - length_s)) < _SAME_S for one in _TIME_SCALES_S)
+    if scale or not within.any():
         expected = f"expected stamps on the clock of the sound, {begins_s:.1f} to {ends_s:.1f} s"
         raise InputFileError(name, f"{expected}, got {first_s:.1f} to {last_s:.1f} s: {way_on}")
+    covered_s = min(last_s + step_s, ends_s) - max(first_s, begins_s)
+    if length_s < _ONE_DAY_S and min(within.mean(), covered_s / length_s) < least:
+        told = "%s: %d of %d stamps lie within the sound, of which they cover %.1f of %.1f s"
+        _LOG.warning(told, name, within.sum(), len(times_s), covered_s, length_s)
 
 
 def _check_rate(log: DetectionLog, last_s: float, length_s: float) -> None:

@@ -448,9 +448,11 @@ def _places(
     """Return in which place of a line each column stands."""
     if len(header) > MAX_COLUMNS:
         raise InputFileError(path, f"expected at most {MAX_COLUMNS} columns, got {len(header)}")
+    header = [name.strip() for name in header]
     missing = [column for column in columns if column not in header]
     if missing:
-        problem = f"expected columns {', '.join(columns)}, missing {', '.join(missing)}"
+        mark = next((f", got {one!r} for commas" for one in ";\t" if one in "".join(header[:1])), "")
+        problem = f"expected columns {', '.join(columns)}, missing {', '.join(missing)}{mark}"
         raise InputFileError(path, problem)
     return {name: header.index(name) for name in (*columns, *optional) if name in header}
 

@@ -1,9 +1,12 @@
 """Odometry of a drive, from CSV."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
 
 from worldstate.ground import InvalidArgumentError, nanoseconds
 from worldstate.ground.checks import check_ranges
@@ -14,6 +17,9 @@ from .file_io import in_order, number, read_rows, refused_as_file
 
 # Odometry of a standing vehicle scatters by some centimetres a second.
 STANDING_MPS = 0.2
+_LOG = logging.getLogger(__name__)
+# No tyre holds more across, and no localiser turns so often, unless in degrees; of km/h poses move a 3.6th.
+MOST_ACROSS_MPS2, MOST_TURNED_RAD, LEAST_MOVED = 15.0, 25.0, 0.4
 # Three hours at 100 Hz, with a pose.
 MAX_BYTES, MAX_ROWS = 128 << 20, 1_080_000
 
@@ -87,13 +93,33 @@ def read_odometry(path: Path | str) -> OdometryLog:
     ...     read_odometry(Path(folder) / "ego.csv").told[0].yaw_rate_rad_s
     0.1
     """
-    name, told = Path(path), []
+    name, told, turned_rad = Path(path), list[Odometry](), 0.0
     optional = "yaw_rate_rad_s", "x_m", "y_m", "yaw_rad"
     for line, row in read_rows(name, ("time_s", "speed_mps"), optional, MAX_BYTES, MAX_ROWS):
         given = (column for column in row if row[column] or column not in optional)
         known = {column: number(name, line, row, column) for column in given}
         with refused_as_file(name, f"line {line}: "):
             stamp_ns = nanoseconds(known.pop("time_s"))
+            turned_rad = max(turned_rad, abs(known.get("yaw_rad", 0.0)))
             told.append(OdometryRecord(**known).at(stamp_ns))
     with refused_as_file(name):
-        return OdometryLog.in_order(told, str(name))
+        log = OdometryLog.in_order(told, str(name))
+    for column, unit in _other_units(log, turned_rad):
+        _LOG.warning("%s: %s has numbers such as of %s, which are read as they stand", name, column, unit)
+    return log
+
+
+def _other_units(log: OdometryLog, turned_rad: float) -> Iterator[tuple[str, str]]:
+    """Yield columns whose numbers no vehicle has, and the unit in which it may have them."""
+    speeds, rates = (
+        np.array([getattr(one, name) for one in log.told]) for name in ("speed_mps", "yaw_rate_rad_s")
+    )
+    if turned_rad > MOST_TURNED_RAD:
+        yield "yaw_rad", "degrees"
+    if np.mean(np.abs(speeds * rates) > MOST_ACROSS_MPS2) > 0.1:
+        yield "yaw_rate_rad_s", "degrees"
+    at = np.array([(1e-9 * one.stamp_ns, *one.pose.position_m) for one in log.told if one.pose is not None])
+    if len(at) == len(speeds) > 1:
+        driven_m = float(np.abs(speeds[:-1] * np.diff(at[:, 0])).sum())
+        if np.hypot(*np.diff(at[:, 1:], axis=0).T).sum() < LEAST_MOVED * driven_m and log.moves:
+            yield "speed_mps", "km/h"

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, 
 from worldstate.adapters.files.odometry_file import OdometryLog, read_odometry
 from worldstate.adapters.listener import listened
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.ground.errors import InputFileError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import nanoseconds, seconds
 from worldstate.measurement import Bearing, Odometry
 
@@ -99,6 +100,86 @@ def test_what_overlaps_is_taken_as_it_is(sound: Path) -> None:
         heard(sound, others=[told.__iter__])
 
 
+# A second in the units in which clocks count, of stamps that begin with the sound or with 1970.
+UNITS = {"microseconds": 1e-3, "milliseconds": 1e-6, "seconds": 1e-9}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("first_s", [0.0, 1.7e9])
+def test_stamps_in_another_unit_are_refused(sound: Path, unit: str, first_s: float) -> None:
+    stamps = np.unique([round(1e9 * (first_s + 0.1 * i) * UNITS[unit]) for i in range(200)])
+    log = DetectionLog((NONE,) * len(stamps), stamps, "boxes.json")
+    with pytest.raises(
+        InputFileError, match=r"boxes\.json: expected stamps in nanoseconds|clock of the sound"
+    ):
+        heard(sound, detections=log)
+
+
+@pytest.mark.parametrize("by", [1e3, 1e6])
+def test_odometry_in_another_unit_is_refused(sound: Path, by: float) -> None:
+    told = tuple(Odometry("wheels", nanoseconds(0.1 * i * by), 0.1) for i in range(201))
+    with pytest.raises(InputFileError, match=r"wheels: expected stamps in nanoseconds, times in seconds"):
+        heard(sound, ego=OdometryLog(told))
+
+
+@pytest.mark.parametrize(
+    ("first_s", "last_s", "told"),
+    [(0.0, 20.0, ""), (-3.0, 22.0, ""), (4.0, 19.0, ""), (15.0, 35.0, "cover 5.0 of 20.0 s"),
+     (0.0, 6.0, "60 of 60 stamps"), (-30.0, 60.0, "of 900 stamps lie within the sound")],
+)  # fmt: skip
+def test_what_hardly_lies_beside_the_sound_draws_a_line(
+    sound: Path, first_s: float, last_s: float, told: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    stamps = np.array([nanoseconds(s) for s in np.arange(first_s, last_s, 0.1)])
+    heard(sound, detections=DetectionLog((NONE,) * len(stamps), stamps))
+    assert told in caplog.text and bool(told) == bool(caplog.text)
+    caplog.clear()
+    heard(sound, ego=OdometryLog(tuple(Odometry("wheels", int(ns), 0.1) for ns in stamps)))
+    assert told in caplog.text and bool(told) == bool(caplog.text)
+
+
+@pytest.mark.parametrize("rate_hz", [8.0, 9.0, 9.5, 10.4])
+def test_a_rate_near_the_one_assumed_draws_a_line(
+    sound: Path, rate_hz: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard(sound, detections=DetectionLog.at_rate([NONE] * round(rate_hz * LENGTH_S), None))
+    assert "stamps lie within the sound" in caplog.text
+    caplog.clear()
+    heard(sound, detections=DetectionLog.at_rate([NONE] * round(rate_hz * LENGTH_S), rate_hz))
+    assert not caplog.text
+
+
+def test_a_sensor_that_measured_nothing_draws_a_line(sound: Path, caplog: pytest.LogCaptureFixture) -> None:
+    heard(sound, others=[partial(lambda path, name: iter(()), "r.csv", name="radar")])
+    assert "radar: no measurement in it" in caplog.text
+
+
+# Odometry of a drive at 10 m/s around a curve, and what others write of it.
+DRIVE = {
+    "as it is": ({}, ""),
+    "yaw of many turns": ({"yaw_rad": 12.0}, ""),
+    "yaw in degrees": ({"yaw_rad": 187.0}, "yaw_rad has numbers such as of degrees"),
+    "yaw rate in degrees": ({"yaw_rate_rad_s": 5.7}, "yaw_rate_rad_s has numbers such as of degrees"),
+    "km/h": ({"speed_mps": 36.0}, "speed_mps has numbers such as of km/h"),
+}
+
+
+@pytest.mark.parametrize("name", DRIVE)
+def test_odometry_in_units_of_others_draws_a_line(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    other, told = DRIVE[name]
+    lines = ["time_s, speed_mps, yaw_rate_rad_s, x_m, y_m, yaw_rad"]
+    for i in range(100):
+        turned = 0.1 * 0.1 * i
+        row = {"time_s": 0.1 * i, "speed_mps": 10.0, "yaw_rate_rad_s": 0.1}
+        row |= {"x_m": 100.0 * np.sin(turned), "y_m": 100.0 * (1.0 - np.cos(turned)), "yaw_rad": turned}
+        lines.append(",".join(str(value) for value in (row | other).values()))
+    (tmp_path / "o.csv").write_text("\n".join(lines))
+    assert len(read_odometry(tmp_path / "o.csv").told) == 100
+    assert told in caplog.text and bool(told) == bool(caplog.text)
+
+
 def ovad_json(folder: Path, images: int) -> Path:
     frames = [BOX if 60 <= i < 70 else EMPTY for i in range(images)]
     (folder / "ovad.json").write_text(json.dumps({"detections_per_frame": frames}))
@@ -168,6 +249,11 @@ def test_the_rate_is_an_option_and_a_key_of_the_camera(tmp_path: Path) -> None:
     assert read("--image-rate", "10") == (10.0, False)
     assert read("--camera", str(tmp_path / "c.json")) == (15.0, False)
     assert read("--camera", str(tmp_path / "c.json"), "--image-rate", "30") == (30.0, False)
+    stamped = [EMPTY | {"stamp_ns": 10**8 * i} for i in range(9)]
+    (tmp_path / "ovad.json").write_text(json.dumps({"detections_per_frame": stamped}))
+    assert read("--camera", str(tmp_path / "c.json")) == (None, False)
+    with pytest.raises(InvalidArgumentError, match="--image-rate: expected images without stamps"):
+        read("--image-rate", "30")
 
 
 # Names of label files as exporters write them, each with the tenths of a second at which the images were

@@ -163,7 +163,10 @@ class GivenSensors:
         if path is None or (n_images, rate_hz) == (None, None):
             return path
         lens = self.camera or adapters.PinholeCamera.ovad()
-        return adapters.read_any_detections(path, rate_hz, (lens.width_px, lens.height_px), n_images)
+        log = adapters.read_any_detections(path, rate_hz, (lens.width_px, lens.height_px), n_images)
+        if stated_hz is not None and log.counted_hz is None:
+            raise InvalidArgumentError(f"--image-rate: expected images without stamps, {path} has them")
+        return log
 
 
 def given_sensors(arguments: argparse.Namespace) -> GivenSensors:
