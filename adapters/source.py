@@ -393,6 +393,9 @@ def open_source(
     heard_by, policy = _array_and_policy(sound, known, _read(array, read_array), settings, moves)
     if camera is None and (detections, detector) != (None, None):
         check_mounting(heard_by)
+    if len(policy.reference_prior) != len(context.directions) + 2:
+        expected = f'{len(policy.reference_prior) - 2} sides as the model, of an open road "open"'
+        raise InvalidArgumentError(f"context.arms: expected {expected}, got {', '.join(context.directions)}")
     first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
     start_ns = nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns
     t0_s = None if recording is None else recording.t0_s

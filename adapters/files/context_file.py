@@ -1,5 +1,6 @@
 """A context from JSON: corners and lanes of a junction, how fast people drive there, how often they come."""
 
+import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,8 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_side
 
 from .file_io import read_record, refused_as_file
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,4 +102,7 @@ def read_context(path: str | Path) -> Context:
     [('left', 31, False), ('right', -39, False)]
     """
     with refused_as_file(path):
-        return read_record(_ContextFile, path, "context", by_hand=True).context()
+        record = read_record(_ContextFile, path, "context", by_hand=True)
+        if record == _ContextFile():
+            _LOG.warning("%s: nothing in it, a usual blind junction is assumed", path)
+        return record.context()

@@ -1,5 +1,6 @@
 """The sensors of a vehicle in one file: its array, its cameras and what they reported, odometry, model."""
 
+import logging
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError, 
 from worldstate.ground.checks import one_of
 from worldstate.ground.serialisation import ADDED
 
+_LOG = logging.getLogger(__name__)
 # No vehicle carries a sensor farther from its origin; such a number was written in millimetres.
 MAX_OFFSET_M = 30.0
 MOST_TURNS_DEG = 3600.0
@@ -181,7 +183,10 @@ def read_car(path: str | Path) -> CarSensors:
     [[1.2, 0.2, 1.6], [1.1, 0.0, 1.6]]
     """
     with refused_as_file(path):
-        return read_record(_CarFile, path, "car", by_hand=True).car(Path(path))
+        record = read_record(_CarFile, path, "car", by_hand=True)
+        if record == _CarFile(name=record.name):
+            _LOG.warning("%s: no array, camera, model, odometry or measurements in it", path)
+        return record.car(Path(path))
 
 
 def write_aligned(

@@ -26,7 +26,6 @@ Examples
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 from worldstate import adapters
@@ -85,8 +84,10 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if arguments.save_state is not None and report.end is not None:
         adapters.save_checkpoint(arguments.save_state, report.end)
     boxes = sensors.box_counts(source, as_json=arguments.json)
-    if given.camera is not None and boxes is None and source.co_evidence is None and arguments.car is None:
-        print("worldstate: --camera without --detections: the camera counts as not asked", file=sys.stderr)
+    if boxes is None and (unasked := given.unasked()):
+        output.say(f"{unasked} without --detections: the camera counts as not asked")
+    if source.before is not None and not report.hops:
+        output.say("--resume: all of the sound was heard before, --start tells when other sound begins")
     beside = {"array": inputs.stance(source.array), "detections": boxes}
     return output.CommandResult(report.to_dict() | beside)
 

@@ -115,10 +115,9 @@ def _sound_and_own_array(
     if (bag := bag_of(arguments)) is not None:
         pcm = None if stated is None else _pcm("--audio-format", stated, io.BytesIO(), str(bag))
         return read_sound(bag, topics_of(arguments).get("audio"), pcm)
-    if stated is not None:
-        raise InvalidArgumentError(
-            f"--audio-format: expected a bag as INPUT; samples without one are {_RAW}..."
-        )
+    if stated is not None or arguments.topic:
+        option = "--topic" if stated is None else "--audio-format"
+        raise InvalidArgumentError(f"{option}: expected a bag as INPUT; samples without one are {_RAW}...")
     names = [str(path) for path in arguments.input]
     raw = next((name for name in names if name == "-" or name.startswith(_RAW)), None)
     if raw is None:

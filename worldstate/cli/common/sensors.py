@@ -1,7 +1,6 @@
 """The sensors of a vehicle: --car, or --array with a camera, its detector and the boxes that count."""
 
 import argparse
-import sys
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from worldstate import adapters, frontend
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 from .inputs import add_array_options, describe, given_array, topics_of, with_channels
+from .output import say
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import SoundInput
@@ -118,6 +118,11 @@ class GivenSensors:
         """The file that tells how often the camera's detector misses."""
         rates: Path | None = self.arguments.miss_rates or self.setup.miss_rates
         return rates
+
+    def unasked(self) -> str:
+        """Return what was given of a camera, for a notice if nothing was detected by it; "" for nothing."""
+        rates = "--miss-rates" if self.arguments.miss_rates else ""
+        return "--camera" if self.arguments.camera else rates or "cameras of --car" * bool(self.car.cameras)
 
     def boxes(self) -> "adapters.DetectionFilter":
         """Return which boxes count: all of a motion detector's, whose score is no confidence."""
@@ -239,21 +244,22 @@ def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
     """Say how many boxes count and why the others do not, of several cameras each; None without a camera."""
     from worldstate.adapters.camera.detections import count_boxes, told_counts
 
+    keep = replace(source.settings.boxes, image_height_px=source.camera.height_px)
+    held = {} if source.detections is None else {"": (source.detections, keep)}
     if source.co_evidence is not None:
-        cameras = source.co_evidence.cameras.items()
-        each = {name: count_boxes(one.detections, one.keep) for name, one in cameras}
-        return each if as_json else [f"{name}: {told_counts(counts)}" for name, counts in each.items()]
-    if source.detections is None:
-        return None
-    height_px = source.camera.height_px
-    counts = count_boxes(source.detections, replace(source.settings.boxes, image_height_px=height_px))
-    if not counts["frames"]:
-        told = "no image was looked at, so that the camera counts as not asked (--images N)"
-        print(f"worldstate: {told}", file=sys.stderr)
-    elif not counts["empty"] and not counts["parked"]:
-        told = "no image is without a box: are those missing in which nothing was found (--images N)?"
-        print(f"worldstate: {told}", file=sys.stderr)
-    return counts if as_json else told_counts(counts)
+        held = {f"{name}: ": (one.detections, one.keep) for name, one in source.co_evidence.cameras.items()}
+    each = {name: count_boxes(*one) for name, one in held.items()}
+    for name, counts in each.items():
+        if not counts["frames"]:
+            say(f"{name}no image was looked at, so that the camera counts as not asked (--images N)")
+        elif not counts["empty"] and not counts["parked"]:
+            say(
+                f"{name}no image is without a box: are those missing in which nothing was found (--images N)?"
+            )
+    if source.co_evidence is not None:
+        named = {name.removesuffix(": "): counts for name, counts in each.items()}
+        return named if as_json else [name + told_counts(counts) for name, counts in each.items()]
+    return next((counts if as_json else told_counts(counts) for counts in each.values()), None)
 
 
 def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> "MakeDetector":

@@ -1,0 +1,151 @@
+"""An input of `run` that is well formed and contributes nothing draws a line, or is refused."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
+from worldstate.cli.main import main
+
+LENGTH_S = 3.0
+LENS = {"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68.75, "position_m": [-0.57, 0, -0.49]}
+FRONT = {"name": "front", **LENS}
+EMPTY = {"boxes": [], "scores": [], "classes_str": []}
+ASKED = {"detections_per_frame": [EMPTY] * 30}
+TRUCK = {"boxes": [[10.0, 200.0, 400.0, 600.0]], "scores": [0.4], "classes_str": ["truck"]}
+NOTHING = {"detections_per_frame": list[object]()}
+BOX = {"image_id": 0, "category_id": 3, "bbox": [10, 200, 400, 400], "score": 0.9}
+
+
+def odometry(*times_s: float) -> str:
+    return "time_s,speed_mps\n" + "".join(f"{time_s},0\n" for time_s in times_s)
+
+
+def stamped(first_s: float, unit: float = 1e9) -> object:
+    return {
+        "detections_per_frame": [{**EMPTY, "stamp_ns": round((first_s + 0.1 * i) * unit)} for i in range(30)]
+    }
+
+
+# What is given beside the sound: an option and its file's content, or its words; and what is said of it.
+SILENT: dict[str, tuple[Mapping[str, object], str]] = {
+    "boxes of no image": ({"--detections d.json": NOTHING}, "no image was looked at"),
+    "results of no box": ({"--detections d.json": []}, "no image was looked at"),
+    "a list of no image": ({"--detections d.json": {"images": [], "annotations": []}}, "no image was looked"),
+    "one image listed": (
+        {"--detections d.json": {"images": [{"id": 0}], "annotations": []}},
+        "1 of 1 stamps",
+    ),
+    "MOTChallenge text, empty": ({"--detections d.txt": ""}, "no image was looked at"),
+    "boxes that do not count": (
+        {"--detections d.json": {"detections_per_frame": [TRUCK] + [EMPTY] * 29}},
+        "none of its boxes has counted yet",
+    ),
+    "boxes of another day": ({"--detections d.json": stamped(86_400.0)}, "stamp_offset_s"),
+    "boxes in milliseconds": ({"--detections d.json": stamped(0.0, 1e3)}, "in another unit"),
+    "boxes of an hour before": ({"--detections d.json": [{**BOX, "image_id": 36_000}]}, "--image-rate"),
+    "boxes of the last hop": ({"--detections d.json": stamped(2.9)}, "of 30 stamps lie within the sound"),
+    "a rate beside stamps": ({"--detections d.json": stamped(0.0), "--image-rate": "30"}, "without stamps"),
+    "images that are listed": ({"--detections d.json": ASKED, "--images": "30"}, "every image"),
+    "a camera alone": ({"--camera c.json": LENS}, "--camera without --detections"),
+    "miss rates alone": ({"--miss-rates rates.json": None}, "--miss-rates without --detections"),
+    "a camera of a car alone": ({"--car car.json": {"cameras": [FRONT]}}, "cameras of --car without"),
+    "an empty car": ({"--car car.json": {}}, "no array, camera, model, odometry or measurements"),
+    "a car's name": ({"--car car.json": {"name": "mine"}}, "no array, camera"),
+    "one of two cameras": (
+        {
+            "--car car.json": {
+                "cameras": [
+                    {**FRONT, "detections": "asked.json"},
+                    {**FRONT, "name": "rear", "yaw_deg": 180, "detections": "nothing.json"},
+                ]
+            }
+        },
+        "rear: no image was looked at",
+    ),
+    "an empty context": ({"--context x.json": {}}, "nothing in it"),
+    "a context of one side": (
+        {"--context x.json": {"arms": [{"direction": "left", "open": True}]}},
+        "context.arms: expected 2 sides",
+    ),
+    "odometry, empty": ({"--odometry o.csv": odometry()}, "at least one line"),
+    "odometry of another day": (
+        {"--odometry o.csv": odometry(86_400.0, 86_400.1)},
+        "on the clock of the sound",
+    ),
+    "odometry of the last hop": ({"--odometry o.csv": odometry(2.99)}, "1 of 1 stamps lie within the sound"),
+    "odometry in milliseconds": (
+        {"--odometry o.csv": odometry(*range(0, 3000, 100))},
+        "in another unit",
+    ),
+    "a topic without a bag": ({"--topic": "detections=/boxes"}, "--topic: expected a bag"),
+    "a format without a bag": ({"--audio-format": "48000:4:s16"}, "--audio-format: expected a bag"),
+    "sound that was heard before": ({"--resume state.json": None}, "all of the sound was heard before"),
+}
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("street")
+    noise = np.random.default_rng(0).uniform(-0.01, 0.01, (round(48_000 * LENGTH_S), 1))
+    sound = noise + np.random.default_rng(1).uniform(-0.002, 0.002, (len(noise), 56))
+    soundfile.write(folder / "a.wav", sound, 48_000)
+    (folder / "asked.json").write_text(json.dumps(ASKED))
+    (folder / "nothing.json").write_text(json.dumps(NOTHING))
+    counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
+    save_miss_rates(folder / "rates.json", MissRates((0.0, 30.0), {"noise": counts}))
+    assert main(["run", str(folder / "a.wav"), "--save-state", str(folder / "state.json")]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", SILENT)
+def test_what_contributes_nothing_draws_a_line(
+    street: Path,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.chdir(street)
+    given, told = SILENT[name]
+    words = ["run", "a.wav"]
+    for option, held in given.items():
+        words += option.split()
+        if option.endswith(".json") and held is not None:
+            Path(words[-1]).write_text(json.dumps(held))
+        elif held is not None and " " in option:
+            Path(words[-1]).write_text(str(held))
+        elif held is not None:
+            words.append(str(held))
+    code = main(words)
+    said = capsys.readouterr().err + caplog.text
+    assert code in (0, 2) and told in said, said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "",
+        "--detections asked.json",
+        "--car asked_car.json",
+        "--odometry steady.csv",
+        "--resume state.json --start 3",
+    ],
+)
+def test_what_contributes_is_not_remarked_on(
+    street: Path,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.chdir(street)
+    Path("asked_car.json").write_text(json.dumps({"cameras": [{**FRONT, "detections": "asked.json"}]}))
+    Path("steady.csv").write_text(odometry(*np.arange(0.0, LENGTH_S, 0.1)))
+    assert main(["run", "a.wav", *words.split()]) == 0
+    assert [one.message for one in caplog.records if "no array is named" not in one.message] == []
+    assert capsys.readouterr().err == ""
