@@ -37,16 +37,20 @@ MAX_BYTES = 1 << 20
 # No vehicle carries a wider array, or one with its microphones farther apart or closer together: such a file
 # was written in millimetres, centimetres or kilometres.
 MAX_APERTURE_M = 20.0
-MAX_SPACING_M = 3.0
+MAX_SPACING_M, FAR_APART_M = 3.0, 1.0
 MIN_SPACING_M = 1e-3
 _UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _STATED = "a header x_mm,y_mm,z_mm, or positions_mm in JSON, states them"
 _HEADER = re.compile(r"(?:pos(?:ition)?[ _]?)?([xyz])(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?", re.IGNORECASE)
 _TRANSPOSED = "three rows are a 3 x M matrix, as of MATLAB and pyroomacoustics: write its transpose"
+_MATRIX = "numpy.savetxt and MATLAB's writematrix write CSV of an M x 3 matrix"
 _DECIMAL_COMMAS = re.compile(r"(-?\d*,\d+|-?\d+)([;\s]+(-?\d*,\d+|-?\d+)){2,3}")
 # Of libconfig: strings stay, comments go; what does not end goes on to the end of the file.
 _COMMENT = re.compile(r'("(?:\\.|[^"\\])*"?)|#[^\n]*|//[^\n]*|/\*(?:.*?\*/|.*)', re.DOTALL)
-_MICS, _GROUPS = re.compile(r"\bmics\s*[:=]\s*[(\[]"), re.compile(r"(?:[\s,]*\{[^{}]*\})*[\s,]*[)\]]")
+_MICS, _GROUPS = (
+    re.compile(r"\bmics\s*[:=]\s*[(\[](?=[\s,]*[{@])"),
+    re.compile(r"(?:[\s,]*\{[^{}]*\})*[\s,]*[)\]]"),
+)
 _MU, _MAP = (re.compile(rf"\b{key}\s*[:=]\s*[(\[]([^()\[\]]*)[)\]]") for key in ("mu", "map"))
 
 
@@ -134,10 +138,11 @@ def _held(path: Path, data: bytes) -> _Rows:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         problem = "expected microphones as XML, CSV, JSON or .cfg of ODAS in UTF-8"
-        way_on = "numpy.savetxt and MATLAB's writematrix write CSV of an M x 3 matrix"
-        raise InputFileError(path, f"{problem}; {way_on}") from error
+        raise InputFileError(path, f"{problem}; {_MATRIX}") from error
     plain = _COMMENT.sub(lambda found: found[1] or "", text)
     mics = _MICS.search(plain)
+    if "@include" in plain[0 if mics is None else mics.end() :]:
+        raise InputFileError(path, "expected one file: write what @include names in its place")
     return _csv_rows(path, text) if mics is None else _odas_rows(path, plain, mics.end())
 
 
@@ -223,6 +228,8 @@ def _check_size(path: Path, positions_m: FloatArray) -> None:
     ):
         if wrong:
             raise InputFileError(path, problem)
+    if mean_m > FAR_APART_M:
+        _LOG.warning("%s: microphones %.3g m apart; if in centimetres or inches, %s", path, mean_m, _STATED)
 
 
 def _xml_rows(path: Path, data: bytes) -> list[Row]:
@@ -233,13 +240,14 @@ def _xml_rows(path: Path, data: bytes) -> list[Row]:
         raise InputFileError(path, problem) from error
     except (SafeElementTree.ParseError, ValueError, LookupError) as error:
         raise InputFileError(path, f"expected array XML, it does not parse: {error}") from error
-    found = root.findall("pos")
+    found = [one for one in root.iter() if str(one.tag).rpartition("}")[2] == "pos"]  # in any namespace
     order = by_number(path, [element.get("Name", "") for element in found])
     return [[found[place].get(axis) for axis in "xyz"] for place in order]
 
 
 def _csv_rows(path: Path, text: str) -> _Rows:
-    kept = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    lines = (line.strip() for line in text.splitlines())
+    kept = [line for line in lines if line and not line.startswith(("#", "%"))]
     if any("," in line and _DECIMAL_COMMAS.fullmatch(line) for line in kept):
         raise InputFileError(path, "expected decimal points, got decimal commas")
     separator = next((mark for mark in ";,\t" if kept and mark in kept[0]), None)
@@ -275,7 +283,7 @@ def _csv_columns(path: Path, cells: list[list[str]]) -> tuple[list[int], int | N
         names = {3: None, 4: 0 if numbers[-1] else 3}[len(first)]
         return [i for i in range(len(first)) if i != names], names, None
     expected = "microphones as XML, JSON or CSV with the columns x, y, z"
-    raise InputFileError(path, f"expected {expected}, got {','.join(first)!r:.60}")
+    raise InputFileError(path, f"expected {expected}, got {','.join(first)!r:.60}; {_MATRIX}")
 
 
 def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]:
@@ -308,7 +316,10 @@ def _json_rows(path: Path, data: bytes) -> _Rows:
     except (ValueError, RecursionError) as error:
         raise InputFileError(path, f"expected array JSON, it does not parse: {error}") from error
     held = document if isinstance(document, dict) else {"positions_m": document}
-    unit = next((unit for unit in _UNITS_M if f"positions_{unit}" in held), "m")
+    stated = [unit for unit in _UNITS_M if f"positions_{unit}" in held]
+    if len(stated) > 1 or {"unit", "units"} & {*held}:
+        raise InputFileError(path, "expected one list, its unit in its name: positions_m, _cm or _mm")
+    unit = next(iter(stated), "m")
     rows = held.get(f"positions_{unit}")
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
         problem = "expected a list of positions [x, y, z], or one as positions_m"

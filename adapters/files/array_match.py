@@ -102,14 +102,15 @@ def by_number(path: Path, names: Sequence[str]) -> list[int]:
     >>> by_number(Path("street"), ["mic_3.wav", "mic_1.wav", "mic_2.wav"])
     [0, 1, 2]
     """
-    given, parts = list(range(len(names))), [re.split(r"(\d{1,9})", name) for name in names]
+    given, small = list(range(len(names))), [name.casefold() for name in names]
+    parts = [re.split(r"(\d{1,9})", name) for name in small]
     numbers, texts = [tuple(map(int, part[1::2])) for part in parts], {tuple(part[::2]) for part in parts}
     ranked = sorted(given, key=numbers.__getitem__)
     if len(texts) > 1 or len({*numbers}) < len(names) or ranked == given:
         return given
     # Locales sort without regard to punctuation: mic_10.wav before mic_1.wav.
-    bare = [re.sub(r"[\W_]", "", name).lower() for name in names]
-    by_text = sorted(names) == list(names) or sorted(bare) == bare
+    bare = [re.sub(r"[\W_]", "", name) for name in small]
+    by_text = any(sorted(one) == one for one in (list(names), small, bare))
     done = "taken in that of the numbers" if by_text else "kept as they were given"
     at = next(i for i in given[:-1] if ranked[i] != i)
     told = "%s: %s, %s, ... are not in the order of their numbers: %s"

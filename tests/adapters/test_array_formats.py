@@ -60,6 +60,8 @@ sst: { active = ( { weight = 1.0; mu = 0.3; sigma2 = 0.0025 } ); }
 """
 SAME |= {
     "odas.cfg": ODAS.replace("MAP", "1, 2, 3"),
+    "matlab.txt": "% my array\n0.5 0.2 1.4\n0.5 -0.2 1.4\n0.1 0 1.5\n",
+    "nested.xml": "<a xmlns='urn:mics'>" + SAME["mics.xml"] + "</a>",
     "colons.cfg": ODAS.replace("mics =", "mics:").replace("MAP", "1, 2, 3"),
 }
 
@@ -85,6 +87,14 @@ CONTRADICTED = {
     "millimetres": ("50,0,0\n0,50,0\n-50,0,0\n", "millimetres? Then a header x_mm"),
     "centimetres": ("5,0,0\n0,5,0\n-5,0,0\n", "centimetres? Then a header x_mm"),
     "two units": ("x_mm,y_mm,z\n1,2,3\n2,3,4\n", "one unit of x, y and z, got m, mm"),
+    "two lists": (json.dumps({"positions_m": PLACES, "positions_mm": PLACES}), "its unit in its name"),
+    "a unit of its own": (json.dumps({"positions_m": PLACES, "unit": "mm"}), "its unit in its name"),
+    "inches by name": ("x_in,y_in,z_in\n2,0,0\n0,2,0\n", "columns x, y, z"),
+    "angles": ("azimuth,elevation,radius\n0,0,0.05\n90,0,0.05\n", "columns x, y, z"),
+    "a matrix of MATLAB": ("mics = [0.05 0 0; 0 0.05 0];\n", "writematrix"),
+    "a file of MATLAB": (b"MATLAB 5.0 MAT-file\0\0", "writematrix"),
+    "an included file": ('@include "mics.cfg"\ngeneral: { };', "write what @include names"),
+    "included microphones": ('mics = (\n@include "mics.inc"\n);', "write what @include names"),
     "commas": ("x;y;z\n0,05;0,00;0,00\n0,00;0,05;0,00\n", "decimal commas"),
     "commas and tabs": ("0,05\t0\t0\n0\t0,05\t0\n", "decimal commas"),
     "commas and blanks": ("1 0,05 0 -0,1\n2 0 0,05 0\n", "decimal commas"),
@@ -108,6 +118,16 @@ def test_numbers_that_may_be_something_else_are_refused_with_the_way_on(case: st
     with pytest.raises(InputFileError) as refused:
         read_array(tmp_path / "mics")
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(("radius_m", "said"), [(0.05, False), (0.6, False), (1.5, True), (2.0, True)])
+def test_a_ring_that_may_be_in_centimetres_or_inches_draws_a_line(
+    radius_m: float, said: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = ((radius_m, 0.0), (0.0, radius_m), (-radius_m, 0.0), (0.0, -radius_m))
+    (tmp_path / "ring.csv").write_text("".join(f"{x},{y},0\n" for x, y in rows))
+    assert read_array(tmp_path / "ring.csv").n_microphones == 4
+    assert ("centimetres or inches" in caplog.text) is said
 
 
 @pytest.mark.parametrize("form", ["csv", "header", "xml"])

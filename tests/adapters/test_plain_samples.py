@@ -197,6 +197,7 @@ def test_numbered_files_are_taken_by_number_or_it_is_said(
 ) -> None:
     numbers, by_number = NAMES[case]
     samples, names = noise(channels=12), [tmp_path / pattern.format(number) for number in numbers]
+    names = [name.with_name(name.name.upper()) if i % 2 else name for i, name in enumerate(names)]
     for name, number in zip(names, numbers, strict=True):
         name.parent.mkdir(exist_ok=True)
         soundfile.write(name, samples[:, number - 1], RATE_HZ, subtype="FLOAT")
