@@ -6,12 +6,13 @@ import struct
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import BinaryIO, Literal, NamedTuple, get_args
+from typing import Any, BinaryIO, Literal, NamedTuple, get_args
 
 import numpy as np
 import soundfile
+from numpy.typing import NDArray
 
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 
 Encoding = Literal["s16", "s24", "s24_32", "s32", "f32"]
 # Of libsndfile, but for the one that it lacks: 24 bits in the lower three of four bytes (ALSA's S24_LE).
@@ -62,9 +63,51 @@ def four_byte_form(data: bytes) -> Encoding | None:
         return None
     if ((top & 0x70) == 0x30).all():
         return "f32"
-    if not (raw & 0xFF).any():
-        return "s32"
-    return "s24_32" if (top == 0).all() or (top == raw << 8 >> 31).all() else None
+    if (top == 0).all() or (top == raw << 8 >> 31).all():  # the first byte is empty in that of 16 bits, too
+        return "s24_32"
+    return None if (raw & 0xFF).any() else "s32"
+
+
+# Neighbouring samples of sound correlate by more than the first number in every channel; decoded wrongly,
+# those of one correlate by less than the second, at more than the third of full scale.
+_SMOOTH, _ROUGH, _LOUD = 0.7, 0.35, 0.3
+_FORMS = {"s16": "<i2", "s24": "", "s32 or s24_32": "<i4", "s16, big-endian": ">i2", "s32, big-endian": ">i4"}
+
+
+def smooth_form(data: bytes, stated: Encoding, channels: int) -> str | None:
+    """Return in which form samples are smooth that are loud noise in the stated one; None for none.
+
+    Pairs of 16 bits are smooth as numbers of 32 bits, too; the lower halves of such numbers are not.
+
+    Examples
+    --------
+    >>> steps = np.random.default_rng(0).normal(0.0, 9.0, (6000, 2))
+    >>> data = (np.cumsum(steps, axis=0) * 9.0).astype("<i2").tobytes()
+    >>> [smooth_form(data, stated, 2) for stated in ("s16", "s24", "s32", "f32")]
+    [None, 's16', 's16', 's16']
+    """
+    if not (data := data[: len(data) // (12 * channels) * 12 * channels]):
+        return None
+    if not (suspect := stated == "f32"):
+        alike, loud = _likeness(decoded(data, SUBTYPES[stated], channels))
+        suspect = bool(((alike < _ROUGH) & (loud > _LOUD)).any())
+    for name, kind in _FORMS.items():
+        other = name != stated and not (stated == "f32" and name.startswith("s32"))
+        if other and (suspect or (name == "s16" and stated.endswith("32"))):
+            read = (
+                np.frombuffer(data, kind).reshape(-1, channels) if kind else decoded(data, "PCM_24", channels)
+            )
+            if _likeness(read)[0].min(initial=1e9) > _SMOOTH:
+                return name
+    return None
+
+
+def _likeness(samples: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+    """Return how neighbouring samples of each channel that is not constant correlate, and its deviation."""
+    about = samples.astype(np.float64) - samples.mean(axis=0)
+    power = (about**2).sum(axis=0)
+    live, along = power > 0.0, (about[1:] * about[:-1]).sum(axis=0)
+    return along[live] / power[live], np.sqrt(power[live] / max(len(about), 1))
 
 
 class _Form(NamedTuple):
@@ -86,6 +129,8 @@ class PlainSamples:
     ----------
     declared_bytes, n_bytes, there_bytes : int
         Of samples: as the header counts them, as the chunks show, and from the first one to the file's end.
+    look : bytes
+        The first samples.
     needed : bool
         Whether libsndfile would read them wrongly (24 bits in four bytes as three) or not at all (BW64).
     """
@@ -100,8 +145,9 @@ class PlainSamples:
         tag = int.from_bytes(about[24:26], "little") if tag == 0xFFFE else tag
         self.subtype = {1: _WHOLE, 3: _FLOATS}.get(tag, {}).get(each)
         self.seek(0)
+        self.look = file.read(LOOK_BYTES)
         # Arecord writes 24 bits into the lower bytes of four, all others into the upper.
-        if (tag, each, bits) == (1, 4, 24) and four_byte_form(file.read(LOOK_BYTES)) == "s24_32":
+        if (tag, each, bits) == (1, 4, 24) and four_byte_form(self.look) == "s24_32":
             self.subtype = PADDED_24
         file.seek(0)
         right = self.n_bytes == declared and bits == 8 * each and file.read(4) != b"BW64"

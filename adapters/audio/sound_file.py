@@ -26,6 +26,7 @@ from .plain_samples import (
     decoded,
     four_byte_form,
     plain_samples,
+    smooth_form,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -40,6 +41,9 @@ _WAYS_ON = {
 FLOATING = ("FLOAT", "DOUBLE")
 ENCODINGS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", *FLOATING)
 SHORTEST_S = 1.0
+# Floats may exceed full scale a little; whole numbers written as floats do by thousands.
+_OVER_FULL_SCALE = 16.0
+_MAGIC = b"RIFF", b"RF64", b"riff", b"fLaC", b"FORM"
 
 
 class Audio(ABC):
@@ -266,7 +270,7 @@ def _open_file(path: Path) -> Any:
         # It encodes names itself, and refuses those that are no UTF-8.
         file = soundfile.SoundFile(os.fsencode(path) if os.name == "posix" else path)
     except (soundfile.SoundFileError, OSError, TypeError) as error:
-        way = _WAYS_ON.get(path.suffix.lower(), "")
+        way = _WAYS_ON.get(path.suffix.lower(), f"; `sox {path.name} out.wav` converts other forms")
         raise InputFileError(path, f"expected {_EXPECTED} audio, found something else{way}") from error
     if file.format not in CONTAINERS or file.subtype not in ENCODINGS:
         kind = f"{file.format} {file.subtype}"
@@ -281,6 +285,11 @@ def _open_plain(path: Path) -> PlainSamples | None:
     if (plain := plain_samples(path)) is None:
         return None
     numbers = plain.declared_bytes, plain.n_bytes
+    with ExitStack() as opened:
+        opened.callback(plain.close)
+        for stated in (name for name, kind in SUBTYPES.items() if kind == plain.subtype):
+            check_encoding(str(path), plain.look, stated, plain.channels)
+        opened.pop_all()
     if not plain.needed or plain.n_bytes > plain.there_bytes:
         plain.close()
     if plain.n_bytes > plain.there_bytes:
@@ -304,6 +313,8 @@ def _cut_short(path: Path, frames: int) -> InputFileError:
 
 def check_finite(path: Path, block: Float32Array, start: int) -> None:
     """Refuse NaN and infinity; `start` is the number of the block's first sample."""
+    if start == 0 and (most := float(np.abs(block).max(initial=0.0))) > _OVER_FULL_SCALE:
+        _LOG.warning("%s: samples reach %.3g, beyond the full scale of 1: divide them by theirs", path, most)
     finite = np.isfinite(block)
     if not finite.all():
         sample, channel = np.argwhere(~finite)[0]
@@ -384,15 +395,21 @@ class RawPcm(SoundStream):
 
     def check_encoding(self, data: bytes) -> None:
         """Refuse samples that obviously have another encoding; where that is not certain, say so."""
-        form = four_byte_form(data)
-        # A channel of 16 bits that is dead or hardly used looks like whole numbers of four bytes.
-        if form in (None, self.encoding) or (self.encoding == "s16" and form != "f32"):
-            return
-        if (self.encoding, form) == ("s32", "s24_32"):
-            told = "%s: samples of s32 fill 24 of 32 bits; if they are 24 bits in four bytes, name s24_32"
-            _LOG.warning(told, self.name)
-            return
-        raise InputFileError(self.name, f"expected samples of {self.encoding}, got such as those of {form}")
+        check_encoding(self.name, data, self.encoding, self.channels)
+
+
+def check_encoding(name: str, data: bytes, stated: Encoding, channels: int) -> None:
+    """Refuse samples that obviously have another encoding; where that is not certain, say so."""
+    by_bytes: str | None = four_byte_form(data)
+    padded = (stated, by_bytes) == ("s32", "s24_32")
+    # A channel of 16 bits that is dead or hardly used looks like whole numbers of four bytes.
+    unsure = by_bytes is None or padded or (stated == "s16" and by_bytes != "f32")
+    form = smooth_form(data, stated, channels) if unsure else by_bytes
+    if form not in (None, stated):
+        raise InputFileError(name, f"expected samples of {stated}, got such as those of {form}")
+    if padded:
+        told = "%s: samples of s32 fill 24 of 32 bits; if they are 24 bits in four bytes, name s24_32"
+        _LOG.warning(told, name)
 
 
 # An open recording is one whose samples come from elsewhere, such as microphones that run.
@@ -426,6 +443,8 @@ class PcmAudio(Audio):
         self.path = Path(raw.name)
         self.sample_rate_hz, self.channels, self.frames = raw.sample_rate_hz, raw.channels, 0
         data = self._read_bytes(raw.sample_rate_hz)
+        if data.startswith(_MAGIC):
+            raise InputFileError(self.path, "expected samples without a header, got a file: name it as INPUT")
         raw.check_encoding(data)
         self._first = self._block(data)
         self.silent_channels = constant_channels(self._first)

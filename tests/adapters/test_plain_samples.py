@@ -4,12 +4,14 @@ import io
 import logging
 import struct
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from worldstate.adapters.audio.plain_samples import SUBTYPES, Encoding, decoded, four_byte_form
 from worldstate.adapters.audio.sound_file import RawPcm, open_audio, open_sound
@@ -180,6 +182,72 @@ def test_a_quiet_recording_of_32_bits_is_read_and_doubted(caplog: pytest.LogCapt
     assert "name s24_32" in caplog.text
 
 
+def street_sound(frames: int, channels: int, scale: float, dead: int) -> np.ndarray:
+    """Sound with less at high frequencies, 40 dB above the noise of its channels; one may be hardly used."""
+    steps = np.random.default_rng(3).normal(0.0, 1.0, (frames, channels))
+    sound = lfilter([1.0], [1.0, -0.95], steps, axis=0)
+    sound = scale * (sound / sound.std() + 0.01 * steps)
+    if dead < channels:
+        sound[:, dead] = 1e-4 * steps[:, dead]
+    return sound.clip(-0.9, 0.9)
+
+
+FORMS: tuple[str, ...] = (*SUBTYPES, "s16, big-endian")
+
+
+@pytest.mark.parametrize("read_as", SUBTYPES)
+@pytest.mark.parametrize("encoding", FORMS)
+@given(
+    scale=st.floats(0.01, 0.3),
+    channels=st.sampled_from([1, 2, 4, 6, 7, 8, 16]),
+    dead=st.sampled_from([0, 3, 99]),
+)
+@settings(max_examples=8, deadline=None)
+def test_sound_of_one_form_is_heard_as_no_other(
+    encoding: str, read_as: Encoding, scale: float, channels: int, dead: int
+) -> None:
+    form = cast("Encoding", encoding.partition(",")[0])
+    data = stored(street_sound(12_000, channels, scale, dead if encoding == read_as else 99), form)
+    if encoding == "s16, big-endian":
+        data = np.frombuffer(data, "<i2").astype(">i2").tobytes()
+    raw = RawPcm(io.BytesIO(data), RATE_HZ, channels, read_as)
+    if encoding == read_as:
+        with open_sound(raw, strict=False):
+            return
+    if (encoding, read_as) == ("s24_32", "s32"):  # the same but for a factor, which draws a line
+        return
+    with pytest.raises(InputFileError, match="expected"):
+        open_sound(raw)
+
+
+@pytest.mark.parametrize("kind", ["WAV", "RF64", "W64"])
+def test_a_file_on_standard_input_is_no_raw_sound(tmp_path: Path, kind: str) -> None:
+    soundfile.write(tmp_path / "a", noise(), RATE_HZ, format=kind, subtype="PCM_16")
+    with pytest.raises(InputFileError, match="name it as INPUT"):
+        open_sound(RawPcm(io.BytesIO((tmp_path / "a").read_bytes()), RATE_HZ, 3, "s16"))
+
+
+@pytest.mark.parametrize("held", ["floats", "whole numbers"])
+def test_a_header_that_names_another_form_is_refused(tmp_path: Path, held: str) -> None:
+    samples = noise(9000, 3)
+    data = stored(samples, "f32" if held == "floats" else "s32")
+    path = wav_of_24_bits(tmp_path / "a.wav", data, 3)
+    kind = struct.pack("<H", 1 if held == "floats" else 3)
+    path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 1, 3), kind + struct.pack("<H", 3), 1))
+    path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 12, 24), struct.pack("<HH", 12, 32), 1))
+    with pytest.raises(InputFileError, match=r"got such as those of|finite"):
+        open_audio(path)
+
+
+@pytest.mark.parametrize(("scale", "said"), [(1.0, False), (3.0, False), (32_768.0, True), (2.0**31, True)])
+def test_floats_with_the_scale_of_whole_numbers_draw_a_line(
+    tmp_path: Path, scale: float, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    soundfile.write(tmp_path / "a.wav", noise() * scale, RATE_HZ, subtype="DOUBLE")
+    with open_audio(tmp_path / "a.wav"):
+        assert ("beyond the full scale" in caplog.text) is said
+
+
 NAMES = {
     "as a shell lists them": ([1, 10, 11, 12, 2, 3, 4, 5, 6, 7, 8, 9], True),
     "as a shell of another locale": ([10, 11, 12, 1, 2, 3, 4, 5, 6, 7, 8, 9], True),
@@ -209,7 +277,8 @@ def test_numbered_files_are_taken_by_number_or_it_is_said(
 
 
 @pytest.mark.parametrize(
-    ("name", "way"), [("a.bag", "rosbags-convert"), ("a.raw", "pcm:RATE"), ("a.au", "`sox a.au out.wav`")]
+    ("name", "way"),
+    [("a.bag", "rosbags-convert"), ("a.raw", "pcm:RATE"), ("a.au", "`sox a.au out.wav`"), ("a.mp3", "`sox")],
 )
 def test_another_form_of_sound_is_refused_with_the_way_on(tmp_path: Path, name: str, way: str) -> None:
     (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n" + bytes(1000))
