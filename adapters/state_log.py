@@ -1,5 +1,6 @@
 """Snapshots of a log in any form: JSON lines of `worldstate run --out`, MCAP, or a bag of ROS 2."""
 
+import logging
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,12 @@ from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds,
 from worldstate.ground.serialisation import MOST_CHARACTERS, decode, decode_json
 from worldstate.state import WorldState
 
+_LOG = logging.getLogger(__name__)
 # A hop: the last decision of a recording ends up to so long before it does.
 _SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
 _HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
+_PACKED = b"\x1f\x8b"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
 
@@ -82,23 +85,25 @@ def read_state_near(path: Path, stamp_ns: int, *, anywhere: bool = False) -> Wor
 
 
 def _json_lines(path: Path) -> Iterator[str]:
-    """Yield every line of the file, without its end; a first or last one that was cut is left out."""
+    """Yield every line of the file, without its end; blank ones, and those cut or damaged, are left out."""
+    left_out = 0
     with plain_file(path, "snapshots") as file:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
-            if number > 1 and len(line) < MOST_CHARACTERS and not line.endswith(b"\n") and _is_cut(line):
-                return
-            # What keeps the last bytes of a log begins within a line.
-            if number == 1 and line.endswith(b"}\n") and not line.startswith(b'{"') and _is_cut(line):
-                continue
-            try:
-                yield line.decode().rstrip("\n")
-            except UnicodeDecodeError as error:
-                raise InvalidArgumentError(f"line {number}: expected UTF-8, unpacked as by gunzip") from error
+            # What keeps the last bytes of a log begins within a line; a running one ends within one.
+            inner = number > 1 and line.endswith((b"}\n", b"}\r\n")) and line.startswith(b"{")
+            if inner or len(line) == MOST_CHARACTERS or not _is_cut(line):
+                yield line.decode("utf-8-sig").strip()
+            elif number == 1 and line.startswith(_PACKED):
+                raise InvalidArgumentError("line 1: expected UTF-8, unpacked as by gunzip")
+            else:
+                left_out += bool(line.strip())
+    if left_out:
+        _LOG.warning("%s: %d lines that are cut or damaged are left out", path, left_out)
 
 
 def _is_cut(line: bytes) -> bool:
     try:
-        decode_json(line.decode(), "")
+        decode_json(line.decode("utf-8-sig"), "")
     except (UnicodeDecodeError, InvalidArgumentError):
         return True
     return False

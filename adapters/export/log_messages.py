@@ -2,6 +2,7 @@
 
 import base64
 import json
+import logging
 import math
 import os
 import struct
@@ -306,6 +307,8 @@ class _McapMessages:
         self._writer.finish()
 
 
+_LOG = logging.getLogger(__name__)
+MCAP_MENDED = "`mcap recover IN -o OUT`"
 # Half a second of states with an image takes a hundredth of it.
 _LARGEST_RECORD = 1 << 28
 
@@ -331,9 +334,12 @@ def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
         except (
             Exception
         ) as error:  # zstandard, lz4 and struct each have errors of their own for damaged bytes
-            if not (found and isinstance(error, (cut_short, struct.error)) and _is_cut(path)):
-                said = str(error) or "it ends before its first whole chunk"
-                raise InputFileError(path, f"expected an MCAP file of snapshots ({said})") from error
+            cut = isinstance(error, (cut_short, struct.error)) and _is_cut(path)
+            if not (found and cut):
+                said = str(error) * (not cut) or "it ends before its first whole chunk"
+                problem = f"expected an MCAP file of snapshots ({said:.200})"
+                raise InputFileError(path, f"{problem}; {MCAP_MENDED} may save it") from error
+            _LOG.warning("%s: it was cut, its whole chunks are read; %s may save more", path, MCAP_MENDED)
 
 
 def _is_cut(path: Path) -> bool:

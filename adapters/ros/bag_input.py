@@ -16,7 +16,7 @@ from worldstate.adapters.audio import sound_file
 from worldstate.adapters.audio.plain_samples import LOOK_BYTES, MAX_CHANNELS, Encoding
 from worldstate.adapters.camera.detections import MAX_FRAMES, DetectionFrame, DetectionLog, frame_of
 from worldstate.adapters.datasets.ovad import AUDIO_NAME
-from worldstate.adapters.export.log_messages import MCAP_MAGIC, check_chunks
+from worldstate.adapters.export.log_messages import MCAP_MAGIC, MCAP_MENDED, check_chunks
 from worldstate.adapters.files.array_file import named_arrays
 from worldstate.adapters.files.file_io import MAX_BYTES, in_order, plain_file, read_text, refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
@@ -31,7 +31,7 @@ from .message_types import instant_of, stamp_of, typestore
 from .sample_clock import begins_again, contradiction, lost_before
 
 # What may mend a file of each storage.
-_MENDED = {".mcap": "`mcap recover IN -o OUT`", ".db3": "`sqlite3 IN .recover | sqlite3 OUT`"}
+_MENDED = {".mcap": MCAP_MENDED, ".db3": "`sqlite3 IN .recover | sqlite3 OUT`"}
 METADATA_NAME, STORAGE_SUFFIXES = "metadata.yaml", tuple(_MENDED)
 # Half a second of a thousand microphones; an image of detections is far below it.
 MAX_MESSAGE_BYTES = 64 << 20

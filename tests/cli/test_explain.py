@@ -1,6 +1,7 @@
 """`worldstate explain` on the snapshots of a short scripted approach, and where it refuses."""
 
 import json
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -161,6 +162,38 @@ def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, tmp_path, 
             assert main(["log", "replay", str(log), "--json"]) == 0
             replayed = json.loads(capsys.readouterr().out)
             assert replayed["states"] == 15 - first and replayed["advisory_onsets_s"] == [0.7]
+
+
+# What a crash, an editor or a disk leaves between the lines, and how many lines it costs.
+DAMAGE = {
+    "a byte order mark": (lambda lines: [b"\xef\xbb\xbf" + lines[0], *lines[1:]], 0),
+    "blank lines": (lambda lines: [b"\n", *lines[:3], b"\r\n", *lines[3:]], 0),
+    "ends of Windows": (lambda lines: [one[:-1] + b"\r\n" for one in lines], 0),
+    "no last end": (lambda lines: [*lines[:-1], lines[-1][:-1]], 0),
+    "a line cut": (lambda lines: [*lines[:5], lines[5][:300] + b"\n", *lines[6:]], 1),
+    "zeros in place of a line": (lambda lines: [*lines[:5], bytes(300) + b"\n", *lines[6:]], 1),
+    "zeros at the end": (lambda lines: [*lines[:-1], lines[-1][:50], bytes(4096)], 1),
+    "both ends cut": (lambda lines: [lines[0][99:], *lines[1:-1], lines[-1][:99]], 2),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_costs_the_lines_that_have_it_and_is_told_once(name, states, tmp_path, capfd, monkeypatch):
+    change, cost = DAMAGE[name]
+    lines = states.read_bytes().splitlines(keepends=True)
+    log = tmp_path / "damaged.jsonl"
+    log.write_bytes(b"".join(change(lines)))
+    monkeypatch.setattr(logging.getLogger("worldstate.adapters.state_log"), "propagate", False)
+    for command in (
+        ["explain", str(log)],
+        ["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")],
+    ):
+        assert main(command) == 0
+        told = capfd.readouterr().err.splitlines()
+        expected = f"damaged.jsonl: {cost} lines that are cut or damaged are left out"
+        assert [one.rpartition("/")[2] for one in told] == [expected] * bool(cost)
+    again = (tmp_path / "again.jsonl").read_bytes().splitlines(keepends=True)
+    assert len(again) == len(lines) - cost and set(again) <= set(lines)
 
 
 def test_a_log_in_mcap_is_explained_alike(states, tmp_path, capsys):

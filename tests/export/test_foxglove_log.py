@@ -230,7 +230,7 @@ def test_a_damaged_log_is_refused_in_one_line(logged, tmp_path, capsys):
     assert main(["log", "replay", str(tmp_path / "empty.jsonl")]) == 2
 
 
-def test_a_log_that_was_cut_anywhere_is_read_up_to_its_last_whole_chunk(logged, tmp_path):
+def test_a_log_that_was_cut_anywhere_is_read_up_to_its_last_whole_chunk(logged, tmp_path, caplog):
     """Within a chunk, a head, the index and the footer: every byte where records are small, else some."""
     path, whole = tmp_path / "cut.mcap", logged[0].read_bytes()
     written, before = logged[1].read_text().splitlines(), 0
@@ -243,6 +243,8 @@ def test_a_log_that_was_cut_anywhere_is_read_up_to_its_last_whole_chunk(logged, 
             continue
         assert lines == written[: len(lines)] and len(lines) >= before
         before = len(lines)
+        assert "it was cut" in caplog.text
+        caplog.clear()
     assert before == len(written)
 
 

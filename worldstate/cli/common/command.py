@@ -123,6 +123,15 @@ class _Printable(logging.Formatter):
         return printable(super().format(record))
 
 
+class _New(logging.Filter):
+    """Leaves out what is the same as the line before: a file that is read twice has the same faults."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Tell whether a line is another one."""
+        before, self._last = getattr(self, "_last", None), record.getMessage()
+        return self._last != before
+
+
 class _HelpAll(argparse.Action):
     """Prints the help of every option."""
 
@@ -181,6 +190,7 @@ def run_program(
     """
     if logging.lastResort is not None:  # what prints warnings where no program has set up logging
         logging.lastResort.setFormatter(_Printable())
+        logging.lastResort.filters[:] = [_New()]
     try:
         # SIGTERM is an exception, so that unfinished files are removed on the way out; exit code 143.
         with _handled((signal.SIGTERM,), _terminate):
