@@ -3,12 +3,12 @@
 import io
 import logging
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
@@ -166,6 +166,7 @@ def refused_as_bag(path: Path) -> Iterator[None]:
 
 
 _LOG = logging.getLogger(__name__)
+T = TypeVar("T")
 
 AUDIO_KINDS = types.AUDIO, types.STAMPED_PCM, types.PCM, types.AUDIO_FRAME, types.RAW_AUDIO
 # Formats by the message that names them; a compressed one has lost the phase between microphones.
@@ -314,23 +315,22 @@ def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
     if info.coding_format.lower() not in ("wave", "raw", ""):
         problem = f"{where}: expected uncompressed samples (format:=wave), got {info.coding_format!r:.20}"
         raise InputFileError(bag.path, problem)
-    return _pcm(bag, str(where), types.PCM_INFO, info.sample_format, info.sample_rate, info.channels)
+    return _described(bag, str(where), types.PCM_INFO, info)
+
+
+# Where a message states the format, the rate and the channels of its bytes; planes of floats have one format.
+_STATED = {
+    types.PCM_INFO: ("sample_format", "sample_rate", "channels"),
+    types.AUDIO_FRAME: ("format", "sampling_frequency", "channel_count"),
+    types.RAW_AUDIO: ("format", "sample_rate", "number_of_channels"),
+    types.AUDIO: ("", "sample_rate", "channels"),
+}
 
 
 def _described(bag: BagReader, topic: str, kind: str, message: Any) -> sound_file.RawPcm:
-    """Return how the bytes of a message that describes itself are to be read."""
-    if kind == types.AUDIO_FRAME:
-        return _pcm(bag, topic, kind, message.format, message.sampling_frequency, message.channel_count)
-    if kind == types.AUDIO:
-        return _pcm(bag, topic, kind, "", message.sample_rate, message.channels)
-    return _pcm(bag, topic, kind, message.format, message.sample_rate, message.number_of_channels)
-
-
-def _pcm(
-    bag: BagReader, topic: str, kind: str, sample_format: str, rate_hz: int, channels: int
-) -> sound_file.RawPcm:
-    encoding = ENCODINGS[kind].get(sample_format)
-    if encoding is None:
+    """Return how bytes are to be read by a message that states it."""
+    sample_format, rate_hz, channels = (getattr(message, name, "") for name in _STATED[kind])
+    if (encoding := ENCODINGS[kind].get(sample_format)) is None:
         problem = f"{topic}: expected one of {', '.join(ENCODINGS[kind])}, got {sample_format!r:.20}"
         raise InputFileError(bag.path, problem)
     with refused_as_file(bag.path):
@@ -534,12 +534,25 @@ def _array(bag: BagReader) -> MicrophoneArray | None:
 
 
 def _detections(bag: BagReader, topic: str, sound: BagSound) -> DetectionLog:
-    stamps, frames = [], []
-    for recorded_ns, message in _few(bag, topic):
-        # A detector that leaves the stamp out saw the image shortly before it was recorded.
-        stamps.append(sound.time_ns(stamp_of(message.header), recorded_ns))
-        frames.append(_frame(message.detections))
-    return DetectionLog.in_order(frames, stamps, f"{bag.path} {topic}")
+    stamps, frames = _timed(bag, topic, sound, lambda message: _frame(message.detections))
+    return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), f"{bag.path} {topic}")
+
+
+def _timed(
+    bag: BagReader, topic: str, sound: BagSound, read: Callable[[Any], T], most: int = MAX_FRAMES
+) -> tuple[list[int], list[T]]:
+    """Return increasing times on the clock of the sound, and what messages hold.
+
+    Stamps three in four of which came before, as of a node that states when it began, are none. A message
+    without a stamp was recorded shortly after what it tells.
+    """
+    told = [(stamp_of(one.header), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)]
+    stamped = [stamp_ns for stamp_ns, *_ in told if stamp_ns]
+    if stands := 4 * len({*stamped}) < len(stamped):  # few transports deliver a message so often
+        _LOG.warning("%s: stamps of %s stand still, times of recording count", bag.path, topic)
+    times = [sound.time_ns(0 if stands else stamp_ns, recorded_ns) for stamp_ns, recorded_ns, _ in told]
+    order = in_order(times, f"{bag.path} {topic}")
+    return [times[i] for i in order], [told[i][2] for i in order]
 
 
 def _frame(found: Any) -> DetectionFrame:
@@ -568,15 +581,12 @@ def _best(results: Any) -> tuple[str, float]:
 
 
 def _ego(bag: BagReader, topic: str, sound: BagSound) -> OdometryLog:
-    told = [
-        (sound.time_ns(stamp_of(said.header), recorded_ns), said.twist.twist)
-        for recorded_ns, said in _few(bag, topic, 100 * MAX_FRAMES)
-    ]
-    places = in_order([stamp_ns for stamp_ns, _ in told], f"{bag.path} {topic}")
     # Not its pose: the frame of odometry is not the map in which the corners of a context stand.
-    return OdometryLog(
-        tuple(Odometry(topic, told[i][0], told[i][1].linear.x, told[i][1].angular.z) for i in places)
-    )
+    def moved(message: Any) -> tuple[float, float]:
+        return message.twist.twist.linear.x, message.twist.twist.angular.z
+
+    times, told = _timed(bag, topic, sound, moved, 100 * MAX_FRAMES)
+    return OdometryLog(tuple(Odometry(topic, ns, *one) for ns, one in zip(times, told, strict=True)))
 
 
 def _few(bag: BagReader, topic: str, most: int = MAX_FRAMES) -> Iterator[tuple[int, Any]]:

@@ -594,6 +594,41 @@ def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
         assert said in " ".join(capsys.readouterr().err.split()), (name, options)
 
 
+# Tenths of a second at which detections and odometry are stamped, None for not at all; all are recorded.
+STAMPED = {
+    "as they were": lambda k: k,
+    "not at all": lambda k: None,
+    "some not": lambda k: None if k % 3 == 1 else k,
+    "out of order": lambda k: k ^ 1,
+    "all alike": lambda k: 0,
+    "ten alike": lambda k: k // 10 * 10,
+    "delivered twice": lambda k: k // 2 * 2,
+}
+
+
+@pytest.mark.parametrize("name", STAMPED)
+def test_stamps_of_boxes_and_odometry_cost_nothing_that_was_sent(name, tmp_path, caplog):
+    begun_ns, tenth_ns = 3_000_000_000, 100_000_000
+    with bag_writer(tmp_path / "bag") as write:
+        for k in range(40):
+            recorded_ns, tenth = begun_ns + k * tenth_ns, STAMPED[name](k)
+            stamp_ns = 0 if tenth is None else begun_ns + tenth * tenth_ns
+            write("/mics", AUDIO, recorded_ns, block(sound_of(800), recorded_ns))
+            found = [box(10.0 + k, 20, 30, 40, "car", 0.8)]
+            write("/boxes", DETECTIONS, recorded_ns, {"header": header(stamp_ns), "detections": found})
+            twist = {"twist": {"linear": {"x": 0.1 * k}}}
+            write("/odom", ODOMETRY, recorded_ns, {"header": header(stamp_ns), "twist": twist})
+    held = read_bag(tmp_path / "bag")
+    kept = range(1, 40, 2) if name == "delivered twice" else range(40)
+    order = [k ^ 1 for k in kept] if name == "out of order" else [*kept]
+    assert [round(frame.boxes_px[0, 0]) - 10 for frame in held.detections.frames] == order
+    assert [round(10 * one.speed_mps) for one in held.ego.told] == order
+    times = [round((ns - begun_ns) / tenth_ns) for ns in held.detections.stamps_ns.tolist()]
+    assert times == [one.stamp_ns // tenth_ns - 30 for one in held.ego.told]
+    assert times == [k - (name == "delivered twice") for k in kept]
+    assert ("stand still" in caplog.text) is (name in ("all alike", "ten alike"))
+
+
 def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
     folder = tmp_path / "DA1" / "left" / "1_00_0001"
     folder.mkdir(parents=True)
