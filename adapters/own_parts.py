@@ -7,14 +7,8 @@ A package names them in its pyproject.toml, and the command line names one of th
 | `worldstate.detectors` | `DetectorPart` | ``--detector NAME`` |
 | `worldstate.exporters` | `ExporterPart` | ``--export NAME=TARGET`` |
 | `worldstate.measurements` | `MeasurementsPart` | ``--measurements NAME=FILE`` |
-
-A part has a minute for each call: one that hangs ends the command as one that fails. Code below Python that
-does not come back then either ends the process, with exit code 1 and where it hangs.
 """
 
-import faulthandler
-import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
@@ -31,11 +25,6 @@ from worldstate.state import WorldState
 
 # Exit codes above it are those of signals.
 SIGNALLED = 128
-# A model of a detector may load for tens of seconds; what takes longer than a minute does not come back.
-LONGEST_S = 60.0
-# What Python raises then reaches no code below it: so long after, the process ends.
-BELOW_PYTHON_S = 10.0
-_STDERR = 2  # Where it hangs is written without Python: to the descriptor, whatever `sys.stderr` is by then
 Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
 # What other modalities say, each time it is asked for anew.
 OtherModality: TypeAlias = Callable[[], Iterable[Timed]]
@@ -98,10 +87,9 @@ def load_part(group: Group, name: str, option: str, built_in: Iterable[str] = ()
 
 @contextmanager
 def of_part(name: str) -> Iterator[None]:
-    """Turn whatever a part raises inside into an error with its name, `SystemExit` too, and that it hangs."""
+    """Turn whatever a part raises inside into an error with its name, `SystemExit` too."""
     try:
-        with _limited():
-            yield
+        yield
     except (WorldstateError, KeyboardInterrupt, GeneratorExit):
         raise
     except BaseException as error:
@@ -109,28 +97,6 @@ def of_part(name: str) -> Iterator[None]:
         if isinstance(error, SystemExit) and isinstance(error.code, int) and error.code > SIGNALLED:
             raise
         raise OwnPartError(name, error) from error
-
-
-@contextmanager
-def _limited() -> Iterator[None]:
-    """Raise TimeoutError after `LONGEST_S`: in the main thread, and where nothing else waits for an alarm."""
-    here = threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGALRM")
-    if not here or signal.getsignal(signal.SIGALRM) is not signal.SIG_DFL:
-        yield
-        return
-
-    def end(number: int, frame: object) -> None:
-        raise TimeoutError(f"no answer after {LONGEST_S:g} s")
-
-    signal.signal(signal.SIGALRM, end)
-    signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
-    faulthandler.dump_traceback_later(LONGEST_S + BELOW_PYTHON_S, exit=True, file=_STDERR)
-    try:
-        yield
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
 
 @dataclass(frozen=True, slots=True)
