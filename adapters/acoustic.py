@@ -203,25 +203,6 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         rate, settings = self.front_end.sample_rate_hz, self.front_end.settings
         self.front_end = SpectrumFrontEnd(spectra, rate, settings, start_ns=start_ns)
 
-    def set_no_source_probability(self, none_probability: float) -> None:
-        """Say how likely it is, after the last measurement, that no source is there.
-
-        Where the front-end's settings have `ego_noise`, what is heard while nothing is there is learned as
-        the own vehicle's noise; see `FrontEnd.learn_ego_noise`. Without, nothing happens.
-
-        Parameters
-        ----------
-        none_probability : float
-            The third of `WorldFilter.belief.hypotheses`, in [0, 1].
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is out of range.
-        """
-        if isinstance(self.front_end, FrontEnd) and self.front_end.settings.ego_noise:
-            self.front_end.learn_ego_noise(none_probability)
-
     def interpret(self, frame: AcousticFrame) -> Measurement:
         """Turn what was heard at one hop into a measurement, the camera's answer included.
 

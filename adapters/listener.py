@@ -380,7 +380,6 @@ class Listener:
             for other in self._waiting.until(measurement.stamp_ns):
                 self.world = self.world.update(other)
             self.world = self.world.predict_to(measurement.stamp_ns).update(measurement)
-            self._adapter.set_no_source_probability(self.world.belief.hypotheses[2])
             if isinstance(reader, SequenceReader):
                 learn_passes(reader.street, self.world.state)
             yield Step(frame, measurement, self._learned())
@@ -401,7 +400,7 @@ class Listener:
 
     def _parts(self, block: Float32Array) -> Iterator[Float32Array]:
         """Cut a block so that no two hops end in one part."""
-        # What is believed after a hop weighs what is learned of ego-noise in the next.
+        # What waits for its sound is taken before the hops after it.
         return (block[start : start + self._part] for start in range(0, len(block), self._part))
 
 
@@ -484,8 +483,6 @@ def listen_steps(source: Source) -> Iterator[Step]:
 
 def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]:
     """Yield every hop of `source` as it was heard and measured, nothing filtered: what calibration needs.
-
-    Ego-noise is not learned, which takes a belief that nothing is there.
 
     Parameters
     ----------

@@ -66,9 +66,6 @@ class ListenSettings:
         Time constant of that, seconds; see `SiteEstimateSettings`.
     grounding : Grounding, optional
         Weighs the model's scores with bearing, approach and engine line, eq. (5); off where not given.
-    ego_noise : bool
-        Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
-        spatial spectrum, bearing and prominence; the signature hears the sound as it is.
     boxes : DetectionFilter
         Which of the camera's boxes count: classes, score, height.
     uncalibrated : bool
@@ -93,7 +90,6 @@ class ListenSettings:
     site_adaptation: bool = True
     forgetting_s: float | None = None
     grounding: Grounding | None = None
-    ego_noise: bool = False
     boxes: DetectionFilter = field(default_factory=DetectionFilter)
     uncalibrated: bool = False
 
@@ -110,7 +106,6 @@ class ListenSettings:
             sample_rate_hz,
             azimuth_span_deg=(-half_deg, half_deg),
             srp_band_hz=self.band_hz or default_band_hz(array, sample_rate_hz),
-            ego_noise=self.ego_noise,
         )
 
     def site(self) -> SiteEstimateSettings | None:

@@ -11,17 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.direction.bearing import steered_power
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum_of
-from worldstate.frontend.ego_noise.ego_noise import EgoNoise, ElevationSplit
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.health.common_sound import NOTHING_IN_COMMON, CommonSound
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
 from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError
-from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array
+from worldstate.ground.typing import Complex128Array, Float32Array
 
 from .settings import ELEVATIONS_RAD, HIGHEST_SHARE, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 
@@ -132,10 +131,6 @@ class HopSpectra:
         heard_hz = bin_frequencies_hz(self.feature_bins, sample_rate_hz, nfft)
         self.monitor = ChannelMonitor(array, heard_hz) if settings.watch_channels else None
         self._common = CommonSound(array, heard_hz) if settings.watch_channels else None
-        self.ego_noise: EgoNoise | None = None
-        if settings.ego_noise:
-            split = ElevationSplit.of(array, frequencies)
-            self.ego_noise = EgoNoise(2.0 * sample_rate_hz / nfft, array.n_microphones, self.beams, split)
 
     def push(self, samples: Float32Array, recorded: Float32Array) -> HopSums:
         """Return the sums over the frames that these samples (n, M) complete, lost ones left out."""
@@ -154,7 +149,8 @@ class HopSpectra:
             health = self.monitor.push(recorded, energies, powers, matrices)
         common = self._common.push(matrices, len(spectra), health.mask.keep) if self._common else None
         health.mask.silence(whitened)
-        srp = self._steered(spectra, whitened, health.mask)
+        inside = whitened[:, self._srp]
+        srp = np.concatenate([steered_power(inside, row) for row in self.beams]) * health.mask.power_scale
         pairs = pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
         pairs = pairs * health.mask.pair_scale
         mean_square = energies.sum(axis=0) / max(len(energies), 1)
@@ -174,17 +170,6 @@ class HopSpectra:
         """Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`."""
         total = powers[:, self._looming].sum(axis=1, dtype=np.float64)
         return np.asarray(total * (2.0 / (0.375 * self._nfft**2)))
-
-    def _steered(self, spectra: Complex64Array, whitened: Complex64Array, mask: ChannelMask) -> FloatArray:
-        """Return the steered power of one hop, scaled to all microphones."""
-        inside, beams = whitened[:, self._srp], self.beams
-        heard = self.ego_noise if len(spectra) else None
-        if heard is not None:
-            mask.silence(spectra)
-            inside, beams = heard.process(spectra[:, self._srp])
-            mask.silence(inside)
-        power = np.concatenate([steered_power(inside, row) for row in beams]) * mask.power_scale
-        return power if heard is None else heard.levelled(power, len(spectra))
 
     def _centre(self, heard: BoolArray) -> float:
         """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""

@@ -41,8 +41,6 @@ class FrontEndSettings:
         Band in which an engine line is searched, Hz, for example (20, 400); None switches it off.
     srp_band_hz, level_band_hz : (float, float)
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
-    ego_noise : bool
-        Whiten the noise of the own vehicle before steering: see `FrontEnd.learn_ego_noise`.
     watch_channels : bool
         Detect faulty microphones, lost samples and masking noise, and leave them out.
     character : bool
@@ -68,7 +66,6 @@ class FrontEndSettings:
     tone_band_hz: Band | None = None
     srp_band_hz: Band = BAND_HZ
     level_band_hz: Band = (50.0, 8000.0)
-    ego_noise: bool = False
     watch_channels: bool = True
     character: bool = False
     feature_order: tuple[int, ...] | None = None

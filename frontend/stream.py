@@ -302,33 +302,6 @@ class FrontEnd:
         in_range("lost_ns", lost_ns, 0, 10**18)
         self._start_ns += lost_ns
 
-    def learn_ego_noise(self, none_probability: float) -> None:
-        """Set the probability that no source is present, with which the sound is learned as ego-noise.
-
-        The noise covariance forgets with that weight w: ``R <- (a^w W R + w sum x x^H) / (a^w W + w T)``. The
-        weight holds for all hops from now on; before the first call nothing is learned. A caller with a
-        filter passes its posterior of "none" after every update; on a calibration drive one passes 1, then 0.
-
-        Parameters
-        ----------
-        none_probability : float
-            In [0, 1]. Below one half nothing is learned.
-
-        Raises
-        ------
-        InvalidArgumentError
-            Out of range, or `settings.ego_noise` is off.
-
-        Examples
-        --------
-        >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
-        >>> front_end = FrontEnd(array, 8000, FrontEndSettings(ego_noise=True))
-        >>> front_end.learn_ego_noise(1.0)
-        """
-        if self._spectra.ego_noise is None:
-            raise InvalidArgumentError("settings.ego_noise: expected True, got False")
-        self._spectra.ego_noise.weight = in_range("none_probability", none_probability, 0.0, 1.0)
-
     def _checked(self, block: ArrayLike) -> Float32Array:
         try:
             with np.errstate(over="ignore"):

@@ -68,26 +68,17 @@ def whole(folder: Path) -> list[Step]:
     return list(steps(folder))
 
 
-DRIVEN = ListenSettings(ego_noise=True)
-
-
-@pytest.fixture(scope="module")
-def driven(folder: Path) -> list[str]:
-    """States with ego-noise that is learned by what is believed."""
-    return [step.state.to_json() for step in steps(folder, settings=DRIVEN)]
-
-
 @pytest.mark.long
 @settings(max_examples=20)
 @given(cuts=st.lists(st.integers(0, 3 * RATE_HZ), max_size=20))
 def test_states_are_the_same_to_the_bit_for_blocks_of_any_length(
-    folder: Path, driven: list[str], cuts: list[int]
+    folder: Path, whole: list[Step], cuts: list[int]
 ) -> None:
     sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
-    source = open_source(folder / "sound.wav", model=folder / "model.json", settings=DRIVEN)
+    source = open_source(folder / "sound.wav", model=folder / "model.json")
     listener = Listener(source, RATE_HZ)
     states = [state for block in np.split(sound, sorted(cuts)) for state in listener.push(block)]
-    assert [state.to_json() for state in states] == driven
+    assert [state.to_json() for state in states] == [step.state.to_json() for step in whole]
 
 
 def test_what_is_told_counts_from_its_stamp_on_and_a_checkpoint_is_gone_on_from(folder: Path) -> None:

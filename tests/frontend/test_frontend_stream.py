@@ -239,9 +239,8 @@ def resident_bytes() -> int:
 @pytest.mark.slow
 def test_memory_does_not_grow() -> None:
     """Everything is on: nothing is kept of 1500 hops, and what is kept does not get larger."""
-    chosen = replace(EVERYTHING, nfft=256, ego_noise=True)
+    chosen = replace(EVERYTHING, nfft=256)
     front_end, sound = FrontEnd(SQUARE, 4_000, chosen), noise_from(SQUARE, 0.5, 4_000, 20.0)
-    front_end.learn_ego_noise(1.0)
     hear(front_end, sound, 770)
     blocks = sys.getallocatedblocks()
     hear(front_end, sound, 770, rounds=2)
@@ -347,7 +346,7 @@ def test_lost_sound_comes_back_as_if_nothing_was_lost(kind: str) -> None:
 
 def test_where_a_whole_window_is_lost_nothing_is_heard_and_the_channels_are_not_to_blame() -> None:
     rate, sound = 16_000, noise_from(SQUARE, 0.5, 16_000, 4.0)
-    frames = FrontEnd(SQUARE, rate, replace(EVERYTHING, ego_noise=True)).process(lose(sound, 20_000, 20_000))
+    frames = FrontEnd(SQUARE, rate, EVERYTHING).process(lose(sound, 20_000, 20_000))
     gone = [frame for frame in frames if frame.lost == 1.0]
     assert len(gone) == 3
     assert all(not frame.feature.any() and frame.prominence == 1.0 for frame in gone)

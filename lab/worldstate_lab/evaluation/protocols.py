@@ -194,7 +194,6 @@ METHODS: tuple[Method, ...] = (
     ShippedChain("shipped model", "shipped"),
     ShippedChain("+ site adaptation", "adapted"),
     ShippedChain("world-state advisory", "filtered"),
-    ShippedChain("+ ego-noise cancellation", "ego_noise"),
 )
 # Ablation of the approach rate in the grounded likelihood, eq. (5), and looming as a weight beside it.
 GROUNDED: tuple[Method, ...] = (

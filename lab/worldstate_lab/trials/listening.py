@@ -51,11 +51,10 @@ from .trial import (
 
 # Changes whenever a pass over the same recording would give other numbers.
 VERSION = 6
-# How the library listens: at its first guess of the site, learning the site, and hearing past the own engine.
+# How the library listens: at its first guess of the site, and learning the site.
 CHAINS = {
     "plain": ListenSettings(site_adaptation=False),
     "adapted": ListenSettings(),
-    "ego_noise": ListenSettings(ego_noise=True),
 }
 # The grounded likelihood without its approach rate, for the ablation that drops it.
 RATELESS = Grounding(settings=GroundedSettings(without=frozenset({"radial_speed_m_s", "inverse_tta_hz"})))

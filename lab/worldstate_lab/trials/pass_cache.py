@@ -204,7 +204,7 @@ ALPHA = 0.02
 # minutes of the same stream, and an alarm that lasts over a cut counts once more.
 PIECE_S = 60.0
 # What a model says of a recording that it was made for: decisions of whole chains, and scores by hop.
-CHAIN_NAMES = ("shipped", "adapted", "filtered", "ego_noise")
+CHAIN_NAMES = ("shipped", "adapted", "filtered")
 SCORES = ("shipped", "grounded", "rateless")
 
 
@@ -228,16 +228,14 @@ class Hearer:
         hops = heard["hops"].replace(about={**heard["hops"].about, "fingerprint": mark})
         refused = model_refusal(take, model)
         if refused is not None:
-            unasked = (*(CHAIN_NAMES if take.moving else CHAIN_NAMES[:-1]), *SCORES)
+            unasked = (*CHAIN_NAMES, *SCORES)
             told = {**hops.about, "refused": dict.fromkeys(unasked, refused)}
             return Trial(hops.replace(about=told), heard["boxes"], heard["truth"])
         # What the chains say depends on the model, too, which the shipped one may change with a release.
         signed = [*about, origin_of(encode(model))]
-        # A standing vehicle's own noise is not what the cancellation was made for.
-        wanted = ("plain", "adapted", "ego_noise") if take.moving else ("plain", "adapted")
         said = {
             chain: cache.tables(chain, signed, partial(chain_tables, take, chain, self.model))
-            for chain in wanted
+            for chain in ("plain", "adapted")
         }
         policy = model.policies.for_alpha(ALPHA)
         chains = {
@@ -245,8 +243,6 @@ class Hearer:
             "adapted": unfiltered_decisions(said["adapted"], policy),
             "filtered": filtered_decisions(said["adapted"]),
         }
-        if take.moving:
-            chains["ego_noise"] = filtered_decisions(said["ego_noise"])
         stream = said["plain"]["stream"]
         prior = list(model.signature.reference_prior)
         hops = hops.replace(

@@ -41,7 +41,6 @@ _PAIRS = (
     ("shipped model", PROPOSED),
     ("+ site adaptation", "shipped model"),
     ("world-state advisory", "+ site adaptation"),
-    ("+ ego-noise cancellation", "world-state advisory"),
 )
 _COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all", "ece", "gospa_deg")
 

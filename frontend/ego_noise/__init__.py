@@ -1,1 +1,0 @@
-"""Noise of the own vehicle: learned, whitened, cancelled."""
