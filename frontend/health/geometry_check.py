@@ -1,12 +1,11 @@
 """Positions, polarity, delays and clocks of the channels, once a second, by the waves that all hear.
 
-Plane waves from all round say which directions a stream holds, and which order of channels they fit.
+Plane waves from all round say which directions a stream holds, and which order of many channels they fit.
 """
 
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -71,15 +70,6 @@ def direction_weights(agreement: Complex64Array) -> Float32Array:
     return np.asarray(power / max(float(power.sum()), np.finfo(np.float32).tiny))
 
 
-def log_sharpness(agreement: Complex64Array) -> float:
-    r"""Return how much the sound is concentrated in few directions, nats.
-
-    .. math:: \ln \sum_d \max\Big(\frac12 \sum_{km} \mathrm{Re}\, g_{kmd},\; 0\Big)^2
-    """
-    power = 0.5 * np.maximum(agreement.real.sum(axis=(0, 1)), 0.0)
-    return float(np.log(max(float(np.square(power).sum(dtype=np.float64)), SILENCE)))
-
-
 def _directions() -> FloatArray:
     """Azimuths and elevations about one step apart, (2, D), mirrored about the x and y axes alike."""
     rows = []
@@ -91,19 +81,13 @@ def _directions() -> FloatArray:
     return np.concatenate(rows, axis=1)
 
 
-# Up to here every exchange of two channels is tried; a larger array predicts each position well enough from
-# its neighbours (`PositionFit`), which microphones half a metre apart do not, and proposes a few.
+# Of fewer channels exchanges are not judged here: each microphone is predicted too poorly by its neighbours,
+# and `position_check` tries every exchange in a recording.
 MAX_CHANNELS = 16
-# Memory in seconds, and the fewest that count where all are tried: a street with one loud side needs several.
-_ORDER_MEMORY_S, _MIN_S = 20, 5
-# Mean gain in nats of a small and of a large array. Simulated streets: 8 microphones in order below 0.04 in
-# 10 s, with two of them exchanged .96 above 0.1; 56 in order below 0.027, though scattering at the roof
-# makes a neighbour's position fit better, and 0.056 and more with two exchanged 8 cm or more apart.
-_GAIN, _GAIN_OF_MANY = 0.1, 0.04
-# An exchange in a small array must gain this share of what taking out the delays of all channels gains.
-# Simulated streets, 8 microphones: of two exchanged mostly 0.84 and more, of a late card on a moving ego 0.55
-# at most. In a large one the position fit has compared them before.
-_SHARE_OF_DELAYS = 0.6
+_ORDER_MEMORY_S = 20
+# Mean gain, nats. Simulated streets: 56 microphones in order below 0.027, though scattering at the roof makes
+# a neighbour's position fit better, and 0.056 and more with two exchanged 8 cm or more apart.
+_GAIN_OF_MANY = 0.04
 
 Pair = tuple[int, int]
 
@@ -111,40 +95,31 @@ Pair = tuple[int, int]
 class OrderCheck:
     """Compare the order of the channels with those in which two of them are exchanged, second by second."""
 
-    def __init__(self, waves: PlaneWaves) -> None:
-        self._waves = waves
-        n = waves.beams.shape[1]
-        self._all: tuple[Pair, ...] = tuple(combinations(range(n), 2)) if n <= MAX_CHANNELS else ()
-        self._gains: dict[Pair, deque[tuple[float, float]]] = {}
+    def __init__(self, beams: Complex64Array) -> None:
+        self._beams = beams
+        self._gains: dict[Pair, deque[float]] = {}
 
-    def push(
-        self, coherence: Complex64Array, proposed: Iterable[ChannelFault], log_sharpness_undelayed: float
-    ) -> None:
+    def push(self, coherence: Complex64Array, proposed: Iterable[ChannelFault]) -> None:
         r"""Take the coherence (K, M, M) of one second, its diagonal zero, and the exchanges to be tried.
 
         .. math:: G_{ab} = \ln \frac{\sum_d \max(P_d^{(ab)}, 0)^2}{\sum_d \max(P_d, 0)^2}
         """
         exchanges = ((one.channel, one.looks_like) for one in proposed if one.looks_like is not None)
-        pairs = self._all or tuple({(min(pair), max(pair)) for pair in exchanges})
-        usual = log_sharpness(self._waves.agreement(coherence))
-        gains = sharpness_gains(coherence, self._waves.beams, np.array(pairs, int).reshape(-1, 2))
-        rival = log_sharpness_undelayed - usual
+        pairs = tuple({(min(pair), max(pair)) for pair in exchanges})
+        gains = sharpness_gains(coherence, self._beams, np.array(pairs, int)) if pairs else np.zeros(0)
         # An exchange that is no longer proposed is forgotten.
         before, self._gains = self._gains, {}
         for pair, gain in zip(pairs, gains.tolist(), strict=True):
             self._gains[pair] = before.get(pair, deque(maxlen=_ORDER_MEMORY_S))
-            self._gains[pair].append((gain, rival))
+            self._gains[pair].append(gain)
 
     def faults(self) -> list[ChannelFault]:
-        """Return the channels whose exchange makes the waves sharper, of a small array the sharpest pair."""
-        least_s, least, share = (_MIN_S, _GAIN, _SHARE_OF_DELAYS) if self._all else (1, _GAIN_OF_MANY, 0.0)
-        means = {pair: np.mean(one, axis=0) for pair, one in self._gains.items() if len(one) >= least_s}
-        found = sorted(
-            (float(gain), pair) for pair, (gain, rival) in means.items() if gain > max(least, share * rival)
-        )
+        """Return the channels whose exchange makes the waves sharper."""
+        means = sorted((float(np.mean(gains)), pair) for pair, gains in self._gains.items())
         return [
             ChannelFault(one, Fault.SWAPPED, gain, looks_like=other)
-            for gain, (a, b) in (found[-1:] if self._all else found)
+            for gain, (a, b) in means
+            if gain > _GAIN_OF_MANY
             for one, other in ((a, b), (b, a))
         ]
 
@@ -259,7 +234,7 @@ _DRIFT, _DRIFT_LENGTH, _DRIFT_SPAN_S = 2e-5, 2e-5, 20.0
 # Streams of 8 microphones: 11 where a siren passes a healthy array, 17 and more within 30 s at 50 millionths.
 _SIGMAS = 12.0
 # Small arrays are compared in several rounds a second; the beams of large ones hardly change by one card.
-_ROUNDS, _FEW_CHANNELS = 3, 16
+_ROUNDS = 3
 
 
 class DelayCheck:
@@ -286,11 +261,10 @@ class DelayCheck:
         self._omega = 2.0 * np.pi * frequencies_hz
         self._search = np.exp(1j * self._omega[:, None] * _SEARCH_S)
         self._delays = np.zeros(n)
-        self.log_sharpness = 0.0  # In the last second, of the channels without their delays
         self._runs = runs(n)
         # A clock drives two channels at least; one alone that moves is one that stands elsewhere.
         self._cards = self._runs[self._runs.sum(axis=1) > 1.0]
-        self._rounds = _ROUNDS if n <= _FEW_CHANNELS else 1
+        self._rounds = _ROUNDS if n <= MAX_CHANNELS else 1
         self._values: deque[FloatArray] = deque(maxlen=_MEMORY_S)
         self._far: deque[bool] = deque(maxlen=_MEMORY_S)
 
@@ -306,10 +280,9 @@ class DelayCheck:
             moved, good = self._peaks(agreement @ weights, active)
             found = untilted(self._positions, good) @ (self._delays + moved)
             self._delays = np.where(good, found, self._delays)
-        self.log_sharpness = log_sharpness(agreement)
         self._values.append(np.where(good, self._delays, np.nan))
         near = float(weights @ (np.abs(self._waves.elevations_rad) > _STEEP)) > _NEAR
-        self._far.append(not near or len(good) > _FEW_CHANNELS)
+        self._far.append(not near or len(good) > MAX_CHANNELS)
 
     @property
     def incoherent(self) -> BoolArray:
@@ -562,7 +535,7 @@ class GeometryCheck:
         chosen = frequencies_hz[self._bins]
         waves = PlaneWaves(array.centred_m, chosen, _directions())
         self._fit = PositionFit(array, frequencies_hz)
-        self._order, self._delay = OrderCheck(waves), DelayCheck(array, waves, chosen)
+        self._order, self._delay = OrderCheck(waves.beams), DelayCheck(array, waves, chosen)
         self._sum = np.zeros((len(chosen), n, n), np.complex64)
         self._hops, self._n_frames = 0, 0
         self._late: list[ChannelFault] = []
@@ -597,8 +570,8 @@ class GeometryCheck:
         if float(np.abs(coherence).max(initial=0.0)) < _TINY:
             return
         self._delay.push(coherence, active)
-        proposed = [one for one in self._fit.faults if one.fault is Fault.SWAPPED]
-        self._order.push(coherence, proposed, self._delay.log_sharpness)
+        many = len(active) > MAX_CHANNELS
+        self._order.push(coherence, [one for one in self._fit.faults if many and one.fault is Fault.SWAPPED])
         confirmed, self._late = repeated(self._delay.faults(), self._late)
         # Exchanged channels are late, too.
         self._by_waves = self._order.faults() or confirmed
