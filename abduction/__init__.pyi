@@ -2,7 +2,6 @@ from .co_evidence import Absent as Absent
 from .co_evidence import MissRateTable as MissRateTable
 from .co_evidence import Present as Present
 from .co_evidence import Unqueried as Unqueried
-from .cueing.cueing_policy import AdaptiveBudget as AdaptiveBudget
 from .cueing.cueing_policy import CueingPolicies as CueingPolicies
 from .cueing.cueing_policy import CueingPolicy as CueingPolicy
 from .cueing.risk_map import ReliabilityCurve as ReliabilityCurve

@@ -3,150 +3,15 @@
 The threshold of a policy is set in `thresholds`, its map to risk in `risk_map`.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, in_range
-from worldstate.ground.serialisation import Check
-from worldstate.ground.values import SECONDS_PER_HOUR
 
 from .risk_map import PlattMap, RiskMap
-
-# Odds of half a billion to one: beyond them a shift of the threshold means nothing.
-_EXTREME_LOGIT = 20.0
-# eta, the shift that one false alarm brings, and the bounds of the shift; downward it keeps quiet nights from
-# making every rustle an alarm.
-STEP_NATS, MOST_UP_NATS, MOST_DOWN_NATS = 0.25, 2.0, 1.0
-# Filtered P(none) from which on the street is believed empty, and P(visible) from which on something has
-# come: the alarm was right.
-_EMPTY, _CAME = 0.5, 0.5
-# An alarm this old without anything having come counts as false, and again after as long.
-_LONGEST_ALARM_S = 15.0
-
-
-@dataclass(frozen=True, slots=True)
-class AdaptiveBudget:
-    r"""Target false-alarm rate and the range within which the threshold may move.
-
-    The calibrated threshold is shifted in log-odds, :math:`\mathrm{logit}\,\gamma_t = \mathrm{logit}\,\gamma
-    + x_t`, with
-
-    .. math:: x \leftarrow \min(\max(x + \eta\,(N - \lambda\, \Delta t), -x_{down}), x_{up}),
-
-    N false alarms and :math:`\Delta t` hours of street believed empty. Whatever the sounds are, the false
-    alarms counted in T such hours are at most
-
-    .. math:: \lambda T + (x_{down} + x_{up}) / \eta + 1,
-
-    as long as the shift stays below its upper bound. That bound is there so that the threshold can never go
-    deaf: the shift is at most `MOST_UP_NATS`, and the threshold never above `highest` unless it was
-    calibrated there. A hazard whose odds are e^{x_up} times those at the calibrated threshold, or whose
-    statistic is at `highest`, is announced however many alarms went before; the budget gives way first.
-
-    Parameters
-    ----------
-    rate_per_hour : float
-        lambda, false alarms per hour of empty street, > 0.
-    highest : float
-        Largest threshold that a shift may lead to, in (0, 1): one that most approaches reach.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
-    Examples
-    --------
-    >>> AdaptiveBudget(rate_per_hour=20.0).highest
-    0.99
-    """
-
-    rate_per_hour: float
-    highest: float = 0.99
-
-    def __post_init__(self) -> None:
-        in_range("rate_per_hour", self.rate_per_hour, 0.0, 1e5, open_low=True)
-        in_range("highest", self.highest, 0.0, 1.0, open_low=True, open_high=True)
-
-    def gamma(self, calibrated: float, shift_nats: float) -> float:
-        r"""Return the threshold at a shift; never above `highest` unless it was calibrated there.
-
-        .. math:: \mathrm{logit}\, \gamma_t = \mathrm{logit}\, \gamma + x_t, \qquad
-                  \gamma_t \le \max(\gamma, highest)
-
-        Parameters
-        ----------
-        calibrated : float
-            Threshold of the policy.
-        shift_nats : float
-            How far it has moved, on the log-odds of the statistic.
-
-        References
-        ----------
-        Derived here: on log-odds a shift means the same evidence wherever the threshold stands.
-
-        Examples
-        --------
-        >>> budget = AdaptiveBudget(20.0)
-        >>> [round(budget.gamma(0.9, shift), 3) for shift in (-1.0, 0.0, 1.0, 2.0)]
-        [0.768, 0.9, 0.961, 0.985]
-        """
-        if shift_nats == 0.0 or not 0.0 < calibrated < 1.0:
-            return calibrated
-        logit = math.log(calibrated / (1.0 - calibrated)) + shift_nats
-        shifted = 1.0 / (1.0 + math.exp(-max(min(logit, 2 * _EXTREME_LOGIT), -2 * _EXTREME_LOGIT)))
-        return min(shifted, max(calibrated, self.highest))
-
-
-@dataclass(frozen=True, slots=True)
-class AdaptiveThreshold:
-    """State of the adaptive threshold."""
-
-    # x_t
-    shift_nats: Annotated[float, Check("at most 100 nats", lambda x: abs(x) <= 100.0)] = 0.0
-    # Age of an alarm of which it is not known yet whether anything comes; None where there is none.
-    pending_s: Annotated[float, Check("an age", lambda age: 0.0 <= age <= 1e9)] | None = None
-    alarm: bool = False  # Whether the rule was in alarm at the last hop
-
-    def advance(
-        self, budget: AdaptiveBudget, *, visible: float, none: float, alarm: bool, elapsed_s: float
-    ) -> "AdaptiveThreshold":
-        r"""Return the state after one more hop.
-
-        .. math:: x \leftarrow \min(\max(x + \eta\, (N - \lambda\, \Delta t), -x_{down}), x_{up})
-
-        with N one where an alarm has turned out false in this hop, and the time counted while the street is
-        empty.
-
-        References
-        ----------
-        I. Gibbs and E. Candès, "Adaptive conformal inference under distribution shift", 2021 (updates of this
-        kind).
-        """
-        onset = alarm and not self.alarm
-        pending_s = 0.0 if onset and self.pending_s is None else self.pending_s
-        empty = not alarm and none >= _EMPTY
-        # False alarms less those that the budget allows; None where an alarm was right or is not judged yet.
-        events: float | None = None
-        if pending_s is None:
-            events = -budget.rate_per_hour * (elapsed_s / SECONDS_PER_HOUR if empty else 0.0)
-        elif visible >= _CAME:
-            pending_s = None
-        elif empty:
-            events, pending_s = 1.0, None
-        elif pending_s + elapsed_s >= _LONGEST_ALARM_S:
-            events, pending_s = 1.0, 0.0
-        else:
-            pending_s += elapsed_s
-        shift = self.shift_nats
-        if events is not None:
-            shift = min(max(shift + STEP_NATS * events, -MOST_DOWN_NATS), MOST_UP_NATS)
-        return AdaptiveThreshold(shift, pending_s, alarm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,8 +34,6 @@ class CueingPolicy:
         The beta at which the statistic was formed on the calibration data: 0 with the visible explanation
         removed, 1 for the published statistic. The statistic falls as beta rises, so a gamma set at 0 keeps
         its budget at every beta.
-    adaptive : AdaptiveBudget, optional
-        A false-alarm rate that the filter keeps by moving the threshold about gamma; None leaves it there.
 
     Raises
     ------
@@ -191,7 +54,6 @@ class CueingPolicy:
     reference_prior: tuple[float, ...]
     risk_map: RiskMap
     miss_rate: float = 0.0
-    adaptive: AdaptiveBudget | None = None
 
     def __post_init__(self) -> None:
         finite_array("gamma", self.gamma, ())
@@ -201,22 +63,6 @@ class CueingPolicy:
         prior = finite_array("reference_prior", self.reference_prior, (None,))
         if prior.size < 3 or (prior <= 0).any() or not np.isclose(prior.sum(), 1.0, atol=1e-6):
             raise InvalidArgumentError("reference_prior: expected 3 or more positive numbers, sum one")
-
-    def gamma_at(self, shift_nats: float) -> float:
-        r"""Return the threshold once it has moved by so much; gamma itself where nothing moves it.
-
-        .. math:: \mathrm{logit}\, \gamma_t = \mathrm{logit}\, \gamma + x_t
-
-        Parameters
-        ----------
-        shift_nats : float
-            On the log-odds of the statistic.
-
-        References
-        ----------
-        Derived here: see `AdaptiveBudget.gamma`.
-        """
-        return self.gamma if self.adaptive is None else self.adaptive.gamma(self.gamma, shift_nats)
 
 
 @dataclass(frozen=True, slots=True)

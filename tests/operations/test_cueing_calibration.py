@@ -116,23 +116,6 @@ def test_approaches_with_a_t0_give_the_risk_map():
     assert (done.recordings, done.windows) == (20, 20 * 291)
 
 
-def test_a_rate_to_keep_is_bounded_by_what_half_of_the_approaches_reach():
-    rng = np.random.default_rng(1)
-    streams = [street(rng, label) for label in ("none", "left") * 20]
-    chosen = CueingSettings(alphas=(0.05,), keep_per_hour=12.0)
-    policy = calibrate_cueing(streams, PRIOR, read_model().policies, chosen).policies.for_alpha(0.05, 0.0)
-    assert policy.adaptive.rate_per_hour == 12.0
-    peaks = [
-        sustained_statistic(statistic_at(s, PRIOR, 0.0)[s.before_sight()], 3).max()
-        for s in streams
-        if not s.hazard_free
-    ]
-    deafest = policy.gamma_at(100.0)
-    assert np.mean(np.array(peaks) >= deafest) >= 0.5
-    plain = calibrate_cueing(streams, PRIOR, read_model().policies, CueingSettings(alphas=(0.05,)))
-    assert plain.policies.for_alpha(0.05, 0.0).adaptive is None
-
-
 def test_too_few_hours_are_said_with_what_it_would_take():
     rng = np.random.default_rng(2)
     few = [street(rng) for _ in range(5)]

@@ -18,7 +18,6 @@ from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.side_belief import TIE, SideBelief
-from worldstate.ground.values import seconds
 from worldstate.measurement import Measurement
 from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
 
@@ -55,7 +54,6 @@ def claimed_nats(probability: float) -> float:
 def update_advisories(memory: Memory, measurement: Measurement, model: FilterModel) -> None:
     """Update the sustained rule of a source with this window's statistic."""
     source, stamp_ns, heard = measurement.source, measurement.stamp_ns, heard_beside(memory, measurement)
-    before_ns = max((one.stamp_ns for one in memory.rules.values()), default=stamp_ns)
     domain = measurement.domain
     fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
     last = memory.rules.get(source)
@@ -69,15 +67,6 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
         )
         return
     update_rule(memory, source, rule, measurement.signature, measurement.co_evidence, model)
-    if model.policy.adaptive is not None:
-        _, visible, none = memory.sides.hypotheses
-        memory.threshold = memory.threshold.advance(
-            model.policy.adaptive,
-            visible=visible,
-            none=none,
-            alarm=any(not sides for sides, _ in _alarms(memory, model.policy)),
-            elapsed_s=max(seconds(stamp_ns - before_ns), 0.0),
-        )
 
 
 def update_rule(
@@ -184,7 +173,7 @@ def _alarms(memory: Memory, policy: CueingPolicy) -> list[tuple[tuple[int, ...],
 
     That of a source that is silent for a second has ended.
     """
-    gamma, hops = policy.gamma_at(memory.threshold.shift_nats), policy.sustain_hops
+    gamma, hops = policy.gamma, policy.sustain_hops
     alarms = []
     for one in memory.rules.values():
         end_ns, is_over = _news_ends_ns(one), len(one.statistic) >= hops and one.sustained(hops) >= gamma
@@ -306,7 +295,7 @@ def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
             EvidenceTerms("coming", dict(zip(after, own, strict=True)), decides, threshold)
             for own, decides in zip(terms, kept.decided_at(memory.stamp_ns), strict=True)
         ]
-    prior, threshold = _rule_log_odds(memory, model)
+    prior, threshold = _rule_log_odds(model)
     looked_nats = math.inf if instant.log_lambda is None else instant.log_lambda
     heard, looked = (min(max(one, -MOST_NATS), MOST_NATS) for one in (instant.heard_nats, looked_nats))
     terms_nats = {"prior": prior, "window": heard, "look": looked - heard}
@@ -319,13 +308,13 @@ def _announced(memory: Memory, model: FilterModel, side: int) -> EvidenceTerms:
     weights = model.policy.reference_prior[:-2]
     chances = announced(memory.tracks, model.site)
     odds = sum(w * math.exp(claimed_nats(p)) for w, p in zip(weights, chances, strict=True)) / sum(weights)
-    prior, threshold = _rule_log_odds(memory, model)
+    prior, threshold = _rule_log_odds(model)
     nats = math.log(odds)
     decided = decided_log_odds(memory, model.policy, side)
     return EvidenceTerms("announced", {"prior": prior, "messages": nats}, decided, threshold)
 
 
-def _rule_log_odds(memory: Memory, model: FilterModel) -> tuple[float, float]:
+def _rule_log_odds(model: FilterModel) -> tuple[float, float]:
     """Return the log-odds of the rule's prior and of its threshold."""
-    gamma = model.policy.gamma_at(memory.threshold.shift_nats)
-    return bounded_log_odds(sum(model.policy.reference_prior[:-2])), bounded_log_odds(gamma)
+    policy = model.policy
+    return bounded_log_odds(sum(policy.reference_prior[:-2])), bounded_log_odds(policy.gamma)

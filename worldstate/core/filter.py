@@ -96,11 +96,6 @@ class WorldFilter:
         return published_belief(self._memory, self._model)
 
     @property
-    def gamma(self) -> float:
-        """Threshold in force: the policy's, moved where it adapts."""
-        return self.policy.gamma_at(self._memory.threshold.shift_nats)
-
-    @property
     def risk(self) -> float:
         """Calibrated risk of a road user hidden in any direction."""
         return self.belief.risk

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeAlias, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
-from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
 from worldstate.abduction.road_users import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.side_belief import SideBelief
@@ -129,8 +128,6 @@ class Memory:
     )
     counts: Counts = field(default_factory=Counts)
     last: LastSaid = field(default_factory=LastSaid)
-    # How far the threshold has moved, where the policy lets it.
-    threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
     rules: dict[str, SourceRule] = field(default_factory=dict)  # By the source
     looks: dict[str, CountedLook] = field(default_factory=dict)  # Last one by the sensor
     relations: tuple[Relation, ...] = ()  # With the intervals in which they have held

@@ -37,7 +37,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
     add("--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)")
     add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
-    add("--keep", type=float, metavar="N", help="let the threshold move to keep N false alarms an hour")
     add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
 
 
@@ -54,7 +53,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         method=arguments.method,
         confidence=arguments.confidence,
         block_s=arguments.block,
-        keep_per_hour=arguments.keep,
     )
     model = adapters.read_model(arguments.model)
     streams = listening.read_streams(arguments.inputs, inputs.given_array(arguments), arguments.model)

@@ -5,7 +5,7 @@ They come from data sets, recordings, sound files or hop streams that were saved
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 from zlib import crc32
@@ -13,12 +13,7 @@ from zlib import crc32
 import numpy as np
 
 from worldstate.abduction.cueing import thresholds
-from worldstate.abduction.cueing.cueing_policy import (
-    AdaptiveBudget,
-    CueingPolicies,
-    CueingPolicy,
-    sustained_statistic,
-)
+from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy, sustained_statistic
 from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, correlation_time_hops, fit_risk_map
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
@@ -59,10 +54,6 @@ class CueingSettings:
     block_s : float
         Hazard-free hours are cut into pieces of this length, which the guarantee takes for exchangeable: it
         should be longer than the correlation time of the statistic.
-    keep_per_hour : float, optional
-        False alarms per hour that the filter is to keep while it runs, by moving the threshold. With
-        approaches at hand it never moves beyond the level that half of them reach: those are announced come
-        what may.
 
     Raises
     ------
@@ -80,7 +71,6 @@ class CueingSettings:
     method: ThresholdKind = "conformal"
     confidence: float | None = None
     block_s: float = 10.0
-    keep_per_hour: float | None = None
 
     def __post_init__(self) -> None:
         if not self.alphas:
@@ -90,8 +80,6 @@ class CueingSettings:
         if self.confidence is not None:
             in_range("confidence", self.confidence, 0.0, 1.0, open_low=True, open_high=True)
         in_range("block_s", self.block_s, 1.0, 3600.0)
-        if self.keep_per_hour is not None:
-            AdaptiveBudget(self.keep_per_hour)
         one_of("method", self.method, get_args(ThresholdKind))
 
     @property
@@ -258,12 +246,11 @@ def _by_miss_rate(
         hazards = [statistic_at(one, prior, beta)[one.before_sight()] for one in approaches]
         nearest = min(kept.policies, key=lambda policy: abs(policy.miss_rate - beta))
         risk = _risk_map(calm, hazards) if hazards else nearest.risk_map
-        adaptive = _adaptive(hazards, settings)
         for alpha in settings.alphas:
             gamma, held_out = settings.threshold(calm, alpha), _held_out(calm, alpha, settings)
             counted = _counted(calm, gamma, settings)
             budgets.append(BudgetReport(alpha, beta, gamma, counted, *held_out))
-            policies.append(CueingPolicy(gamma, settings.sustain_hops, alpha, prior, risk, beta, adaptive))
+            policies.append(CueingPolicy(gamma, settings.sustain_hops, alpha, prior, risk, beta))
     return budgets, policies
 
 
@@ -321,15 +308,6 @@ def _risk_map(calm: list[FloatArray], hazards: list[FloatArray]) -> RiskMap:
     scores = np.concatenate([*calm, *hazards])
     labels = np.arange(scores.size) >= sum(s.size for s in calm)
     return fit_risk_map(scores, labels, independent=scores.size / correlation_time_hops(calm))
-
-
-def _adaptive(hazards: list[FloatArray], settings: CueingSettings) -> AdaptiveBudget | None:
-    """Return the rate to keep, its threshold bounded by what half of the approaches reach."""
-    if settings.keep_per_hour is None:
-        return None
-    peaks = [sustained_statistic(scores, settings.sustain_hops).max() for scores in hazards]
-    budget, reached = AdaptiveBudget(settings.keep_per_hour), float(np.median(peaks)) if peaks else -np.inf
-    return replace(budget, highest=reached) if 0.0 < reached < 1.0 else budget
 
 
 def _warnings(
