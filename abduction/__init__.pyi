@@ -10,9 +10,7 @@ from .cueing.risk_map import brier_score as brier_score
 from .cueing.risk_map import expected_calibration_error as expected_calibration_error
 from .cueing.risk_map import fit_risk_map as fit_risk_map
 from .cueing.risk_map import reliability_curve as reliability_curve
-from .cueing.thresholds import conformal_threshold as conformal_threshold
 from .cueing.thresholds import neyman_pearson_threshold as neyman_pearson_threshold
-from .cueing.thresholds import recordings_needed as recordings_needed
 from .evidence import Posterior as Posterior
 from .evidence import SignatureEvidence as SignatureEvidence
 from .evidence import abduce as abduce

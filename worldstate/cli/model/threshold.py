@@ -5,20 +5,20 @@ Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and
 INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, or hop streams
 that --save-streams wrote with the same signature. Recordings labelled none and sound files count as
 hazard-free. Approaches with a T0, where there are some, give the risk map (Platt for few, isotonic for many);
-without them the model's own is kept. A budget that the hours do not suffice for is warned about, with the
-hours that it would take.
+without them the model's own is kept. If few false alarms were counted, a warning names the hours that would
+count enough.
 
 Examples
 --------
   worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
-  worldstate model threshold my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json
+  worldstate model threshold my_dataset --alpha 0.01 0.05 --out my_model.json
 """
 
 import argparse
 from pathlib import Path
 
 from worldstate import adapters, operations
-from worldstate.cli.common import command, inputs, listening, output
+from worldstate.cli.common import inputs, listening, output
 
 NEEDS = ("sklearn",)
 
@@ -32,10 +32,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
     budgets = "budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)"
     add("--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A", help=budgets)
-    guarantee = "with a finite-sample guarantee, or the smallest threshold that fits"
-    command.add_choice(parser, "--method", guarantee, "conformal", "plain")
-    add("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
-    add("--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)")
     add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
     add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
 
@@ -50,9 +46,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     settings = operations.CueingSettings(
         alphas=tuple(arguments.alpha),
         sustain_hops=arguments.sustain_hops,
-        method=arguments.method,
-        confidence=arguments.confidence,
-        block_s=arguments.block,
     )
     model = adapters.read_model(arguments.model)
     streams = listening.read_streams(arguments.inputs, inputs.given_array(arguments), arguments.model)
@@ -73,7 +66,6 @@ def _result(arguments: argparse.Namespace, done: "operations.CueingCalibration")
         "hazard_free_hours": done.hours,
         "windows": done.windows,
         "recordings": done.recordings,
-        "pieces": done.blocks,
         "correlation_time_s": done.correlation_time_s,
         "risk_map": done.risk,
     }

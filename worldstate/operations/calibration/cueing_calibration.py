@@ -7,29 +7,25 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 from zlib import crc32
 
 import numpy as np
 
-from worldstate.abduction.cueing import thresholds
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy, sustained_statistic
 from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, correlation_time_hops, fit_risk_map
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InvalidArgumentError, in_range
-from worldstate.ground.checks import one_of
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, caution, poisson_interval
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream, load_streams
 from worldstate.operations.training.training import MISS_RATES
-
-ThresholdKind = Literal["conformal", "plain"]
 
 # Of the recording-level folds that the achieved rate is measured by.
 N_FOLDS = 5
@@ -47,13 +43,6 @@ class CueingSettings:
         Budgets: share of hazard-free windows in sustained alarm, in (0, 1).
     sustain_hops : int
         k of the sustained rule.
-    method : {"conformal", "plain"}
-        With the finite-sample guarantee, or the smallest threshold that keeps the budget on these very hours.
-    confidence : float, optional
-        Of the conformal guarantee; without it the guarantee is on the mean over calibrations.
-    block_s : float
-        Hazard-free hours are cut into pieces of this length, which the guarantee takes for exchangeable: it
-        should be longer than the correlation time of the statistic.
 
     Raises
     ------
@@ -62,40 +51,22 @@ class CueingSettings:
 
     Examples
     --------
-    >>> CueingSettings(alphas=(0.02,)).block_hops
-    100
+    >>> CueingSettings(alphas=(0.02,)).sustain_hops
+    3
     """
 
     alphas: tuple[float, ...] = (0.01, 0.02, 0.05)
     sustain_hops: int = 3
-    method: ThresholdKind = "conformal"
-    confidence: float | None = None
-    block_s: float = 10.0
 
     def __post_init__(self) -> None:
         if not self.alphas:
             raise InvalidArgumentError("alpha: expected at least one budget")
         for alpha in self.alphas:
             in_range("alpha", alpha, 0.0, 1.0, open_low=True, open_high=True)
-        if self.confidence is not None:
-            in_range("confidence", self.confidence, 0.0, 1.0, open_low=True, open_high=True)
-        in_range("block_s", self.block_s, 1.0, 3600.0)
-        one_of("method", self.method, get_args(ThresholdKind))
-
-    @property
-    def block_hops(self) -> int:
-        """Length of a piece in hops."""
-        return max(round(self.block_s / HOP_S), 1)
 
     def threshold(self, hazard_free: Sequence[FloatArray], alpha: float) -> float:
-        """Return gamma(alpha) on recordings; above all of them where no threshold has the guarantee."""
-        if self.method == "plain":
-            return thresholds.neyman_pearson_threshold(hazard_free, alpha, self.sustain_hops)
-        blocks = [block for stream in hazard_free for block in cut(stream, self.block_hops)]
-        gamma = thresholds.conformal_threshold(blocks, alpha, self.sustain_hops, self.confidence)
-        if np.isfinite(gamma):
-            return gamma
-        return thresholds.neyman_pearson_threshold(hazard_free, 0.0, self.sustain_hops)
+        """Return gamma(alpha) on recordings."""
+        return neyman_pearson_threshold(hazard_free, alpha, self.sustain_hops)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +108,8 @@ class CueingCalibration:
         One for each budget and miss rate.
     budgets : tuple of BudgetReport
         In the same order.
-    hours, windows, recordings, blocks : float and int
-        Hazard-free time, decision windows, recordings and pieces of them.
+    hours, windows, recordings : float and int
+        Hazard-free time, decision windows and recordings.
     correlation_time_s : float
         Of the statistic at miss rate 0.
     risk : {"kept", "platt", "isotonic"}
@@ -150,7 +121,7 @@ class CueingCalibration:
     --------
     >>> from worldstate.adapters.files.model_file import read_model
     >>> shipped = read_model().policies
-    >>> found = CueingCalibration(shipped, (), 0.5, 18_000, 3, 180, 1.1, "kept", ("too few hours",))
+    >>> found = CueingCalibration(shipped, (), 0.5, 18_000, 3, 1.1, "kept", ("too few hours",))
     >>> found.policies.for_alpha(0.02).alpha, found.warnings
     (0.02, ('too few hours',))
     """
@@ -160,7 +131,6 @@ class CueingCalibration:
     hours: float
     windows: int
     recordings: int
-    blocks: int
     correlation_time_s: float
     risk: str
     warnings: tuple[str, ...]
@@ -183,7 +153,7 @@ def calibrate_cueing(
     kept : CueingPolicies
         Whose risk maps are kept where no approach is there to fit one to.
     settings : CueingSettings, optional
-        Budgets and method.
+        Budgets and the sustained rule.
 
     Returns
     -------
@@ -216,7 +186,6 @@ def calibrate_cueing(
     approaches = [stream for stream in streams if stream.before_sight().any()]
     budgets, policies = _by_miss_rate(free, approaches, reference_prior, kept, chosen)
     calm = [statistic_at(stream, reference_prior, 0.0) for stream in free]
-    blocks = sum(len(cut(stream, chosen.block_hops)) for stream in calm)
     tau = correlation_time_hops(calm)
     fitted = "isotonic" if isinstance(policies[0].risk_map, IsotonicMap) else "platt"
     return CueingCalibration(
@@ -225,10 +194,9 @@ def calibrate_cueing(
         hours=budgets[0].counted.hours,
         windows=sum(map(len, free)),
         recordings=len(free),
-        blocks=blocks,
         correlation_time_s=tau * HOP_S,
         risk=fitted if approaches else "kept",
-        warnings=tuple(_warnings(budgets, chosen, blocks, tau * HOP_S)),
+        warnings=tuple(_warnings(budgets, len(free))),
     )
 
 
@@ -252,18 +220,6 @@ def _by_miss_rate(
             budgets.append(BudgetReport(alpha, beta, gamma, counted, *held_out))
             policies.append(CueingPolicy(gamma, settings.sustain_hops, alpha, prior, risk, beta))
     return budgets, policies
-
-
-def cut(stream: FloatArray, block_hops: int) -> list[FloatArray]:
-    """Return pieces of at least `block_hops`; what is left over at the end goes to the last one.
-
-    Examples
-    --------
-    >>> [piece.size for piece in cut(np.zeros(25), 10)]
-    [10, 15]
-    """
-    count = max(stream.size // block_hops, 1)
-    return np.split(stream, [i * block_hops for i in range(1, count)])
 
 
 def statistic_at(stream: HopTable, prior: Sequence[float], miss_rate: float) -> FloatArray:
@@ -310,20 +266,9 @@ def _risk_map(calm: list[FloatArray], hazards: list[FloatArray]) -> RiskMap:
     return fit_risk_map(scores, labels, independent=scores.size / correlation_time_hops(calm))
 
 
-def _warnings(
-    budgets: list[BudgetReport], settings: CueingSettings, blocks: int, correlation_s: float
-) -> Iterator[str]:
-    conformal = settings.method == "conformal"
-    if few := caution(blocks, f"pieces of {settings.block_s:g} s"):
+def _warnings(budgets: list[BudgetReport], recordings: int) -> Iterator[str]:
+    if few := caution(recordings):
         yield few
-    for alpha in settings.alphas if conformal else ():
-        need = thresholds.recordings_needed(alpha, settings.confidence)
-        if blocks < need:
-            yield (
-                f"alpha {alpha:g}: the guarantee needs {need} pieces of {settings.block_s:g} s "
-                f"({need * settings.block_s / 3600.0:.2g} h), got {blocks}; the threshold lies above all "
-                "that was heard and guarantees nothing"
-            )
     for report in budgets:
         count = report.counted
         if report.miss_rate == 0.0 and count.onsets < ENOUGH_ONSETS:
@@ -334,11 +279,6 @@ def _warnings(
                 f"between {low:.3g} and {high:.3g} an hour; "
                 f"{enough_h:.2g} h would tell it to a factor of two"
             )
-    if conformal and correlation_s > settings.block_s / 2:
-        yield (
-            f"the statistic is correlated over {correlation_s:.3g} s: pieces of {settings.block_s:g} s "
-            "depend on each other, take longer ones"
-        )
 
 
 def find_inputs(path: Path) -> list[Path]:
