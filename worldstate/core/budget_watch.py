@@ -14,7 +14,7 @@ Sources: Shafer, "Testing by betting", J. R. Statist. Soc. A 184, 2021; Shin, Ra
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from worldstate.ground import InvalidArgumentError, nanoseconds, seconds
@@ -39,8 +39,6 @@ RATES = (2.0, 10.0)  # Alternatives, in budgets: what is to be found within two 
 # Streets differ by a factor of three either way, 1.1 nats; what is learned of their traffic takes .5.
 TOLERANCE_NATS = 0.7
 _LEAST_CHANCE = 1e-9
-# Of the threshold, for half of the onsets: of ten streams (seed 1) 82 an hour from -2.5 nats on, 2 from .5.
-HALVING_NATS, MOST_HALVINGS = 0.55, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +111,7 @@ class WatchedHop:
 
     stamp_ns: int
     looked: bool  # Whether a camera would have seen what comes into view
-    over: Sequence[bool]  # Whether the model's own threshold is reached
+    over: Sequence[bool]  # Whether the threshold is reached
     emerged_ns: tuple[int | None, ...]  # When one last came into view
     within: tuple[float, ...]  # Chance that one does within two seconds
 
@@ -125,7 +123,7 @@ _MOST = len(RATES) * BROKEN * (1.0 + 1e-9)  # All of the mean in one of them
 
 @dataclass(frozen=True, slots=True)
 class BudgetWatch:
-    """The watch over an alarm: always of the model's own threshold, wherever the one in force stands."""
+    """The watch over an alarm: it reports, and moves no threshold."""
 
     tally: Tally = field(default_factory=Tally)
     onsets: Evidence = _NO_ONSETS
@@ -133,26 +131,9 @@ class BudgetWatch:
     stamp_ns: int = 0
     since_ns: int | None = None  # Since when a camera has looked without a break
     pending_ns: tuple[int, ...] = ()  # Onsets of which it is not known yet whether anything comes
-    over_ns: tuple[int | None, ...] = _NEVER  # When each side was last above the model's own threshold
-    raised_ns: tuple[int | None, ...] = _NEVER  # The same of the threshold in force
+    over_ns: tuple[int | None, ...] = _NEVER  # When each side was last above the threshold
     emerged_ns: tuple[int | None, ...] = _NEVER
     bet: tuple[int, tuple[float, ...]] | None = None  # Chances stated then, of which the outcome is awaited
-
-    @property
-    def shift_nats(self) -> float:
-        r"""How much the threshold is raised: where the budget is broken, by the halvings that restore it.
-
-        .. math:: \Delta = h\, \frac{\sum_\rho M_\rho \min(\log_2 \rho, 2)}{\sum_\rho M_\rho}
-
-        with h nats for half of the onsets.
-        """
-        if not self.onsets.broken:
-            return 0.0
-        values = self.onsets.values
-        halvings = math.fsum(
-            one * min(math.log2(rho), MOST_HALVINGS) for one, rho in zip(values, RATES, strict=True)
-        )
-        return HALVING_NATS * halvings / math.fsum(values)
 
     def watches(self, stamp_ns: int) -> bool:
         """Tell whether a camera has looked until just now."""
@@ -173,12 +154,11 @@ class BudgetWatch:
         new = [k for k, ns in enumerate(hop.emerged_ns) if ns is not None and ns != self.emerged_ns[k]]
         if not new:
             return self
-        own, raised = ([_recent(ns[k], hop) for k in new] for ns in (self.over_ns, self.raised_ns))
+        own = [_recent(self.over_ns[k], hop) for k in new]
         tally = replace(
             self.tally,
             arrivals=self.tally.arrivals + len(new),
             warned=self.tally.warned + sum(own),
-            lost=self.tally.lost + sum(a and not b for a, b in zip(own, raised, strict=True)),
         )
         return replace(self, tally=tally, pending_ns=())
 
@@ -218,19 +198,15 @@ class BudgetWatch:
             stamp_ns=hop.stamp_ns,
             emerged_ns=hop.emerged_ns,
             pending_ns=(*self.pending_ns, hop.stamp_ns) if begins else self.pending_ns,
-            over_ns=_latest(self.over_ns, hop.over, hop.stamp_ns),
+            over_ns=tuple(
+                hop.stamp_ns if yes else ns for ns, yes in zip(self.over_ns, hop.over, strict=True)
+            ),
         )
-
-    def raised(self, over: Iterable[bool]) -> "BudgetWatch":
-        """Return the watch with which sides are above the threshold in force."""
-        if not self.onsets.broken:  # Which is the model's own
-            return replace(self, raised_ns=self.over_ns)
-        return replace(self, raised_ns=_latest(self.raised_ns, over, self.stamp_ns))
 
     def check(self, sides: int) -> None:
         """Refuse what a file cannot have been written with."""
         laid = self.emerged_ns if self.bet is None else self.bet[1]
-        lengths = {len(one) for one in (self.over_ns, self.raised_ns, self.emerged_ns, laid)}
+        lengths = {len(one) for one in (self.over_ns, self.emerged_ns, laid)}
         tests = (self.onsets, _NO_ONSETS), (self.within, _NO_CHANCES)
         if lengths != {sides} or any(len(one.values) != len(first.values) for one, first in tests):
             raise InvalidArgumentError(f"memory.sequence.watch: expected values of {sides} sides")
@@ -238,16 +214,12 @@ class BudgetWatch:
             raise InvalidArgumentError(f"memory.sequence.watch: expected e-values up to {_MOST:g}")
 
 
-def _latest(before_ns: Sequence[int | None], over: Iterable[bool], now_ns: int) -> tuple[int | None, ...]:
-    return tuple(now_ns if yes else ns for ns, yes in zip(before_ns, over, strict=True))
-
-
 def budget_of(watch: BudgetWatch, stamp_ns: int, onsets_per_hour: float) -> Budget:
     """Return how the watch over a budget stands at a time."""
     # In full precision they would take twice as long to write.
     evidence_nats = {"onsets": round(watch.onsets.nats, 6), "within": round(watch.within.nats, 6)}
     verdict, why = _verdict(watch, stamp_ns)
-    return Budget(verdict, why, evidence_nats, onsets_per_hour, watch.shift_nats, watch.tally)
+    return Budget(verdict, why, evidence_nats, onsets_per_hour, 0.0, watch.tally)
 
 
 def _verdict(watch: BudgetWatch, stamp_ns: int) -> tuple[Verdict, str | None]:

@@ -171,12 +171,7 @@ class SequenceMemory:
 
     @property
     def threshold_nats(self) -> float:
-        """What the alarm is raised from: higher where its budget is broken, or a vehicle has just come."""
-        return self.own_threshold_nats + self.watch.shift_nats
-
-    @property
-    def own_threshold_nats(self) -> float:
-        """The same, whatever has become of the budget; infinite without an alarm."""
+        """What the alarm is raised from: higher where a vehicle has just come; infinite without an alarm."""
         if self.alarm is None:
             return math.inf
         return self.alarm.threshold_nats + _BESIDE_ONE_NATS * self.just_emerged()
@@ -530,16 +525,11 @@ def alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     decided, over_ns, alarm = np.array([float(np.mean(row)) for row in rows]), kept.over_ns, kept.alarm
     watch = kept.watch
     if alarm is not None:
-        alarm = replace(alarm, threshold_nats=kept.own_threshold_nats)
-        given = decided, kept.posterior.groups[0], np.array(kept.read_nats(context))
-        decided, denied = alarm.deciding(*given), np.array(kept.sides.risks) < LEAST_RISK
-        hop = _watched(kept, (decided >= alarm.threshold_nats) & ~denied)
-        watch = watch.after(hop, alarm.onsets_per_hour)
-        threshold = alarm.threshold_nats + watch.shift_nats
-        if watch.onsets.broken:
-            decided = replace(alarm, threshold_nats=threshold).deciding(*given)
-        over = decided >= threshold
-        watch = watch.raised(over & ~denied)
+        alarm = replace(alarm, threshold_nats=kept.threshold_nats)
+        read_nats = np.array(kept.read_nats(context))
+        decided = alarm.deciding(decided, kept.posterior.groups[0], read_nats)
+        over, denied = decided >= alarm.threshold_nats, np.array(kept.sides.risks) < LEAST_RISK
+        watch = watch.after(_watched(kept, over & ~denied), alarm.onsets_per_hour)
         # A risk that denies an alarm ends it: it is not held, and time alone does not bring it back.
         sides = zip(over, denied, over_ns, strict=True)
         over_ns = tuple(None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides)

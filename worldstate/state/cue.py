@@ -105,7 +105,7 @@ class Tally:
     warned : int
         Those of them for whose side the alarm stood in the eight seconds before.
     lost : int
-        Those of these that the raised threshold did not warn of.
+        Always 0 since no threshold is raised.
 
     Examples
     --------
@@ -127,9 +127,6 @@ Verdict: TypeAlias = Literal["kept", "in doubt", "broken", "unwatched"]
 class Budget:
     r"""Whether a sequence's alarm keeps to its budget, and its chances are true, by what a camera sees later.
 
-    Where the budget is broken the threshold is raised by as many halvings of the onsets as restore it, two at
-    most; it comes back with the evidence, which is always of the model's own threshold.
-
     Parameters
     ----------
     verdict : {"kept", "in doubt", "broken", "unwatched"}
@@ -142,7 +139,7 @@ class Budget:
     onsets_per_hour : float
         The budget, of time in which no vehicle comes into view.
     threshold_shift_nats : float
-        How much the threshold is raised.
+        Always 0: the watch moves no threshold.
     tally : Tally
         What was counted since the filter began.
 
