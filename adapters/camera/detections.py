@@ -10,10 +10,10 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
-from worldstate.adapters.files.file_io import in_order, read_json, read_text, refused_as_file
+from worldstate.adapters.files.file_io import in_order, read_text, refused_as_file
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range, nanoseconds
 from worldstate.ground.checks import check_shape
-from worldstate.ground.serialisation import Check, Count, Probability, Via, decode
+from worldstate.ground.serialisation import Check, Count, Probability, Via, decode, decode_items, decode_json
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 
 from .class_names import COCO_CATEGORIES, ROAD_USERS, YOLO_NAMES, class_name
@@ -44,6 +44,7 @@ _NUMBERED = re.compile(r"(?!-\d+$)(.*?)(\d{1,19})", re.ASCII)
 _NO_LABELS = frozenset({"classes.txt", "README.txt", "README.dataset.txt", "README.roboflow.txt"})
 # What others call the time of an image.
 _TIMES = {f"{name}{unit}" for name in ("stamp", "timestamp", "time") for unit in ("", "_s", "_ms", "_us")}
+_PER_FRAME = re.compile(r'"detections_per_frame"\s*:\s*\[')
 _FORMS = "`worldstate run --help-all` lists the forms that detections may have"
 # Car and bus if categories are counted from 0 as by YOLO, bicycle and airplane from 1 as by COCO.
 _UNSURE = frozenset({"2", "5"})
@@ -435,20 +436,36 @@ def read_detections(path: str | Path, frame_rate_hz: float | None = None) -> Det
     """
     name = Path(path)
     _rate_hz(frame_rate_hz)  # before a long file is read
-    return _ovad_log(name, read_json(name, "a detections file", MAX_BYTES), frame_rate_hz)
+    return _ovad_log(name, read_text(name, "a detections file", MAX_BYTES), frame_rate_hz)
 
 
-def _ovad_log(name: Path, document: object, frame_rate_hz: float | None) -> DetectionLog:
-    rows = document.get("detections_per_frame") if isinstance(document, dict) else None
-    if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
-        problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
-        raise InputFileError(name, f"{problem}; {_FORMS}")
-    keys = {*rows[0]} if rows and isinstance(rows[0], dict) else set()
-    if "stamp_ns" not in keys and (times := sorted(keys & _TIMES)):
-        raise InputFileError(name, f'frame 0: expected times as "stamp_ns", whole nanoseconds, got {times}')
+def _ovad_log(name: Path, text: str, frame_rate_hz: float | None) -> DetectionLog:
+    frames, stamps = list[DetectionFrame](), list[int | None]()
+
+    def take(row: object) -> None:
+        if (
+            not frames
+            and isinstance(row, dict)
+            and "stamp_ns" not in row
+            and (times := sorted(_TIMES & {*row}))
+        ):
+            raise InvalidArgumentError(
+                f'frame 0: expected times as "stamp_ns", whole nanoseconds, got {times}'
+            )
+        read = decode(_OvadFrame, row, f"frame {len(frames)}")
+        frames.append(read.frame())
+        stamps.append(read.stamp_ns)
+
     with refused_as_file(name):
-        read = [decode(_OvadFrame, row, f"frame {number}") for number, row in enumerate(rows)]
-        frames, stamps = [one.frame() for one in read], [one.stamp_ns for one in read]
+        found, end = _PER_FRAME.search(text), 0
+        if found is not None:
+            end = decode_items(text, found.end() - 1, take, "frame")
+            text = f"{text[: found.end()]}{text[end - 1 :]}"
+        document = decode_json(text, "a detections file")
+        rows = document.get("detections_per_frame") if isinstance(document, dict) else None
+        if not isinstance(rows, list) or len(frames) > MAX_FRAMES:
+            problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
+            raise InvalidArgumentError(f"{problem}; {_FORMS}")
     stamped = [stamp for stamp in stamps if stamp is not None]
     if not stamped:
         return DetectionLog.at_rate(frames, frame_rate_hz, source=str(name))
@@ -567,16 +584,32 @@ def read_any_detections(
         return read_yolo_text(name, size_px, frame_rate_hz, n_images)
     if name.suffix.lower() == ".txt":
         return read_mot_text(name, frame_rate_hz, n_images)
+    text = read_text(name, "a detections file", MAX_BYTES)
+    if _PER_FRAME.search(text) is not None:
+        if n_images is not None:
+            raise InputFileError(name, "expected no number of images (--images): the file has every image")
+        return _ovad_log(name, text, frame_rate_hz)
     try:
-        document = read_json(name, "a detections file", MAX_BYTES)
-        of_coco = isinstance(document, dict) and {"images", "annotations"} & {*document}
-        if of_coco or isinstance(document, list):
+        with refused_as_file(name):
+            of_list = text.lstrip().startswith("[")
+            document = _results(text) if of_list else decode_json(text, "a detections file")
             return coco_log(name, document, frame_rate_hz, n_images, size_px)
     except InputFileError as error:
         raise InputFileError(error.path, f"{error.problem}; {_FORMS}") from error
-    if n_images is not None:
-        raise InputFileError(name, "expected no number of images (--images): the file has every image")
-    return _ovad_log(name, document, frame_rate_hz)
+
+
+def _results(text: str) -> "_CocoFile":
+    """Return what a list of COCO results holds, read one by one."""
+    found = list[_CocoResult]()
+
+    def take(item: object) -> None:
+        found.append(decode(_CocoResult, item, f"COCO.annotations[{len(found)}]"))
+        if len(found) > MAX_BOXES:
+            raise InvalidArgumentError(f"expected at most {MAX_BOXES} boxes")
+
+    if rest := text[decode_items(text, text.index("["), take, "COCO.annotations") :].strip():
+        raise InvalidArgumentError(f"expected JSON, got {rest:.20} behind a list")
+    return _CocoFile(tuple(found))
 
 
 def coco_log(
@@ -594,9 +627,9 @@ def coco_log(
     size has to be `size_px`. Categories without names are COCO's, counted from 1; if one is 0, YOLO's.
     """
     with refused_as_file(path):
-        held = document if isinstance(document, dict) else {"annotations": document}
-        listed, read = "images" in held, decode(_CocoFile, held, "COCO")
-        images = read.images if read.images is not None else _unlisted(read.annotations)
+        held = {"annotations": document} if isinstance(document, list) else document
+        read = held if isinstance(held, _CocoFile) else decode(_CocoFile, held, "COCO")
+        listed, images = read.images is not None, read.images or _unlisted(read)
         for one in images:
             if size_px is not None and (one.width or size_px[0], one.height or size_px[1]) != size_px:
                 expected = f"expected images of the camera's {size_px[0]} x {size_px[1]} px"
@@ -620,9 +653,11 @@ def coco_log(
     return _log(path, rows, frame_rate_hz, sorted(rows) if listed else n_images)
 
 
-def _unlisted(results: Sequence[_CocoResult]) -> tuple[_CocoId, ...]:
-    """Return the images that results name, once each."""
-    return tuple(map(_CocoId, dict.fromkeys(one.image_id for one in results)))
+def _unlisted(read: _CocoFile) -> tuple[_CocoId, ...]:
+    """Return the images that results name, once each, where none are listed."""
+    return (
+        () if read.images is not None else tuple(map(_CocoId, {one.image_id: 0 for one in read.annotations}))
+    )
 
 
 def _category_names(read: _CocoFile) -> dict[str, str]:

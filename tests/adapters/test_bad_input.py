@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.adapters.audio.sound_file import open_audio
-from worldstate.adapters.camera.detections import read_detections
+from worldstate.adapters.camera.detections import read_any_detections, read_detections
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.file_io import atomic_path, write_text
 from worldstate.adapters.files.model_file import read_model, save_model
@@ -267,6 +267,32 @@ def test_bad_detections(tmp_path: Path, text: str, problem: str) -> None:
     name = tmp_path / "d.json"
     name.write_text(text)
     expect(problem, name, lambda: read_detections(name))
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ('{"detections_per_frame": [%s %s]}', "frame 1: expected JSON"),
+        ('{"detections_per_frame": [%s, %s,]}', "frame 2: expected JSON"),
+        ('{"detections_per_frame": [%s, %s]', "expected JSON"),
+        ('{"detections_per_frame": [%s, %s]} {}', "expected JSON"),
+        ('{"note": {"detections_per_frame": [%s, %s]}}', "expected an object with a list"),
+        ('[%s, %s]', r"COCO.annotations\[0\].image_id"),
+        ('{"detections_per_frame": [%s, %s, [[[]]]]}', "frame 2: expected an object"),
+        ('{"detections_per_frame": [%s, %s], "a": NaN}', "NaN is no JSON"),
+        ('{"detections_per_frame": [%s, %s], "a": "\\ud800"}', "half a surrogate pair"),
+    ],
+)  # fmt: skip
+def test_detections_that_are_read_one_by_one_are_as_strict(tmp_path: Path, text: str, problem: str) -> None:
+    name, good = tmp_path / "d.json", json.dumps(GOOD)
+    name.write_text(text % (good, good))
+    expect(problem, name, lambda: read_any_detections(name))
+    for blanks in (
+        '{ "detections_per_frame" :\n[ %s\n,\t%s ]\n, "model": 1}',
+        '{"a": {}, "detections_per_frame": [%s,%s]}',
+    ):
+        name.write_text(blanks % (good, good))
+        assert len(read_any_detections(name)) == 2
 
 
 def test_missing_detections_and_rates(tmp_path: Path) -> None:

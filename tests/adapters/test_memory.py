@@ -58,6 +58,20 @@ def keys(count: int) -> bytes:
     return json.dumps({f"{i:x}": i + 300 for i in range(count)}).encode()
 
 
+RESULT = '{"image_id":107999,"category_id":3,"bbox":[1234.5,678,90,123],"score":0.9},'
+
+
+def drive(note: str, images: int = 1) -> bytes:
+    """Return images in OVAD's form, eight boxes each."""
+    image = {
+        "boxes": [[1234.56, 789.01, 1500.23, 999.9]] * 8,
+        "scores": [0.9123] * 8,
+        "classes_str": ["car"] * 8,
+    }
+    frames = ",".join([json.dumps(image)] * images)
+    return f'{{"detections_per_frame": [{frames}], "note": "{note}"}}'.encode()
+
+
 COLUMNS = [*(f"feat{i}" for i in range(60)), "Class", "ID", "Environment", "T0", "Recording ID"]
 HEADER, ROW = ",".join(COLUMNS) + "\n", "0," * 60 + "none,a,S,,b\n"
 LONG_NAME = HEADER + ROW.replace("a", "a" * 100_000)
@@ -67,6 +81,9 @@ FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "as many lists as may be": ("read_any_detections", lambda: json_list("[],", 64 * MIB, 4_000_000)),
     "as many keys as may be": ("read_any_detections", lambda: keys(1_900_000)),
     "wide text": ("read_any_detections", lambda: ('["\N{GRINNING FACE}' + "a" * (60 * MIB) + '"]').encode()),
+    "a wide drive": ("read_any_detections", lambda: drive("\N{GRINNING FACE}" + "a" * (62 * MIB))),
+    "an hour of results": ("read_any_detections", lambda: json_list(RESULT, 24 * MIB)),
+    "an hour of images": ("read_any_detections", lambda: drive("", 54_000)),
     "as many rows as may be": ("read_mot_text", mot_rows),
     "wide rows": ("read_mot_text", lambda: ("\N{GRINNING FACE}" + "1," * (31 * MIB)).encode()),
     "empty objects": ("read_model", lambda: json_list("{},", 16 * MIB, 4_000_000)),

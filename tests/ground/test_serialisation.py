@@ -19,6 +19,7 @@ from worldstate.ground.serialisation import (
     Layout,
     Probability,
     decode,
+    decode_items,
     decode_json,
     encode,
 )
@@ -177,6 +178,36 @@ def test_json_text_can_be_written_again_or_is_refused(key, value):
                 decode_json(refused, "car")
     else:
         json.dumps(decode_json(text, "car"), ensure_ascii=False).encode()
+
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(items=st.lists(JSON, max_size=9), indent=st.sampled_from([None, 0, 2]), long=st.integers(0, 3))
+def test_a_list_that_is_read_item_by_item_is_what_it_is_as_a_whole(items, indent, long):
+    items += ["a" * 20_000, list(range(9000)), {"b": [{}] * 3000}][:long]
+    found, text = [], "{" + json.dumps("a") + ":" + json.dumps(items, indent=indent) + "}"
+    assert decode_items(text, text.index("["), found.append, "items") == len(text) - 1
+    assert found == items
+    for cut in range(0, len(text) - 1, max(len(text) // 20, 1)):
+        with pytest.raises(InvalidArgumentError, match="expected JSON"):
+            decode_items(text[:cut], 4, [].append, "items")
+
+
+@pytest.mark.parametrize("depth", [700, 20_000])
+@pytest.mark.parametrize("item", ["[" * 5, '"\\ud800"', "NaN", "{]", "[1 2]", "1,,2", "1 2", "[[0]], x"])
+def test_an_item_that_is_no_json_is_refused(item, depth):
+    text = "[" + item.replace("[" * 5, "[" * depth + "]" * depth + ", x") + "]"
+    with pytest.raises(InvalidArgumentError, match=r"^items \d: expected JSON"):
+        decode_items(text, 0, [].append, "items")
 
 
 @pytest.mark.parametrize("depth", [300, 700, 20_000])

@@ -6,7 +6,8 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -188,19 +189,90 @@ def decode_json(text: str, where: str) -> object:
     values = sum(map(text.count, "[{:,"))
     if values > MOST_VALUES:
         raise InvalidArgumentError(f"{where}: expected at most {MOST_VALUES} values, got {values}")
-    try:
+    with _refused_as_json(where):
         value: object = json.loads(text, parse_constant=_refuse_constant)
-        # Half a surrogate pair has no bytes: it would fail where it is printed or written.
-        shown = json.dumps(value, ensure_ascii=False) if "\\u" in text else text
-        if not shown.isascii() and _HALF.search(shown):
-            raise ValueError("half a surrogate pair is no character")
+        _check_characters(value, text)
+    return value
+
+
+def decode_items(text: str, at: int, take: Callable[[object], object], where: str) -> int:
+    """Decode the list that begins at a place of a JSON text item by item, without a bound on their number.
+
+    Parameters
+    ----------
+    text : str
+        The text, whose other parts are not looked at.
+    at : int
+        Place of the list's bracket.
+    take : callable
+        Is given each item.
+    where : str
+        Names the list in messages.
+
+    Returns
+    -------
+    int
+        The place behind the list.
+
+    Examples
+    --------
+    >>> found = []
+    >>> decode_items('{"a": [1, {"b": 2}], "c": 3}', 6, found.append, "a"), found
+    (19, [1, {'b': 2}])
+    """
+    at, number = _behind_blanks(text, at + 1), 0
+    while text[at : at + 1] != "]":
+        with _refused_as_json(f"{where} {number}"):
+            if number and text[at : at + 1] != ",":
+                raise ValueError("Expecting ',' delimiter")
+            at = _behind_blanks(text, at + bool(number))
+            value, end = _item(text, at)
+        take(value)
+        at, number = _behind_blanks(text, at + end), number + 1
+    return at + 1
+
+
+def _item(text: str, at: int) -> tuple[object, int]:
+    """Return the value that begins at a place, and its length: of what is far longer little is decoded."""
+    for size in _WINDOWS:
+        window = text[at : at + size]
+        try:
+            value, end = _DECODER.raw_decode(window)
+            break
+        except ValueError:
+            if size == _WINDOWS[-1]:
+                raise
+    _check_characters(value, window[:end])
+    return value, end
+
+
+def _behind_blanks(text: str, at: int) -> int:
+    while text[at : at + 1] in _BLANKS:
+        at += 1
+    return at
+
+
+def _check_characters(value: object, text: str) -> None:
+    """Refuse half a surrogate pair, which has no bytes: it would fail where it is printed or written."""
+    shown = json.dumps(value, ensure_ascii=False) if "\\u" in text else text
+    if not shown.isascii() and _HALF.search(shown):
+        raise ValueError("half a surrogate pair is no character")
+
+
+@contextmanager
+def _refused_as_json(where: str) -> Iterator[None]:
+    try:
+        yield
     except (ValueError, RecursionError) as error:
         raise InvalidArgumentError(f"{where}: expected JSON, got a text that is none ({error})") from error
-    return value
 
 
 def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no JSON number")
+
+
+_BLANKS, _DECODER = (" ", "\t", "\n", "\r"), json.JSONDecoder(parse_constant=_refuse_constant)
+_WINDOWS = 1 << 11, 1 << 15, 1 << 22  # An item of a list: most are short, an image of 1,000 boxes is not
 
 
 @cache
