@@ -326,6 +326,9 @@ class CameraRecord:
         for name, low in (("horizontal_fov_deg", 0.0), ("pitch_deg", -90.0), ("roll_deg", -90.0)):
             if (given := getattr(self, name)) is not None:
                 in_range(f"camera.{name}", given, low, low + 180.0, open_low=True, open_high=True)
+        if self.yaw_deg is not None:  # which goes round
+            most_deg = math.degrees(MOST_TURNS_RAD)
+            in_range("camera.yaw_deg", self.yaw_deg, -most_deg, most_deg)
         if self.cx is not None:
             in_range("camera.cx", self.cx, 0.0, self.width_px)
         if self.position_m is not None and math.hypot(*self.position_m[:2]) >= NOMINAL_RANGE_M:

@@ -2,9 +2,11 @@
 
 import logging
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_side
 
@@ -52,8 +54,12 @@ class _ContextFile:
         order = {direction: place for place, direction in enumerate(usual.directions)}
         known = usual.occluders
         if self.arms is not None:
-            known = tuple(arm.occluder(-1 if order.get(arm.direction) else 1) for arm in self.arms)
-        half_deg = self.view_half_angle_deg
+            names = [arm.direction for arm in self.arms]
+            if not len({*names}) == len(names) > 0:
+                raise InvalidArgumentError(f"context.arms: expected different directions, got {names}")
+            known = tuple(self._occluders(order))
+        if (half_deg := self.view_half_angle_deg) is not None:
+            in_range("context.view_half_angle_deg", half_deg, 0.0, 180.0)
         return Context(
             rates=self.rates or usual.rates,
             occluders=tuple(sorted(known, key=lambda one: order.get(one.direction, len(order)))),
@@ -62,6 +68,14 @@ class _ContextFile:
             site=self.site,
             view_half_angle_rad=usual.view_half_angle_rad if half_deg is None else math.radians(half_deg),
         )
+
+    def _occluders(self, order: Mapping[str, int]) -> Iterator[Occluder]:
+        for number, arm in enumerate(self.arms or ()):
+            try:
+                yield arm.occluder(-1 if order.get(arm.direction) else 1)
+            except InvalidArgumentError as error:
+                said = str(error).removeprefix("context.arms: ")
+                raise InvalidArgumentError(f"context.arms[{number}]: {said}") from error
 
 
 def read_context(path: str | Path) -> Context:

@@ -315,6 +315,7 @@ def test_of_a_running_camera_boxes_outside_are_counted_and_an_image_of_them_alon
         ({"min_box_px": -1}, "camera.min_box_px"),
         ({"min_score": 75}, "camera.min_score"),
         ({"image_rate_hz": 0}, "camera.image_rate_hz"),
+        ({"yaw_deg": 1e9}, r"camera.yaw_deg: .* got 1000000000"),
         ({"stamp_offset_s": 1e11}, "stamp_offset_s"),
         ({"width_px": 0}, "width_px"),
     ],

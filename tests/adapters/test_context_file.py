@@ -87,12 +87,20 @@ def rates() -> dict[str, float]:
         ({"arms": [LEFT, {**RIGHT, "speed": 12.0}]}, r"context.arms\[1\]: expected keys among .*\['speed'\]"),
         ({"rates": {**rates(), "arrivals_hz": 0.01}}, r"context.rates: expected keys among .*'arrivals_hz'"),
         ({"arms": [LEFT]}, "priors for"),
-        ({"arms": [LEFT, LEFT]}, "different"),
-        ({"arms": [{**LEFT, "corner_m": [5.0, 0.0]}, RIGHT]}, "corner_m"),
+        ({"arms": [LEFT, LEFT]}, r"context\.arms: expected different directions, got \['left', 'left'\]"),
+        ({"arms": []}, r"context\.arms: expected different"),
+        (
+            {"view_half_angle_deg": 200.0},
+            r"context\.view_half_angle_deg: expected a number in \[0.0, 180.0\]",
+        ),
+        ({"arms": [RIGHT, {**LEFT, "corner_m": [5.0, 0.0]}]}, r"context\.arms\[1\]: corner_m"),
         ({"arms": [{**LEFT, "corner_m": [9.5, 3.0]}, RIGHT]}, "nearer than 9"),
         ({"arms": [{**LEFT, "speed_mps": -1.0}, RIGHT]}, "speed_mps"),
         ({"arms": [{**LEFT, "crossing_m": None}, RIGHT]}, "crossing_m"),
-        ({"arms": [{"direction": "left"}, RIGHT]}, "corner_m and crossing_m, or"),
+        (
+            {"arms": [{"direction": "left"}, RIGHT]},
+            r"context\.arms\[0\]: expected corner_m and crossing_m, or",
+        ),
         ({"ego_speed_mps": "fast"}, "ego_speed_mps"),
     ],
 )
