@@ -345,15 +345,6 @@ def test_seen_without_being_heard_is_an_entity_of_its_own():
     assert "emerged_from" not in {r.kind for r in world.state.relations}
 
 
-def test_back_into_occlusion_with_the_same_id():
-    script = [measured(t, FRONT, car(0.1 - 0.35 * (t - 1.0))) for t in hops(1.0, 2.5)]
-    script += [measured(t, RIGHT, answer=Absent(0.6)) for t in hops(2.5, 5.0)]
-    _, states = run(start(), script)
-    assert states[-1].entities[0].status == "hidden"
-    assert states[-1].entities[0].last_seen_ns == 2_400_000_000
-    assert len({e.id for s in states for e in s.entities}) == 1
-
-
 @pytest.mark.parametrize("miss_rate", [0.04, 0.3, 0.9])
 def test_empty_looks_move_existence_as_bernoulli_says(miss_rate):
     """One look an interval counts in full: r (1 - pd) / (1 - r pd), times survival."""

@@ -7,7 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import MOSTLY_MISSED, Unqueried
+from worldstate.abduction.co_evidence import MOSTLY_MISSED
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
@@ -18,7 +18,7 @@ from worldstate.belief.track import NEVER_NS, Tracks, born, heard_as
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
 from worldstate.ground import BoolArray
 from worldstate.ground.values import nanoseconds, wrap_angle
-from worldstate.measurement import Measurement, Sector
+from worldstate.measurement import Measurement
 from worldstate.state import Event
 from worldstate.state.entity import EventKind
 
@@ -27,11 +27,6 @@ from .memory import Memory
 # After a hand-over no birth on its side: the window still holds the sound from before it.
 _REARM_NS = nanoseconds(1.0)
 _MASKED = 0.5  # Of the existence below which a hidden entity ends, beside a vehicle just come into view
-# A moving entity out of sight for so long may be the one now heard hidden nearby: more than one image at
-# 10 Hz, since a single miss is no occlusion, and less than a following vehicle takes, which would get its id.
-REOCCLUSION_NS, _REOCCLUSION_END_NS = nanoseconds(0.15), nanoseconds(3.0)
-# From the edge that it was last seen near: less than the 64 degrees between the edges of a default junction.
-_REOCCLUSION_RAD = 0.8
 HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 _LOST_RAD = 0.8  # Standard deviation; beyond, the azimuth is known to no more than half of the view
 # Of two at one place; an entity that is found by itself within it is another one.
@@ -109,31 +104,23 @@ def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry
 def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> None:
     """Add one more hidden entity on a side, of unknown side where it is the only one."""
     tracks, sides, shares = memory.tracks, memory.sides, tuple[float, ...]()
-    row = _returning(memory, k, site)
-    if row is None:
-        # After a hand-over it is another one, of the other side.
-        if sides.both is not None and not hidden_rows(tracks) and all(_rearmed(memory)):
-            shares = sides.side_shares(site.settings.death_probability)
-        one = born(site.sides[k].label, memory.history[k].births, 0.0, measurement.stamp_ns, site)
-        memory.history[k].births += 1
-        # A detector adds to the kinds at the hand-over.
-        one = replace(one, labels=measurement.kinds or one.labels, sources=(measurement.source,))
-    else:
-        one = tracks.row(row)
-        tracks = tracks.without([row])
+    # After a hand-over it is another one, of the other side.
+    if sides.both is not None and not hidden_rows(tracks) and all(_rearmed(memory)):
+        shares = sides.side_shares(site.settings.death_probability)
+    one = born(site.sides[k].label, memory.history[k].births, 0.0, measurement.stamp_ns, site)
+    memory.history[k].births += 1
     # What came into view from here before was another vehicle: the new one starts without its mass.
     if isinstance(memory.belief, WindowBelief):
         memory.belief = memory.belief.map(partial(ExplanationBelief.forget_origin, direction=k))
     one = replace(
         one,
         side=k,
-        seen=False,
         came_from=1.0,
         existence=min(sides.hidden[k], 1.0),
         motion=site.sides[k].prior(),
-        updated_ns=measurement.stamp_ns,
-        place=None,
-        behind=1.0,
+        # A detector adds to the kinds at the hand-over.
+        labels=measurement.kinds or one.labels,
+        sources=(measurement.source,),
         side_shares=shares,
     )
     memory.tracks = tracks.joined([one])
@@ -238,33 +225,6 @@ def hidden_on(tracks: Tracks, k: int) -> int | None:
 def _may_be_on(tracks: Tracks, row: int, side: int) -> bool:
     of_side = tracks.of_side(row)
     return bool(tracks.side_shares[row][side] > 0.0) if of_side is None else of_side == side
-
-
-def _returning(memory: Memory, k: int, site: SiteGeometry) -> int | None:
-    """Return the moving entity that looks have missed near this side's edge for a moment, if any."""
-    tracks = memory.tracks
-    recent = tracks.unseen_ns(memory.stamp_ns) <= _REOCCLUSION_END_NS
-    rows = np.flatnonzero(tracks.seen & tracks.moving & recent).tolist()
-    azimuth_rad = {i: float(tracks.mean[i, AZIMUTH]) for i in rows}
-    apart_rad = {
-        i: site.sides[k].distance_rad(at)
-        for i, at in azimuth_rad.items()
-        # A camera that has died since says nothing of it.
-        if _searched_ns(memory, at) >= int(tracks.last_seen_ns[i]) + REOCCLUSION_NS
-    }
-    near = (i for i, apart in apart_rad.items() if apart <= _REOCCLUSION_RAD)
-    return min(near, key=apart_rad.__getitem__, default=None)
-
-
-def _searched_ns(memory: Memory, azimuth_rad: float) -> int:
-    """Return when a sensor last searched an azimuth, `NEVER_NS` if none has."""
-    asked = (one for one in memory.looks.values() if not isinstance(one.answer, Unqueried))
-    there = (
-        one.stamp_ns
-        for one in asked
-        if one.sector_rad is None or Sector.between(*one.sector_rad).touches(azimuth_rad)
-    )
-    return max(there, default=NEVER_NS)
 
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.

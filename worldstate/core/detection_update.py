@@ -35,7 +35,7 @@ from worldstate.ground import BoolArray, FloatArray, nanoseconds, seconds, wrap_
 from worldstate.ground.typing import IndexArray
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
-from .birth_death import REOCCLUSION_NS, after_look
+from .birth_death import after_look
 from .cues import NO_LOOK, claimed_nats, update_rule
 from .fixed_lag import LAG_NS
 from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory, SourceRule
@@ -308,12 +308,16 @@ def _see(
     tracks.miss_rate[rows] = miss_rates(scans, azimuth_rad)
 
 
+# Out of sight for longer: more than one image at 10 Hz, since a single miss is no occlusion.
+_OUT_OF_SIGHT_NS = nanoseconds(0.15)
+
+
 def _announce(tracks: Tracks, row: int, site: SiteGeometry) -> None:
     """Put a track that a message has placed on the side whose occluder hides it there, if one does."""
     x, y = tracks.place_mean[row, :2].tolist()
     side = site.hiding_side(math.atan2(y, x))
     unseen_ns = tracks.unseen_ns(int(tracks.updated_ns[row]))[row]
-    if side is not None and (not tracks.seen[row] or unseen_ns > REOCCLUSION_NS):
+    if side is not None and (not tracks.seen[row] or unseen_ns > _OUT_OF_SIGHT_NS):
         tracks.side[row], tracks.seen[row], tracks.came_from[row] = side, False, 1.0
 
 
