@@ -29,7 +29,7 @@ from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError, WorldstateError
 from worldstate.ground.checks import in_range, one_of
 from worldstate.ground.typing import Float32Array
-from worldstate.ground.values import nanoseconds, seconds
+from worldstate.ground.values import integer_ns, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import WorldState
 
@@ -307,7 +307,8 @@ class Listener:
             self._blind = False
         query = self._cameras[one_of("camera", camera, self._cameras)]
         held_bytes = checked_frame("look", frame).boxes_px.nbytes + sum(map(len, frame.labels))
-        self._take(query.taken_ns(stamp_ns), camera, partial(_seen, query, stamp_ns, frame), held_bytes)
+        taken_ns = query.taken_ns(integer_ns("stamp_ns", stamp_ns))
+        self._take(taken_ns, camera, partial(_seen, query, stamp_ns, frame), held_bytes)
 
     def _take(self, stamp_ns: int, name: str, take: Callable[[], int], held_bytes: int = 0) -> None:
         """Take what is near the sound; what is ahead of it waits for its own."""

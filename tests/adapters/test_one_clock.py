@@ -472,6 +472,17 @@ def test_a_look_that_was_told_ahead_and_cannot_be_read_costs_itself() -> None:
     assert max(view.stamp_ns for view in states[-1].searched) == nanoseconds(2.7)
 
 
+@pytest.mark.parametrize("stamp_ns", [None, "0", 1.5e9, float("nan"), float("inf"), 1j, 10**40])
+def test_a_stamp_that_is_no_whole_number_is_refused_by_name(stamp_ns: Any) -> None:
+    listener = three()
+    with pytest.raises(InvalidArgumentError, match="stamp_ns: expected integer nanoseconds"):
+        listener.look(stamp_ns, NONE)
+    with pytest.raises(InvalidArgumentError, match="look: expected a DetectionFrame, got None"):
+        listener.look(0, None)  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgumentError, match="add: expected Measurement"):
+        listener.add(stamp_ns)
+
+
 @pytest.mark.parametrize(
     ("at_s", "told", "tries", "refused"),
     [
