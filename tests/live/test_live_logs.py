@@ -216,6 +216,24 @@ def test_a_trace_that_is_removed_is_a_notice(tmp_path, caplog, name):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("name", ["rosbag", "rosbag-sqlite3"])
+@pytest.mark.parametrize("at_ns", [1_500_000_000, 2_000_000_000])
+def test_a_bag_that_is_removed_ends_no_run(street, tmp_path, monkeypatch, caplog, name, at_ns):
+    def show(step):
+        if step.step.state.stamp_ns == at_ns:
+            shutil.rmtree(next(tmp_path.glob(".bag*")))
+
+    monkeypatch.setattr("worldstate.cli.common.live_view.view_of", show)
+    monkeypatch.setattr("worldstate.cli.common.live_view._SHOWN_EVERY_NS", 0)
+    export = "--export", f"{name}={tmp_path / 'bag'}"
+    assert (
+        main([*words(street, tmp_path, "--speed", 10, "--view")[:8], *export, "--speed", "10", "--view"]) == 0
+    )
+    assert last_s(tmp_path / "states.jsonl") == 2.0
+    assert [record.getMessage().partition(": ")[0] for record in caplog.records] == [str(tmp_path / "bag")]
+    assert not (tmp_path / "bag").exists()
+
+
 def test_a_folder_that_is_removed_ends_no_run(tmp_path, caplog):
     (folder := tmp_path / "logs").mkdir()
     with line_writer(folder / "log.jsonl", GrowingFile) as write:

@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     Stack = AbstractContextManager[Callable[[WorldState], object]]
 
+_LOG = logging.getLogger(__name__)
 FOXGLOVE_PORT = 8765
 CROSSING_M = 9.0
 # Exporters of the library, with the optional module that each needs.
@@ -172,8 +174,28 @@ def _stack(name: str, target: str, crossing_m: float, live: bool, arguments: arg
     }
     if name in own:
         opened: Stack = own[name](target)
-        return opened
+        return _expendable(target, opened) if live and name.startswith("rosbag") else opened
     return own_exporter(name, load_part("worldstate.exporters", name, "--export", EXPORTERS), target)
+
+
+@contextmanager
+def _expendable(target: str, stack: "Stack") -> "Iterator[Callable[[WorldState], object]]":
+    """Lend what a bag lends: one that cannot be written is a notice and not the end of a run."""
+    failed = False
+
+    def tried(write: Callable[[], object]) -> None:
+        nonlocal failed
+        try:
+            write()
+        except Exception as error:  # SQLite and MCAP have errors of their own
+            if not failed:
+                _LOG.warning("%s: nothing is kept: %s", target, error)
+            failed = True
+
+    with ExitStack() as opened:
+        export = opened.enter_context(stack)
+        yield lambda state: None if failed else tried(partial(export, state))
+        tried(opened.pop_all().close)
 
 
 @contextmanager
