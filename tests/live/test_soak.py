@@ -9,7 +9,6 @@ import threading
 import time
 from collections import Counter
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -286,30 +285,36 @@ def test_a_run_with_a_fault_every_second_goes_on(
     assert main(["live", *given, *kept, *ends, *(["--key", "key"] if key else [])]) == 0
     printed = capsys.readouterr()
     report, faults = json.loads(printed.out), feed.faults.total()
+    lost = sum(int(one) for one in re.findall(r"s\.jsonl: (\d+) records were lost", caplog.text))
+    left_out = feed.sound.start_ns // HOP_NS
+    used_mib = [used >> 20 for used in feed.bytes]
+    figures = {"faults": feed.faults, "records lost": lost, "hops left out": left_out}
+    figures["MiB at start, end, most"] = used_mib[0], used_mib[-1], max(used_mib)
+    with capsys.disabled():
+        print(json.dumps(report | figures, indent=1) if length_s > 60.0 else "", end="")
     assert "Traceback" not in printed.err
     assert set(feed.faults) == {name.removeprefix("_fault_") for name in feed.kinds}
     assert faults >= 0.9 * 40 / feed.every * (length_s - 3.0) - 1
     assert report["detections_refused"] + report["odometry_refused"] > 100 * faults
-    assert report["detections_dropped"] <= 64  # of the first second
-    assert report["states"] == pytest.approx(10 * length_s, abs=0.02 * 10 * length_s + 12)
+    # A machine with more to do than it has cores is too slow: what it loses is counted.
+    if report["load"] < os.cpu_count():
+        assert report["detections_dropped"] <= 64  # of the first second
+        assert left_out <= 0.02 * 10 * length_s
+    assert report["states"] + left_out == pytest.approx(10 * length_s, abs=12)
     logs = [*(f"kept/{number}.jsonl" for number in range(1, feed.faults["log_deleted"] + 1)), "s.jsonl"]
-    states = [state for log in logs for _, state in read_log(Path(log))]
-    for before, state in pairwise(states):
-        assert broken_laws(state, before if state.stamp_ns - before.stamp_ns == HOP_NS else None) == []
+    logged, before = 0, None
+    for log in logs:
+        for _, state in read_log(Path(log)):
+            logged, follows = logged + 1, before and state.stamp_ns - before.stamp_ns == HOP_NS
+            assert broken_laws(state, before if follows else None) == []
+            before = state
     # All that is missing was counted as lost, or left out of a gap in the sound.
-    lost = sum(int(one) for one in re.findall(r"s\.jsonl: (\d+) records were lost", caplog.text))
-    assert len(states) + lost == report["states"]
-    left_out = feed.sound.start_ns // HOP_NS
-    assert (states[-1].stamp_ns - states[0].stamp_ns) // HOP_NS + 1 == len(states) + lost + left_out
-    assert states[-1].delivery.refused > 0.5 * faults
+    assert logged + lost == report["states"]
+    assert (before.stamp_ns - 1_000_000_000) // HOP_NS + 1 == logged + lost + left_out
+    assert before.delivery.refused > 0.5 * faults
     # MCAP that could not be written ends there, until it begins anew.
     *_, (_, last) = read_log(tmp_path / "s.mcap")
-    assert last in states[-60:]
-    assert read_checkpoint(tmp_path / "belief.json").world.stamp_ns == states[-1].stamp_ns
+    assert before.stamp_ns - last.stamp_ns <= 6_000_000_000
+    assert read_checkpoint(tmp_path / "belief.json").world.stamp_ns == before.stamp_ns
     # Buffers are full after a minute.
-    assert max(feed.bytes[60:], default=0) < max(feed.bytes[:60]) + (64 << 20)
-    figures = {"faults": feed.faults, "lost in logs": lost, "hops left out": left_out, "states": len(states)}
-    with capsys.disabled():
-        memory = {"first_mib": feed.bytes[0] >> 20, "last_mib": feed.bytes[-1] >> 20}
-        memory["largest_mib"] = max(feed.bytes) >> 20
-        print(json.dumps(report | figures | memory, indent=1) if length_s > 60.0 else "", end="")
+    assert max(used_mib[60:], default=0) < max(used_mib[:60]) + 64
