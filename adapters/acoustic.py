@@ -31,12 +31,11 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.given_spectra import GivenSpectra, SpectrumFrontEnd
-from worldstate.frontend.health.common_sound import NOTHING_IN_COMMON
-from worldstate.frontend.hop_spectra import falling
+from worldstate.frontend.health.common_sound import ARRAY_FAULTS
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground import LEAST_HEARD, NotUsable, OutOfDomainError, wrap_angle
+from worldstate.ground import LEAST_HEARD, NotUsable, OutOfDomainError, falling, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
 from worldstate.measurement.measurement import MeasurementAdapter
@@ -359,10 +358,10 @@ def _approach(frame: AcousticFrame) -> Approach | NotUsable:
 
 
 def _array_fault(frame: AcousticFrame) -> str | None:
-    """Return how many microphones have which fault, or that they share no sound; None if all is well."""
+    """Return why all of the microphones are not heard, or how many have which fault; None if all is well."""
     health = frame.health
-    if frame.heard is not None and frame.heard < LEAST_HEARD and frame.unheard == NOTHING_IN_COMMON:
-        return NOTHING_IN_COMMON
+    if frame.heard is not None and frame.heard < LEAST_HEARD and frame.unheard in ARRAY_FAULTS:
+        return frame.unheard
     if isinstance(health, NotUsable) or not health.faults:
         return None
     counts = Counter(one.fault.value for one in health.faults)

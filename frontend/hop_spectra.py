@@ -17,9 +17,9 @@ from worldstate.frontend.direction.bearing import steered_power
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum_of
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
-from worldstate.frontend.health.common_sound import NOTHING_IN_COMMON, CommonSound
+from worldstate.frontend.health.common_sound import CommonSound
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
-from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError
+from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError, falling
 from worldstate.ground.typing import Complex128Array, Float32Array
 
 from .settings import ELEVATIONS_RAD, HIGHEST_SHARE, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
@@ -87,7 +87,8 @@ class HopSums:
     pairs: Complex128Array  # shape (30,): Pair sums of the published feature
     energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
     health: ArrayHealth  # Faults of the array, and the microphones used
-    common: float | None = None  # Coherence over that of a diffuse field, None where it decides nothing
+    # Share that coherence and positions leave to be heard, and what takes the rest.
+    common: tuple[float, str | None] = (1.0, None)
 
     @property
     def n_frames(self) -> int:
@@ -147,7 +148,8 @@ class HopSpectra:
         health = self._unmonitored
         if self.monitor is not None:
             health = self.monitor.push(recorded, energies, powers, matrices)
-        common = self._common.push(matrices, len(spectra), health.mask.keep) if self._common else None
+        keep = health.mask.keep
+        common = self._common.push(matrices, len(spectra), keep) if self._common else (1.0, None)
         health.mask.silence(whitened)
         inside = whitened[:, self._srp]
         srp = np.concatenate([steered_power(inside, row) for row in self.beams]) * health.mask.power_scale
@@ -290,9 +292,6 @@ _NOISE_DB = (6.0, 12.0)
 _JUMP_DB, _JUMP_HOPS = (6.0, 10.0), 3
 # Fall below the loudest hop of a noise by which it ends; what lasts ten seconds is the place's own.
 _END_DB, _LONGEST_HOPS = 5.0, 100
-# Coherence over that of a diffuse field: of a clean simulated street, 4 to 56 microphones, 0.3 and more, of
-# 4,202 hops of real ones 0.28 and more, of a quiet street under independent noise 10 dB louder below 0.1.
-_IN_COMMON = (0.15, 0.25)
 # Excess of the lowest quarter of the bands over the highest that only wind has.
 _WIND_DB = 10.0
 
@@ -331,18 +330,17 @@ class NoiseMeter:
         self._jump = None
 
     def push(
-        self, levels: FloatArray, coherence: float, common: float | None = None
+        self, levels: FloatArray, coherence: float, common: tuple[float, str | None] = (1.0, None)
     ) -> tuple[float, str | None]:
         """Take log-energies (bands,) and the coherence of a hop; return its share and what takes the rest.
 
-        `common` is the coherence over that of a diffuse field; what is not common is not the place's own.
+        `common` is the same before levels are compared: what is then not heard is not the place's own.
         """
-        level_db = levels * _DB
-        heard = 1.0 if common is None else 1.0 - falling(common, _IN_COMMON)
-        if heard < LEAST_HEARD and not self._memory:
-            return heard, NOTHING_IN_COMMON
-        share, reason = self._masked(level_db, coherence, learn=heard >= LEAST_HEARD)
-        return (share, reason) if share <= heard else (heard, NOTHING_IN_COMMON)
+        heard = common[0] >= LEAST_HEARD
+        if not heard and not self._memory:
+            return common
+        masked = self._masked(levels * _DB, coherence, learn=heard)
+        return masked if masked[0] <= common[0] else common
 
     def _masked(self, level_db: FloatArray, coherence: float, learn: bool) -> tuple[float, str | None]:
         """Return the share that noise above this place's usual leaves; learn what is usual if it is heard."""
@@ -380,15 +378,3 @@ class NoiseMeter:
         is_old = self._n_hops - begin >= _LONGEST_HOPS
         self._jump = None if has_ended or is_old else (before, highest, begin)
         return loudness_db - before
-
-
-def falling(value: float, between: tuple[float, float]) -> float:
-    """Return 1 below the first of two values, 0 above the second, linear between them.
-
-    Examples
-    --------
-    >>> [falling(value, (6.0, 12.0)) for value in (3.0, 9.0, 20.0)]
-    [1.0, 0.5, 0.0]
-    """
-    low, high = between
-    return min(max((high - value) / (high - low), 0.0), 1.0)

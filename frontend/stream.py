@@ -90,8 +90,8 @@ class AcousticFrame:
         of the window is left. Hops of which less than .2 could be heard are left out of everything here.
         None where it is not measured: of given spectra.
     unheard : str or None
-        Why the rest could not: "lost samples", "wind", "noise far above this place's usual" or "no sound
-        common to the microphones".
+        Why the rest could not: "lost samples", "wind", "noise far above this place's usual", "no sound
+        common to the microphones" or "sound that contradicts the positions of the microphones".
     excess_db : float
         Level of the newest hop above the quiet street, a mean over bands, decibels.
 

@@ -13,6 +13,7 @@ from .typing import IntArray as IntArray
 from .values import LEAST_HEARD as LEAST_HEARD
 from .values import NANOSECONDS_PER_SECOND as NANOSECONDS_PER_SECOND
 from .values import NotUsable as NotUsable
+from .values import falling as falling
 from .values import integer_ns as integer_ns
 from .values import nanoseconds as nanoseconds
 from .values import seconds as seconds

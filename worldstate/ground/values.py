@@ -50,6 +50,18 @@ class NotUsable:
         check_fields(self, reason=str)
 
 
+def falling(value: float, between: tuple[float, float]) -> float:
+    """Return 1 below the first of two values, 0 above the second, linear between them.
+
+    Examples
+    --------
+    >>> [falling(value, (6.0, 12.0)) for value in (3.0, 9.0, 20.0)]
+    [1.0, 0.5, 0.0]
+    """
+    low, high = between
+    return min(max((high - value) / (high - low), 0.0), 1.0)
+
+
 def significant(values: FloatArray, figures: int) -> FloatArray:
     """Round to so many significant figures: what a file of coefficients need not hold.
 

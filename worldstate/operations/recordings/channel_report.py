@@ -12,13 +12,13 @@ import numpy as np
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Dropout, Fault
-from worldstate.frontend.health.common_sound import NOTHING_IN_COMMON
+from worldstate.frontend.health.common_sound import ARRAY_FAULTS, NOTHING_IN_COMMON, OUT_OF_PLACE
 from worldstate.frontend.health.position_check import NOTHING_AGAINST, PositionVerdict
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import Via, encode
 from worldstate.ground.typing import BoolArray
-from worldstate.ground.values import NotUsable, seconds
+from worldstate.ground.values import LEAST_HEARD, NotUsable, seconds
 from worldstate.operations import figure_style as style
 
 # Of a rate by another clock: an error of four standard deviations is significant, one false report in 16,000.
@@ -37,6 +37,11 @@ _EXPLAINS = {
 _MISPLACED = frozenset({Fault.SWAPPED, Fault.DELAY, Fault.DRIFT})
 # What no wave arrives at in its order: the position of a channel with a clock of its own cannot be judged.
 _DEAF = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.DELAY, Fault.DRIFT})
+# Where to look if an array is not heard.
+_CAUSES = {
+    NOTHING_IN_COMMON: "wind, sample format, leads",
+    OUT_OF_PLACE: "order, leads and start of the channels, sample format",
+}
 # Dropouts beyond these are counted, not listed.
 _LISTED_DROPOUTS = 100
 # Eleven faults by six colours and two markers.
@@ -134,19 +139,14 @@ class RecordingHealth:
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
     sample_rate: RateEstimate | None = None  # By another clock
     positions: PositionVerdict = NOTHING_AGAINST
-    unheard: float = 0.0  # Share of the hops in which no microphone hears what another hears
+    unheard: str | None = None  # Why the array is not heard in most hops
 
     @property
     def is_healthy(self) -> bool:
         """Whether nothing was wrong."""
         rate_is_wrong = self.sample_rate is not None and self.sample_rate.is_wrong
-        well = self.positions.fits and not self.is_deaf
-        return well and not (self.verdicts or self.n_dropouts or rate_is_wrong)
-
-    @property
-    def is_deaf(self) -> bool:
-        """Whether in most hops no microphone hears what another hears."""
-        return self.unheard > 0.5
+        wrong = self.verdicts or self.n_dropouts or rate_is_wrong or self.unheard
+        return self.positions.fits and not wrong
 
     def hears_waves(self, n_channels: int) -> BoolArray:
         """Channels whose sound is that of the others, wherever they stand, (M,)."""
@@ -177,7 +177,8 @@ class HealthLog:
     """
 
     def __init__(self) -> None:
-        self._n_hops, self._n_unheard = 0, 0
+        self._n_hops = 0
+        self._unheard: Counter[str | None] = Counter()
         self._seen: dict[tuple[int, Fault], ChannelVerdict] = {}
         self._dropouts: list[Dropout] = []
         self._latest: ArrayHealth | None = None
@@ -185,7 +186,7 @@ class HealthLog:
     def add(self, frame: AcousticFrame) -> None:
         """Take one hop; frames without a health report count as healthy."""
         self._n_hops += 1
-        self._n_unheard += frame.unheard == NOTHING_IN_COMMON
+        self._unheard[frame.unheard] += frame.heard is not None and frame.heard < LEAST_HEARD
         health = frame.health
         if isinstance(health, NotUsable):
             return
@@ -205,7 +206,7 @@ class HealthLog:
         latest = self._latest
         dropouts, count = tuple(self._dropouts[:_LISTED_DROPOUTS]), latest.n_dropouts if latest else 0
         coherence = latest.coherence if latest else NotUsable("nothing heard")
-        unheard = self._n_unheard / max(self._n_hops, 1)
+        unheard = next((why for why in ARRAY_FAULTS if 2 * self._unheard[why] > self._n_hops), None)
         return RecordingHealth(self._verdicts(), dropouts, count, self._n_hops, coherence, unheard=unheard)
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
@@ -283,6 +284,7 @@ def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stanc
         "coherence": None if isinstance(health.coherence, NotUsable) else health.coherence,
         "masked_microphones": [channel + 1 for channel in health.masked_channels],
         "condition": "working" if health.is_healthy else "impaired",
+        "unheard": health.unheard,
         "positions": _positions_json(health.positions),
         "faults": [_fault_json(verdict) for verdict in health.verdicts],
         "n_dropouts": health.n_dropouts,
@@ -403,7 +405,7 @@ def _conclusion(health: RecordingHealth) -> str:
     for verdict in health.verdicts:
         kinds.setdefault(verdict.fault.value, set()).add(verdict.channel + 1)
     parts = [f"{kind} {', '.join(map(str, sorted(found)))}" for kind, found in kinds.items()]
-    parts += [f"{NOTHING_IN_COMMON} (wind, sample format, leads)"] if health.is_deaf else []
+    parts += [f"{health.unheard} ({_CAUSES[health.unheard]})"] if health.unheard else []
     parts += [] if health.positions.fits else ["sound and positions do not belong together"]
     masked = len(health.masked_channels)
     left_out = f"; {masked} left out by the front-end" if masked else ""
