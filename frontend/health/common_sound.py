@@ -78,8 +78,12 @@ class CommonSound:
         """Go on with the pairs of some channels, (M,)."""
         chosen = self._used & kept[:, None] & kept
         self._kept, self._chosen = kept, chosen.astype(np.float32)
-        self._count = chosen.sum(axis=(1, 2))
+        self._count = count = chosen.sum(axis=(1, 2))
         self._diffuse = np.square(self._field * chosen).sum(axis=(1, 2))
+        self._scatter = _SIGMAS * np.sqrt(2.0 * count), _SIGMAS * float(np.sqrt(2.0 * count.sum()))
+        self._decides = bool(self.decides(count.sum(), self._diffuse.sum()))
+        bins = self.decides(count, self._diffuse)
+        self._bins = np.flatnonzero(bins) if np.count_nonzero(bins) >= _FEWEST_BINS else None
 
     def push(self, matrices: Complex64Array, n_frames: int, keep: BoolArray) -> tuple[float, str | None]:
         """Take the cross-spectra (K, M, M) of a hop and the microphones kept (M,); return what can be heard.
@@ -106,17 +110,18 @@ class CommonSound:
 
     def _compare_noise(self) -> None:
         """Take the share that independent noise leaves, of the whole band and of its bins."""
-        count, diffuse, noise = self._count, self._diffuse, self._noise / self._n_frames**2
-        if not self.decides(count.sum(), diffuse.sum()):
+        if not self._decides:
             return
-        power = (np.square(self._sum.real) + np.square(self._sum.imag)) / np.float32(self._n_frames**2)
-        excess = (power * self._chosen).sum(axis=(1, 2)) - noise * count
-        least = _SIGMAS * noise * np.sqrt(2.0 * count)
-        whole = (excess.sum() - _SIGMAS * noise * np.sqrt(2.0 * count.sum())) / diffuse.sum()
-        decides = self.decides(count, diffuse)
-        judged = np.count_nonzero(decides) >= _FEWEST_BINS
-        in_bins = float((excess - least > _IN_BIN * diffuse)[decides].mean()) if judged else 1.0
-        self._common.append(1.0 - max(falling(float(whole), _IN_COMMON), falling(in_bins, _BINS)))
+        noise, (scatter, scatter_of_all) = self._noise / self._n_frames**2, self._scatter
+        power = np.square(self._sum.real) + np.square(self._sum.imag)
+        power *= self._chosen
+        excess = power.sum(axis=(1, 2)) / self._n_frames**2 - noise * self._count
+        whole = float(excess.sum() - noise * scatter_of_all) / float(self._diffuse.sum())
+        covered = falling(whole, _IN_COMMON)
+        if self._bins is not None:
+            in_common = (excess - noise * scatter > _IN_BIN * self._diffuse)[self._bins]
+            covered = max(covered, falling(np.count_nonzero(in_common) / len(in_common), _BINS))
+        self._common.append(1.0 - covered)
 
     def _compare_places(self) -> None:
         """Compare the coherence of the last half second with the positions of the channels that are kept."""
