@@ -36,6 +36,8 @@ _MOST_CHANNELS = 12
 _KEPT = np.float32(0.8)
 # Power of a sum of T independent frames over T: neighbours share half a Hann window and correlate by 1/6.
 _OVERLAP = 1.0 + 2.0 / 36.0
+# Frames without which nothing is compared: after a loss the sums of what was before it fade for ever.
+_LEAST_FRAMES = 1.0
 # Standard deviations of noise that are taken off v: in the first hops it scatters most. Three of them,
 # at nine frames a hop, may be no more than the least v of clean streets less the most that is unheard.
 _SIGMAS, _FRAMES, _MOST_STD = 3.0, 9.0, 0.03
@@ -99,7 +101,7 @@ class CommonSound:
         kept = keep[self._picked]
         if not np.array_equal(kept, self._kept):
             self._choose(kept)
-        if self._n_frames:
+        if self._n_frames > _LEAST_FRAMES:
             self._compare_noise()
             if self._hops % _EVERY_HOPS == 0 and np.count_nonzero(kept) > 2:
                 self._compare_places()

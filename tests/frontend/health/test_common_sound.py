@@ -20,6 +20,7 @@ from worldstate.frontend.health.common_sound import (
     ARRAY_FAULTS,
     NOTHING_IN_COMMON,
     OUT_OF_PLACE,
+    CommonSound,
     FarField,
 )
 from worldstate.frontend.hop_spectra import BANDS, NoiseMeter
@@ -150,6 +151,21 @@ def test_waves_fit_the_positions_and_no_other_order(seed: int, n: int, extent_m:
     assert len(known) > 10 or extent_m < 0.2
     assert fits is None or fits < 0.1
     assert len(known) < 10 or np.median(known) > 0.5
+
+
+@pytest.mark.filterwarnings("error")
+@settings(max_examples=10, deadline=None)
+@given(st.integers(1, 9000), st.integers(3, 6))
+def test_what_was_heard_before_a_loss_of_any_length_is_forgotten_and_no_more(lost: int, n: int) -> None:
+    rng = np.random.default_rng(lost)
+    positions = rng.uniform(-0.2, 0.2, (n, 3))
+    common, keep = CommonSound(MicrophoneArray(positions), BINS_HZ), np.ones(n, bool)
+    heard, nothing = 18.0 * far_field(positions, rng), np.zeros((len(BINS_HZ), n, n), complex)
+    heard[:, range(n), range(n)] = 18.0
+    for matrices, frames in [(heard, 18)] * 20 + [(nothing, 0)] * lost + [(heard, 18)] * 20:
+        share, reason = common.push(np.asarray(matrices, np.complex64), frames, keep)
+        assert 0.0 <= share <= 1.0
+    assert (share, reason) == (1.0, None)
 
 
 def test_the_mean_over_all_orders_is_that_over_each_of_them() -> None:
