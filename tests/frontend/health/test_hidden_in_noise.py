@@ -79,14 +79,14 @@ def test_a_vehicle_in_noise_is_not_heard_or_announced(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="95 of 100 when this was written", strict=False)
-def test_of_a_hundred_draws() -> None:
-    """Of five that failed four were wind that covers the long waves only, and is heard beside them.
+def test_of_a_hundred_draws_at_most_eleven_fail() -> None:
+    """None is asked to fail; when this was written five did, and eleven are the upper end of their interval.
 
-    That leaves as much in common as a windy street without any fault has. The fifth was heard for one hop.
+    Four of the five were wind that covers the long waves only, and is heard beside them: it leaves as much in
+    common as a windy street without any fault has. The fifth was heard for one hop.
     """
     first = int(np.random.SeedSequence().generate_state(1)[0])
     found = [verdict(first + i) for i in range(100)]
     failed = [one for one in found if one[1] not in (UNHEARD, AS_WITHOUT)]
     print(f"from seed {first}: {100 - len(failed)} of 100", failed)
-    assert not failed
+    assert len(failed) <= 11
