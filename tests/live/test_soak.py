@@ -289,7 +289,7 @@ def test_a_run_with_a_fault_every_second_goes_on(
     left_out = feed.sound.start_ns // HOP_NS
     used_mib = [used >> 20 for used in feed.bytes]
     figures = {"faults": feed.faults, "records lost": lost, "hops left out": left_out}
-    figures["MiB at start, end, most"] = used_mib[0], used_mib[-1], max(used_mib)
+    figures["MiB every tenth of the time"] = [*used_mib[:: len(used_mib) // 10], max(used_mib)]
     with capsys.disabled():
         print(json.dumps(report | figures, indent=1) if length_s > 60.0 else "", end="")
     assert "Traceback" not in printed.err
