@@ -23,7 +23,6 @@ from worldstate.abduction.sequence.sequence_model import (
 )
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Tracks, born
 from worldstate.core.memory import first_memory
 from worldstate.core.sequence_memory import ArrivalRate
@@ -291,7 +290,7 @@ def test_whoever_comes_on_one_side_takes_nothing_from_the_other(seed: int) -> No
     left = {one.direction: one for one in alone[-1].state.entities}
     sides = {one.direction: one for one in both[-1].state.entities}
     assert (set(left), set(sides)) == ({"left"}, {"left", "right"})
-    # But for the chance that it has come into view meanwhile, unseen, and another one is what comes.
+    # But for the chance that it has come into view meanwhile, unseen.
     assert sides["left"].hidden_probability == pytest.approx(left["left"].hidden_probability, abs=2e-3)
     assert sides["left"].azimuth_rad == pytest.approx(-sides["right"].azimuth_rad)
     assert both[-1].belief.hidden[0] == pytest.approx(0.9, abs=1e-6)
@@ -369,26 +368,6 @@ def test_who_came_into_view_unseen_is_there_as_long_as_it_sounds() -> None:
     np.testing.assert_allclose(belief(dead[-1]), said[-1].groups, rtol=1e-6, atol=1e-9)
     again = WorldFilter.from_dict(dead[40].to_dict())
     assert again.update(heard(42, said[41])).state == dead[41].state
-
-
-def test_one_that_came_into_view_unseen_is_not_the_one_that_comes_behind_it() -> None:
-    said = approach()
-    groups = said[40].groups.copy()
-    groups[0, [COMING, COMING_S.index(5.0)]] = 0.49
-    said[31:] = [replace(one, groups=groups / groups.sum(axis=1, keepdims=True)) for one in said[31:]]
-    worlds = run(WorldFilter(), [heard(hop + 1, one) for hop, one in enumerate(said)])
-    (before,), (now,) = worlds[28].state.entities, worlds[33].state.entities
-    assert before.status == "hidden" and (now.id, now.status) == (before.id, "emerged")
-    assert abs(now.azimuth_rad) < abs(before.azimuth_rad)
-    # The chance that another one comes is what the reading says.
-    assert worlds[33].belief.risks[0] == pytest.approx(0.49, abs=0.03)
-
-
-def test_rounding_makes_no_chance_to_be_hidden_negative() -> None:
-    """All that is hidden may be another one."""
-    more = float(np.nextafter(0.3, 1.0))
-    sides = SideBelief((0.3, 0.0), (0.5, 0.0), (0.3, 0.0), 0.3, (0.3, 0.5, 0.2), 0.0, (more, 0.0, more))
-    assert [sides.hidden_share(side) for side in (0, None)] == [0.0, 0.0]
 
 
 def test_one_who_may_have_come_from_either_side_is_one_and_two_are_two() -> None:

@@ -28,9 +28,6 @@ class SideBelief:
     hypotheses: tuple[float, float, float]  # P(hidden), P(visible), P(none) of eq. (6)
     # P(a vehicle is hidden on each of two sides); None by single windows, whose sides exclude each other.
     both: float | None = None
-    # P(the vehicle believed there has come into view unseen, and another one is hidden), of each side and of
-    # any, shape (K + 1,); empty where there is never another one.
-    another: tuple[float, ...] = ()
 
     def hidden_on(self, side: int | None) -> float:
         """Return P(a vehicle is hidden on a side), on any where None."""
@@ -45,9 +42,7 @@ class SideBelief:
     def hidden_share(self, side: int | None) -> float:
         """Return P(hidden | exists) of the vehicle believed there."""
         existence = self.existence(side)
-        another = self.another[-1 if side is None else side] if self.another else 0.0
-        own = max(self.hidden_on(side) - another, 0.0)  # Rounding may leave less than nothing
-        return min(own / existence, 1.0) if existence > 0.0 else 1.0
+        return min(self.hidden_on(side) / existence, 1.0) if existence > 0.0 else 1.0
 
     def side_shares(self, least: float) -> tuple[float, ...]:
         """Return P(side | one vehicle of unknown side exists), zero below the least, shape (K,)."""

@@ -269,26 +269,7 @@ class SequenceMemory:
         hypotheses = (1.0 - none * (1.0 - far), none * seen, none * (1.0 - far - seen))
         told = tuple(comes.tolist())
         chances = told, tuple(emerged.tolist()), told, 1.0 - none, hypotheses
-        return SideBelief(*chances, self.both_come, self._another)
-
-    @property
-    def _another(self) -> tuple[float, ...]:
-        r"""P(the vehicle believed there has come into view unseen, and another one is hidden), shape (3,).
-
-        .. math:: u\, l\, \frac{e}{e + n + (1 - u)\, l}, \qquad
-                  e = q(seen)\, \frac{u}{1 - (1 - u)(1 - o)}
-
-        with the chance u that it has, l and n that one comes beyond a second and within it, and o that what
-        is in view is of no side; of each side by its own reading, and of any.
-        """
-        passed, later = np.array(self.unseen), self.coming[:, _LATER].sum(axis=1)
-        seen = self.posterior.groups[0, :, _SEEN_GROUP] * passed / (1.0 - (1.0 - passed) * (1.0 - _OTHERS))
-        # One of unknown side is as likely hidden as the joint of both sides says.
-        joint = (1.0 - self.none_comes) / max(float(self.comes.sum()), _LEAST_WEIGHT)
-        near, later = (np.append(one, one.sum() * joint) for one in (self.comes - later, later))
-        passed, seen = (np.append(one, min(one.sum(), 1.0)) for one in (passed, seen))
-        weight = np.maximum(seen + near + (1.0 - passed) * later, _LEAST_WEIGHT)
-        return tuple((passed * later * seen / weight).tolist())
+        return SideBelief(*chances, self.both_come)
 
     def since_emerged_ns(self, stamp_ns: int) -> list[float]:
         """Return how long before a time a vehicle last came into view from each side."""
