@@ -16,10 +16,14 @@ from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvide
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.hidden_bearing import time_to_visible
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, update_bearing
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import Tracks
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement import Odometry, Position, PositionScan, SearchedSector, Sector
+from worldstate.state.context import corner_at
 
 SEEDS = st.integers(0, 2**32 - 1)
 SILENT = NotUsable("not scripted")
@@ -403,3 +407,87 @@ def test_radar_and_camera_speak_of_one_car() -> None:
     # The box is the sharper one across, the radar the only one along.
     across = [math.sqrt(np.linalg.eigvalsh(np.array(one.covariance)[:2, :2])[0]) for one in entities]
     assert max(across) < 0.25
+
+
+def passed_s(place: np.ndarray, corners: np.ndarray, speed_mps: float, step_s: float) -> np.ndarray:
+    """Return when each road user (n, 4) passes the line from the ego vehicle past its corner (n, 2).
+
+    Infinite for one that does not pass it within eight seconds, negative for one that is in view already.
+    """
+    first = np.full(len(place), math.inf)
+    for time_s in np.arange(0.0, 8.0, step_s)[::-1]:
+        ray, off = (
+            one - (speed_mps * time_s, 0.0) for one in (corners, place[:, :2] + time_s * place[:, 2:])
+        )
+        first[ray[:, 0] * off[:, 1] <= ray[:, 1] * off[:, 0]] = time_s if time_s else -1.0
+    return first
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_the_risk_of_an_announced_road_user_is_the_share_of_draws_that_come_into_view(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    edge_rad, edge_std = rng.uniform(0.2, 1.0), rng.uniform(0.001, 0.07)
+    azimuth_rad, range_m = edge_rad + rng.uniform(0.0, 0.7), rng.uniform(5.0, 50.0)
+    mean = np.array(
+        [range_m * math.cos(azimuth_rad), range_m * math.sin(azimuth_rad), *rng.uniform(-8, 8, 2)]
+    )
+    turn, _ = np.linalg.qr(rng.normal(size=(4, 4)))
+    covariance = turn @ np.diag(np.exp(rng.uniform(-2.0, 2.2, 4))) @ turn.T
+    edges_rad = edge_rad + edge_std * rng.standard_normal(20_000)
+    draws = rng.multivariate_normal(mean, covariance, 20_000)
+    passed = passed_s(draws, np.stack([np.cos(edges_rad), np.sin(edges_rad)], axis=1), 0.0, 0.05)
+    hidden = passed > 0.0
+    share, chances = np.mean(passed[hidden] <= 8.0), []
+    for way in (1.0, -1.0):  # Mirrored
+        flip = np.array([1.0, way, 1.0, way])
+        place = CartesianBelief(mean * flip, covariance * np.outer(flip, flip))
+        side = SideGeometry("left", way * edge_rad, way * (edge_rad + 0.4), 0.35, edge_std)
+        site = SiteGeometry((side,), 0.6, FilterSettings())
+        chance, times_s = time_to_visible(place, side, site)
+        chances.append(chance)
+        assert (times_s is None) == (chance < 0.9)
+        if times_s is not None:
+            low_s, best_s, high_s = times_s
+            assert 0.0 <= low_s <= best_s <= high_s <= 8.0
+    if hidden.sum() > 2000:
+        assert chances[0] == pytest.approx(share, abs=0.02)
+    assert chances[1] == pytest.approx(chances[0], abs=1e-9)
+
+
+def test_the_risk_of_a_pedestrian_falls_smoothly_as_its_speed_is_less_sure() -> None:
+    def told(speed_std: float) -> tuple[float, tuple[float, float, float] | None]:
+        there = Position((10.0, 11.0), diagonal(0.3, 0.3, speed_std, speed_std), (0.0, -1.4), 0.95)
+        state = after(heard(0.1), radio(0.15, there)).state
+        return state.cues[0].risk, state.entities[0].time_to_visible_s
+
+    risks = [told(speed_std)[0] for speed_std in np.arange(0.3, 3.2, 0.1)]
+    steps = np.diff(risks)
+    assert risks[0] > 0.9 and 0.5 < risks[-1] < 0.6 and (steps < 0.0).all() and steps.min() > -0.07
+    expected_s = (11.0 - 10.0 * math.tan(math.radians(32.0))) / 1.4
+    assert told(0.3)[1][1] == pytest.approx(expected_s, abs=0.05)
+    assert told(3.0)[1] is None  # It may as well never come
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 2.0, 5.0, 8.3])
+@pytest.mark.parametrize("told_by", ["context", "odometry"])
+def test_the_line_of_sight_turns_as_the_ego_vehicle_drives_up_to_the_corner(speed_mps, told_by) -> None:
+    sides = corner_at("left", (30.0, 5.0), 34.0), corner_at("right", (30.0, -5.0), 34.0)
+    start, corner, errors = np.array([[34.0, 22.0, 0.0, -4.0]]), np.array([[30.0, 5.0]]), []
+    true_s = float(passed_s(start, corner, speed_mps, 0.001)[0])
+    world = WorldFilter(Context(occluders=sides, ego_speed_mps=speed_mps if told_by == "context" else None))
+    for time_s in np.arange(0.0, true_s + 0.2, 0.1):
+        if told_by == "odometry":
+            world = world.update(Odometry("wheels", round(time_s * 1e9), speed_mps))
+        at = (34.0 - speed_mps * time_s, 22.0 - 4.0 * time_s)
+        world = world.update(radio(time_s, Position(at, diagonal(0.3, 0.3, 0.2, 0.2), (0.0, -4.0), 0.95)))
+        (entity,), cues = world.state.entities, world.state.cues
+        if entity.status == "hidden":
+            errors.append(entity.time_to_visible_s[1] - (true_s - time_s))
+            assert cues[0].risk > 0.8 and world.risk == world.state.risk
+            assert cues[0].advisory or not 0.25 < time_s < true_s - 0.1
+    assert entity.status != "hidden" and np.abs(errors).max() < 0.05 and len(errors) >= true_s * 10.0
+    # Past a corner at an unknown distance no cue is lost: the line is taken to stay where it is.
+    usual = [Context(ego_speed_mps=speed_mps), Context()]
+    moving, standing = (after(heard(0.1), radio(0.1, crossing(0.1)), world=WorldFilter(one)) for one in usual)
+    assert moving.risk == pytest.approx(standing.risk, abs=1e-9)

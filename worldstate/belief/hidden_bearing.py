@@ -9,11 +9,15 @@ Metres are not in the sound, but the time to visible is; the mean is taken over 
 what is not known of v / d. Of the variance a fifth is the place's: what is heard is how far behind the edge
 a vehicle is, and most of what is not known of the time is at which pace it comes.
 
-A hidden vehicle with a place comes into view when it passes its edge. With the edge of the occluder at
-azimuth a, the normal :math:`n = (-\sin a, \cos a)` of its line of sight and the velocity w relative to the
-ego vehicle, an entity at p comes into view after
+A hidden road user with a place p and a velocity w over ground comes into view when it passes the line from
+the ego vehicle, which drives along e(t), past the corner c of its occluder:
 
-.. math:: t = -\frac{n \cdot p}{n \cdot w}
+.. math:: S_t = (c - e_t) \times (p + w t - e_t) \le 0
+
+Place and velocity are normal, and so is :math:`S_t` at each time. While the ego vehicle stands, it is the
+distance :math:`n \cdot (p + w t)` behind the line, times that of the corner, and the time to visible is the
+ratio :math:`T = -(n \cdot p) / (n \cdot w)`. The line past a corner at an unknown distance is assumed to keep
+its place on the ground.
 """
 
 import math
@@ -21,7 +25,7 @@ import math
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S
-from worldstate.belief.kinematics.cartesian import CartesianBelief
+from worldstate.belief.kinematics.cartesian import CartesianBelief, arc
 from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, MotionBelief
 from worldstate.ground import FloatArray, wrap_angle
 
@@ -44,6 +48,7 @@ _SMALLEST = 1e-12
 # Of the azimuth rate, relative: drivers brake and turn.
 _RATE_SPREAD = 0.5
 _IN_VIEW_STD = math.radians(20.0)
+_STEPS = 51  # Of the times until which a line of sight is passed: between them it is interpolated
 
 
 def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float]:
@@ -100,53 +105,70 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
     return MotionBelief(mean, covariance)
 
 
-# Slower towards the line of sight than so many standard deviations, and it may never cross it.
-_LEAST_DEVIATIONS = 2.0
-# m/s: of a velocity that was not measured, which says nothing against coming.
-_UNKNOWN_SPEED_STD = 3.0
-
-
 def time_to_visible(
-    place: CartesianBelief, side: SideGeometry, ego_speed_mps: float
-) -> tuple[float, float] | None:
-    """Return mean and standard deviation of the time until an entity passes an edge, s; None if it may not.
+    place: CartesianBelief, side: SideGeometry, site: SiteGeometry, within_s: float = COMING_S[-1]
+) -> tuple[float, tuple[float, float, float] | None]:
+    r"""Return P(an entity comes into view in time | hidden), and low, best and high time to visible, s.
+
+    .. math:: P(T \le t \mid \text{hidden}) = P(S_t \le 0 \mid S_0 > 0)
+
+    The best time is that of the mean place and velocity; low and high hold nine of ten of those that come in
+    time. None are stated unless nine of ten come in time: of the others the time has no mean and no end.
 
     Examples
     --------
+    >>> from worldstate.belief.settings import FilterSettings
     >>> coming = CartesianBelief(np.array([10.0, 20.0, 0.0, -8.0]), np.diag([0.2, 0.2, 0.1, 0.1]))
-    >>> [round(value, 1) for value in time_to_visible(coming, SideGeometry("left", 0.56, 0.96, 0.35), 0.0)]
-    [1.7, 0.2]
+    >>> left = SideGeometry("left", 0.56, 0.96, 0.35)
+    >>> chance, times_s = time_to_visible(coming, left, SiteGeometry((left,), 0.6, FilterSettings()))
+    >>> round(chance, 3), [round(value, 1) for value in times_s]
+    (1.0, [1.4, 1.7, 2.0])
     """
-    edge_rad = side.edge_azimuth_rad
-    along = np.array([math.cos(edge_rad), math.sin(edge_rad)])
-    normal = np.array([-along[1], along[0]])
-    position, velocity = place.mean[:2], place.mean[2:] - np.array([ego_speed_mps, 0.0])
-    rate = float(normal @ velocity)
-    if abs(rate) <= _LEAST_DEVIATIONS * math.sqrt(normal @ place.covariance[2:, 2:] @ normal):
-        return None
-    time_s = -float(normal @ position) / rate
-    crossing_m = float(along @ (position + time_s * velocity))
-    if time_s <= 0.0 or crossing_m <= 0.0:
-        return None
-    slope = np.concatenate([normal, time_s * normal])
-    variance = float(slope @ place.covariance @ slope) + (crossing_m * side.edge_std_rad) ** 2
-    return time_s, math.sqrt(variance) / abs(rate)
+    # Imported where it is needed: few streets have announced road users.
+    from scipy.special import ndtr, ndtri
+
+    along = np.array([math.cos(side.edge_azimuth_rad), math.sin(side.edge_azimuth_rad)])
+    range_m, speed_mps = (side.corner_m, site.ego_speed_mps) if side.corner_m else (1.0, 0.0)
+    ahead_m = range_m * along[0]
+    # Past its corner nothing is hidden by it.
+    end_s = min(within_s, ahead_m / speed_mps) if ahead_m * speed_mps > 0.0 else within_s
+    times_s = np.linspace(0.0, end_s, _STEPS)
+    ego, _ = arc(speed_mps, site.ego_yaw_rate_rad_s, times_s)
+    ray, off = range_m * along - ego, place.mean[:2] + times_s[:, None] * place.mean[2:] - ego
+    normal = side.outwards * np.stack([-ray[:, 1], ray[:, 0]], axis=1)
+    slope = np.hstack([normal, times_s[:, None] * normal])
+    mean, edge = (normal * off).sum(axis=1), range_m * side.edge_std_rad * (off @ along)
+    covariance = slope @ place.covariance @ slope.T + np.outer(edge, edge)
+    std = np.sqrt(covariance.diagonal())
+    past = -mean / std
+    correlation = covariance.diagonal(1) / (std[1:] * std[:-1])
+    # By steps: one that has passed the ego vehicle as well is behind its line again.
+    passes = _both_below(-past[:-1], past[1:], -correlation).sum()
+    chance = float(min(max(passes, 0.0) / max(ndtr(-past[0]), _SMALLEST), 1.0))
+    if chance < 0.9:
+        return chance, None
+    past = np.maximum.accumulate(past)
+    first, last = ndtr(past[[0, -1]])
+    low, high = ndtri(first + np.array([0.05, 0.95]) * (last - first)).tolist()
+    low_s, best_s, high_s = np.interp([low, 0.0, high], past, times_s).tolist()
+    return chance, (low_s, best_s, high_s)
+
+
+def _both_below(h: FloatArray, k: FloatArray, correlation: FloatArray) -> FloatArray:
+    """Return P(both of two normal numbers of mean 0 and deviation 1 are below h and k), by Owen's T."""
+    from scipy.special import ndtr, owens_t
+
+    h, k = (np.where(one, one, _SMALLEST) for one in (h, k))
+    rest = np.sqrt(np.maximum(1.0 - correlation**2, _SMALLEST))
+    tails = owens_t(h, (k / h - correlation) / rest) + owens_t(k, (h / k - correlation) / rest)
+    return np.asarray(0.5 * (ndtr(h) + ndtr(k)) - tails - 0.5 * (h * k < 0.0))
 
 
 def announced(tracks: Tracks, site: SiteGeometry) -> tuple[float, ...]:
     """Return for each side the probability that a hidden entity with a place comes into view, shape (K,)."""
     chances = [0.0] * len(site.sides)
-    for i in np.flatnonzero(tracks.placed & ~tracks.seen).tolist():
-        if _comes(tracks, i, site):
-            side, chance = int(tracks.side[i]), float(tracks.existence[i] * tracks.behind[i])
-            chances[side] = max(chances[side], chance)
+    for i in np.flatnonzero(tracks.placed & ~tracks.seen & tracks.moving).tolist():
+        k, place = int(tracks.side[i]), CartesianBelief(tracks.place_mean[i], tracks.place_covariance[i])
+        comes, _ = time_to_visible(place, site.sides[k], site)
+        chances[k] = max(chances[k], float(tracks.existence[i] * tracks.behind[i]) * comes)
     return tuple(chances)
-
-
-def _comes(tracks: Tracks, row: int, site: SiteGeometry) -> bool:
-    """Tell whether an entity may come into view within the times that a sequence model speaks of."""
-    place = CartesianBelief(tracks.place_mean[row], tracks.place_covariance[row])
-    if place.velocity_std_mps > _UNKNOWN_SPEED_STD:
-        return True
-    expected = time_to_visible(place, site.sides[tracks.side[row]], site.ego_speed_mps)
-    return bool(tracks.moving[row]) and expected is not None and expected[0] <= COMING_S[-1]

@@ -48,6 +48,7 @@ class SideGeometry:
     pace_hz: float = 0.5  # Speed over the distance of the crossing lane
     hides: bool = True
     yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
+    corner_m: float | None = None  # Distance of the corner; None if it is not known
 
     @property
     def outwards(self) -> float:

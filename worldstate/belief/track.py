@@ -5,14 +5,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import starmap
 from operator import attrgetter
-from typing import Annotated, Any, TypeAlias, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeAlias, get_type_hints
 from uuid import UUID, uuid5
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
-from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, predict_place
+from worldstate.belief.kinematics.cartesian import CartesianBelief, NumbersT, polar_motion, predict_place
 from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, MotionBelief, predict, relax
 from worldstate.ground import BoolArray, FloatArray
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
@@ -41,7 +41,6 @@ _LOST_PLACE_M = 10.0
 NEVER_NS = np.iinfo(np.int64).min  # Of what was never seen
 
 
-NumbersT = TypeVar("NumbersT", float, FloatArray)  # Of one entity, or of each of many
 Label: TypeAlias = Annotated[tuple[str, float], Keys(("label", "probability"))]
 Objects: TypeAlias = NDArray[np.object_]
 

@@ -93,7 +93,7 @@ class WorldFilter:
     @property
     def belief(self) -> SideBelief:
         """What is believed of the sides, of which the snapshot states marginals."""
-        return published_belief(self._memory, self._model)
+        return published_belief(self._memory, from_here(self._model, self._memory.ego))
 
     @property
     def gamma(self) -> float:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeAlias, TypeVar
 
+import numpy as np
+
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
 from worldstate.abduction.road_users import DomainVerdict
@@ -181,4 +183,7 @@ def first_memory(context: Context, start_ns: int) -> Memory:
     else:
         belief = ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)
     history = tuple(SideHistory() for _ in range(k))
-    return Memory(start_ns, WindowBelief(belief, ((start_ns, belief),)), history)
+    speed_mps = context.ego_speed_mps
+    # Without odometry the ego vehicle drives straight on, and corners that are known in metres come nearer.
+    ego = EgoBelief(np.zeros(3), np.zeros((3, 3)), speed_mps, 0.0, 0.0, 0.0) if speed_mps else None
+    return Memory(start_ns, WindowBelief(belief, ((start_ns, belief),)), history, ego=ego)

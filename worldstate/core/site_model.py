@@ -36,7 +36,7 @@ def site_geometry_of(
     context: Context, settings: FilterSettings, ego: EgoBelief | None = None
 ) -> SiteGeometry:
     """Return the site geometry of a context, as the ego vehicle has it."""
-    yaw_rad = 0.0 if ego is None else float(ego.pose[2])
+    x, y, yaw_rad = (0.0, 0.0, 0.0) if ego is None else ego.pose.tolist()
     sides = (
         SideGeometry(
             one.direction,
@@ -47,6 +47,7 @@ def site_geometry_of(
             one.pace_hz,
             one.hides,
             0.0 if one.corner_m is None else yaw_rad,
+            None if one.corner_m is None else math.dist(one.corner_m, (x, y)),
         )
         for one in context.occluders
     )

@@ -221,15 +221,8 @@ def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
 
 
 def visible_in(track: Track, site: SiteGeometry) -> tuple[float, float, float] | None:
-    """Return low, best and high time to visible of a hidden entity by its place, None where it tells none."""
-    place = track.place
-    if place is None or place.velocity_std_mps >= _KNOWN_VELOCITY_STD_MPS:
-        return None
-    expected = time_to_visible(place, site.sides[track.side], site.ego_speed_mps)
-    if expected is None:
-        return None
-    mean_s, std_s = expected
-    return max(mean_s - NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + NINE_OF_TEN * std_s
+    """Return low, best and high time to visible of a hidden entity by its place, if it comes in time."""
+    return None if track.place is None else time_to_visible(track.place, site.sides[track.side], site)[1]
 
 
 def ego_of(ego: EgoBelief) -> Ego:

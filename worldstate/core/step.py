@@ -41,6 +41,8 @@ MOST_TRACKS = 128
 def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     """Return a draft of the memory, predicted to a later time."""
     before, memory, step_ns = memory, memory.draft(), stamp_ns - memory.stamp_ns
+    # First: what has come into view by then depends on where the edges are by then.
+    memory.ego = memory.ego and driven(memory.ego, seconds(step_ns))
     model = from_here(model, memory.ego)
     predict_tracks(memory.tracks, memory.sides, seconds(step_ns), model.site)
     memory.tracks = surviving(memory.tracks, model.site.settings)
@@ -50,7 +52,6 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
         memory.belief = carried(memory.belief, stamp_ns, step_ns, model.context)
     else:
         memory.belief = memory.belief.predict(model.context.rates.values_hz, step_ns)
-    memory.ego = memory.ego and driven(memory.ego, seconds(step_ns))
     if (before.tracks.placed & ~before.tracks.seen).any():
         _pass_places(before.tracks, memory, model)
     return memory

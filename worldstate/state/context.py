@@ -290,7 +290,7 @@ def seen_from(
     >>> round(math.degrees(nearer.edge_azimuth_rad), 1), seen_from(corner, (5.0, 0.0, 0.0), 0.1, 0.01).hides
     (39.3, False)
     """
-    if occluder.corner_m is None or occluder.crossing_m is None:
+    if occluder.corner_m is None:
         return occluder
     (corner_x, corner_y), (x, y, yaw) = occluder.corner_m, pose
     ahead_m, beside_m = corner_x - x, corner_y - y
@@ -298,7 +298,8 @@ def seen_from(
         return replace(occluder, hides=False)
     before_m, now_m = math.hypot(corner_x, corner_y), math.hypot(ahead_m, beside_m)
     std_m = math.hypot(occluder.edge_std_rad * before_m, position_std_m)
-    pace_hz = occluder.pace_hz * occluder.crossing_m / (occluder.crossing_m - x)
+    nearer = 1.0 if occluder.crossing_m is None else occluder.crossing_m / (occluder.crossing_m - x)
+    pace_hz = occluder.pace_hz * nearer
     hidden_rad, hidden_std = hidden_behind(ahead_m, beside_m, pace_hz)
     return replace(
         occluder,

@@ -16,7 +16,7 @@ drives in a time t the chord
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import numpy as np
 
@@ -44,6 +44,7 @@ _UNKNOWN_SPEED_STD = 10.0
 _NEAREST_M = 1.0
 _LARGEST_PLACE_STD = 1e4  # m and m/s: ten times the least sure position that is taken
 _IDENTITY = np.eye(4)
+NumbersT = TypeVar("NumbersT", float, FloatArray)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,11 +80,12 @@ def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArr
     return np.array([*position.position_m, *(position.velocity_mps or (0.0, 0.0))]), noise
 
 
-def arc(speed_mps: float, yaw_rate_rad_s: float, step_s: float) -> tuple[float, float]:
-    r"""Return the chord :math:`v t\,\operatorname{sinc}(\omega t / 2)` of an arc, and its turn."""
+def arc(speed_mps: float, yaw_rate_rad_s: float, step_s: NumbersT) -> tuple[FloatArray, NumbersT]:
+    """Return the chord of an arc in the axes at its beginning, shape (..., 2), and its turn."""
     turned = yaw_rate_rad_s * step_s
     # numpy's sinc has a factor of pi.
-    return speed_mps * step_s * float(np.sinc(0.5 * turned / math.pi)), turned
+    length = speed_mps * step_s * np.sinc(0.5 * turned / math.pi)
+    return np.stack([length * np.cos(0.5 * turned), length * np.sin(0.5 * turned)], axis=-1), turned
 
 
 def constant_velocity(step_s: float) -> tuple[FloatArray, FloatArray]:
@@ -109,7 +111,7 @@ def predict_place(
     flow, noise = constant_velocity(step_s)
     mean = belief.mean @ flow.T
     chord, turned = arc(ego_speed_mps, ego_yaw_rate_rad_s, step_s)
-    mean[..., :2] -= chord * np.array([math.cos(0.5 * turned), math.sin(0.5 * turned)])
+    mean[..., :2] -= chord
     strength = np.asarray(acceleration_psd)[..., None, None]
     covariance = flow @ belief.covariance @ flow.T + strength * noise
     if not turned:
@@ -219,11 +221,11 @@ def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
     array([2.   , 2.   , 1.571])
     """
     chord, turned = arc(ego.speed_mps, ego.yaw_rate_rad_s, step_s)
-    heading = float(ego.pose[2]) + 0.5 * turned
-    ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
-    pose = ego.pose + chord * ahead + np.array([0.0, 0.0, turned])
-    flow, gain = np.eye(3), np.stack([ahead, [0.0, 0.0, 1.0]], axis=1)
-    flow[:2, 2] = -chord * ahead[1], chord * ahead[0]
+    yaw, heading = float(ego.pose[2]), float(ego.pose[2]) + 0.5 * turned
+    x, y = (np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]) @ chord).tolist()
+    pose = ego.pose + np.array([x, y, turned])
+    flow, gain = np.eye(3), np.array([[math.cos(heading), 0.0], [math.sin(heading), 0.0], [0.0, 1.0]])
+    flow[:2, 2] = -y, x
     noise = gain * (np.array([ego.speed_std_mps, ego.yaw_rate_std_rad_s]) * step_s) ** 2 @ gain.T
     pose[2] = wrap_angle(pose[2])
     return replace(ego, pose=pose, covariance=flow @ ego.covariance @ flow.T + noise)
