@@ -32,6 +32,9 @@ def _chances(state: WorldState) -> Iterator[str]:
         yield "a chance outside of 0 to 1"
     if len(state.entities) > 128 or len(state.events) > 64:
         yield "more entities or events than a snapshot holds"
+    names = {one.id for one in (*state.entities, *state.context.occluders)} | {"ego"}
+    if any(not {one.src, one.dst} <= names for one in state.relations):
+        yield "a relation of what the snapshot does not hold"
     for cue in state.cues:
         hidden, visible, none = cue.hypotheses.hidden, cue.hypotheses.visible, cue.hypotheses.none
         if abs(hidden + visible + none - 1.0) > SLACK:

@@ -1,11 +1,13 @@
 """Who is in one lane with whom, in front of whom, and who will cross the path of the ego vehicle."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from snapshot_laws import broken_laws
 
 from worldstate import Context, WorldFilter
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
@@ -13,13 +15,14 @@ from worldstate.state import Relation
 
 ALL_ROUND = SearchedSector(Sector(0.0, math.pi), range_m=100.0, detection_probability=0.9)
 STD = (0.4, 0.3, 0.3, 0.3)
+SPREAD = tuple(map(tuple, np.diag(np.square(STD)).tolist()))
 
 
 def seen(
     *rows: tuple[float, float, float, float], context: Context | None = None
 ) -> dict[tuple[str, str, str], float]:
     """Return the relations of vehicles that a radar has found, by their ends ("ego", "0", "1") and kind."""
-    positions = [Position(row[:2], tuple(map(tuple, np.diag(np.square(STD)))), row[2:], 0.9) for row in rows]
+    positions = [Position(row[:2], SPREAD, row[2:], 0.9) for row in rows]
     state = (
         WorldFilter(context or Context()).update(PositionScan("radar", 0, tuple(positions), ALL_ROUND)).state
     )
@@ -77,10 +80,29 @@ def test_an_ego_vehicle_that_drives_passes_before_who_crosses_behind_it() -> Non
 
 def test_who_is_announced_behind_a_corner_approaches_from_its_arm() -> None:
     def arm(vy: float) -> float:
-        there = Position((10.0, 14.0), tuple(map(tuple, np.diag(np.square(STD)))), (0.0, vy), 0.95)
+        there = Position((10.0, 14.0), SPREAD, (0.0, vy), 0.95)
         relations: tuple[Relation, ...] = (
             WorldFilter().update(PositionScan("v2x", 0, (there,))).state.relations
         )
         return next((r.probability for r in relations if r.kind == "approaching_from"), 0.0)
 
     assert arm(-6.0) > 0.9 and arm(6.0) < 0.1
+
+
+def test_relations_name_only_what_the_snapshot_holds() -> None:
+    """Over 2,000 steps in which vehicles of two lanes come and go, and of which some are hidden."""
+    rng, world, ended, named = np.random.default_rng(3), WorldFilter(), 0, 0
+    there = list[np.ndarray]()
+    for step in range(1, 2001):
+        there = [one + 0.1 * np.append(one[2:], (0.0, 0.0)) for one in there if rng.random() < 0.97]
+        if len(there) < 5 and rng.random() < 0.3:
+            lane = (10.0, rng.uniform(5.0, 25.0), 0.0, -6.0), (rng.uniform(5.0, 40.0), 0.5, 5.0, 0.0)
+            there.append(np.array(lane[int(rng.integers(2))]))
+        found = [Position(tuple(one[:2]), SPREAD, tuple(one[2:]), 0.9) for one in there if rng.random() < 0.9]
+        scan = PositionScan("radar", step * 10**8, tuple(found), ALL_ROUND)
+        world = world.update(scan if rng.random() < 0.8 else replace(scan, source="v2x", searched=None))
+        state = (world if rng.random() < 0.8 else world.predict(rng.uniform(0.0, 1.0))).state
+        assert not broken_laws(state), step
+        ended += sum(one.until_ns is not None for one in state.relations)
+        named += len(state.relations)
+    assert named > 10_000 and ended > 1_000

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_model import STATED
+from worldstate.abduction.sequence.sequence_model import LONGEST_S, STATED
+from worldstate.belief.hidden_bearing import time_to_visible
 from worldstate.belief.site_geometry import normal_share
 from worldstate.belief.track import Track, Tracks, hidden_shares, side_weights
 from worldstate.ground import FloatArray, nanoseconds
@@ -14,6 +15,7 @@ from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
 
 from .memory import Memory
+from .site_model import FilterModel
 
 _HOLDS = 0.5  # The probability from which on a relation is said to hold
 _KEPT_NS = nanoseconds(5.0)  # Of a relation that has ended
@@ -26,7 +28,7 @@ _BESIDE = 10.0  # Metres ahead that a metre beside the lane counts for
 _LEAST = 0.05  # What is less likely is not named
 
 
-def relations_at(memory: Memory, tracks: Tracks, context: Context) -> tuple[Relation, ...]:
+def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Relation, ...]:
     """Return the relations of some tracks, with the interval in which each has held by those in memory."""
     # What a camera alone has found, first in view, has none.
     related = ~tracks.seen | (tracks.came_from >= _LEAST) | tracks.approach_heard | tracks.placed
@@ -35,17 +37,15 @@ def relations_at(memory: Memory, tracks: Tracks, context: Context) -> tuple[Rela
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
     shares, some = hidden_shares(tracks, memory.sides)[related].tolist(), tracks.taken(related).rows()
     edges = [
-        one
-        for track, share in zip(some, shares, strict=True)
-        for one in _edges(track, share, memory, context)
+        one for track, share in zip(some, shares, strict=True) for one in _edges(track, share, memory, model)
     ]
     placed = [one for one in some if one.place and one.place.known]
     if placed:
-        edges += _between(placed, memory.stamp_ns, context)
+        edges += _between(placed, memory.stamp_ns, model.context)
     now = {(one.src, one.dst, one.kind): one for one in edges}
-    names = set(tracks.id)
+    names = {*tracks.id, *(one.id for one in model.context.occluders), EGO}
     for key, edge in before.items():
-        if key not in now and edge.src in names:
+        if key not in now and names.issuperset((edge.src, edge.dst)):
             now[key] = Relation(*key, 0.0, memory.stamp_ns)
     held = (_held(edge, before.get(key)) for key, edge in now.items())
     return tuple(edge for edge in held if edge.probability or edge.until_ns is not None)
@@ -63,28 +63,27 @@ def _held(edge: Relation, before: Relation | None) -> Relation:
     return replace(edge, since_ns=since_ns, until_ns=until_ns)
 
 
-def _edges(track: Track, share: float, memory: Memory, context: Context) -> Iterator[Relation]:
+def _edges(track: Track, share: float, memory: Memory, model: FilterModel) -> Iterator[Relation]:
     """Yield the relations of one entity to its occluder and to the ego vehicle."""
-    occluder, stamp_ns = context.occluders[track.side].id, memory.stamp_ns
+    occluders, stamp_ns = model.context.occluders, memory.stamp_ns
     if not track.seen:
-        for k, weight in enumerate(side_weights(track, len(context.occluders))):
+        for k, weight in enumerate(side_weights(track, len(occluders))):
             if weight > 0.0:
-                one, hidden = context.occluders[k], share * weight
-                comes = hidden * _comes(track, k, memory)
+                one, hidden = occluders[k], share * weight
+                comes = hidden * _comes(track, k, memory, model)
                 yield Relation(track.id, one.id, "occluded_by", hidden, stamp_ns)
                 yield Relation(track.id, one.id, "approaching_from", comes, stamp_ns)
     elif track.came_from >= _LEAST:
-        yield Relation(track.id, occluder, "emerged_from", track.came_from, stamp_ns)
+        yield Relation(track.id, occluders[track.side].id, "emerged_from", track.came_from, stamp_ns)
     if track.approach_heard:
         deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
         yield Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns)
 
 
-def _comes(track: Track, side: int, memory: Memory) -> float:
+def _comes(track: Track, side: int, memory: Memory, model: FilterModel) -> float:
     """Return P(it comes into view from there within five seconds | hidden), by its place or the sound."""
     if track.place is not None:
-        y, vy = track.place.mean[[1, 3]].tolist()
-        return normal_share(-math.copysign(vy, y * vy) / math.sqrt(track.place.covariance[3, 3]))
+        return time_to_visible(track.place, model.site.sides[side], model.site, LONGEST_S)[0]
     if memory.sequence is None:
         return 1.0
     coming = memory.sequence.coming[side]
