@@ -362,13 +362,17 @@ def test_high_risk_without_advisory_says_why() -> None:
 @settings(max_examples=5, deadline=None)
 def test_a_hop_that_could_not_be_heard_moves_nothing_but_what_time_moves(sequence: bool, seed: int) -> None:
     rng, world = np.random.default_rng(seed), WorldFilter()
-    for number in range(1, 15):
-        world = world.update(hop(rng, number, sequence=sequence))
     deaf = Measurement(
         1_500_000_000, SignatureEvidence(("left", "right"), tuple(rng.uniform(-3, 3, 2)), 0.0, 0.0),
         Unqueried("-"), SILENT, SILENT, heard=Heard(0.0, "lost samples"),
         sequence=NotUsable("lost samples") if sequence else None,
     )  # fmt: skip
+    for number in range(1, 15):
+        world = world.update(hop(rng, number, sequence=sequence))
+        kinds = {
+            one.kind for one in world.update(replace(deaf, stamp_ns=number * 10**8 + 10**8)).state.events
+        }
+        assert not kinds & {"born", "hidden_again"}
     after, carried = world.update(deaf).state, world.predict_to(1_500_000_000).state
     for told, alone in zip(after.cues, carried.cues, strict=True):
         assert told.risk == pytest.approx(alone.risk, abs=1e-12)

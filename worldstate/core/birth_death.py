@@ -52,7 +52,7 @@ def birth_death(
     # Before births: another one is born on the side that it leaves.
     for i in _of_unknown_side(tracks):
         _put_on_its_side(tracks, i, memory.sides, site)
-    for k in _sides_of_births(memory, alarmed, site):
+    for k in _sides_of_births(memory, alarmed, site) if measurement.heard.usable else ():
         _give_birth(memory, k, measurement, site)
     tracks = memory.tracks
     if len(hidden_rows(tracks)) != 1 or memory.sides.hidden_share(None) < HIDDEN:
