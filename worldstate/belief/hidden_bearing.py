@@ -129,7 +129,7 @@ def time_to_visible(
 
     along = np.array([math.cos(side.edge_azimuth_rad), math.sin(side.edge_azimuth_rad)])
     range_m, speed_mps = (side.corner_m, site.ego_speed_mps) if side.corner_m else (1.0, 0.0)
-    ahead_m = range_m * along[0]
+    ahead_m = range_m * math.cos(side.edge_azimuth_rad)
     # Past its corner nothing is hidden by it.
     end_s = min(within_s, ahead_m / speed_mps) if ahead_m * speed_mps > 0.0 else within_s
     times_s = np.linspace(0.0, end_s, _STEPS)
