@@ -14,6 +14,7 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 from worldstate.state import Delivery, WorldState
 
+Timed = Measurement | PositionScan
 SEEDS = st.integers(0, 2**32 - 1)
 SILENT = NotUsable("not scripted")
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
@@ -27,9 +28,9 @@ def scan(rng: np.random.Generator, stamp_ns: int, searches: bool) -> PositionSca
     return PositionScan("radar" if searches else "messages", stamp_ns, tuple(at), searched)
 
 
-def script(rng: np.random.Generator, hops: int = 18) -> list[Measurement | PositionScan]:
+def script(rng: np.random.Generator, hops: int = 18) -> list[Timed]:
     """Return sound every tenth of a second, a camera in it, and a radio and a radar now and then."""
-    measured: list[Measurement | PositionScan] = []
+    measured: list[Timed] = []
     for hop in range(1, hops + 1):
         left, right, visible, none = rng.normal(0.0, 1.0, 4).tolist()
         heard = SignatureEvidence(("left", "right"), (left, right), visible, none)
@@ -51,7 +52,7 @@ def script(rng: np.random.Generator, hops: int = 18) -> list[Measurement | Posit
     return sorted(measured, key=lambda one: (one.stamp_ns, one.source))
 
 
-def filtered(measurements: list[Measurement | PositionScan], world: WorldFilter | None = None) -> WorldFilter:
+def filtered(measurements: list[Timed], world: WorldFilter | None = None) -> WorldFilter:
     world = world or WorldFilter()
     for one in measurements:
         world = world.update(one)
@@ -59,7 +60,13 @@ def filtered(measurements: list[Measurement | PositionScan], world: WorldFilter 
 
 
 def content(world: WorldFilter) -> WorldState:
-    return replace(world.state, delivery=Delivery())
+    return replace(world.state, delivery=Delivery(), events=())  # Both follow from when it was delivered
+
+
+def arrived_late(rng: np.random.Generator, told: list[Timed]) -> list[Timed]:
+    """Return measurements in the order of arrival, each held up by less than the lag."""
+    arrival_s = [one.stamp_ns * 1e-9 + rng.uniform(0.0, 1.8) for one in told]
+    return [told[i] for i in np.argsort(arrival_s)]
 
 
 @given(SEEDS)
@@ -67,13 +74,32 @@ def content(world: WorldFilter) -> WorldState:
 def test_the_order_of_arrival_does_not_matter_within_the_lag(seed: int) -> None:
     rng = np.random.default_rng(seed)
     in_order = script(rng)
-    # Each is held up by so long that the newest one before it is less than the lag ahead.
-    arrival_s = [one.stamp_ns * 1e-9 + rng.uniform(0.0, 1.8) for one in in_order]
-    shuffled = [in_order[i] for i in np.argsort(arrival_s)]
+    shuffled = arrived_late(rng, in_order)
     late = filtered(shuffled)
     assert content(late) == content(filtered(in_order))
     assert late.state.delivery.too_late == late.state.delivery.repeated == 0
     assert (late.state.delivery.replayed > 0) == (shuffled != in_order)
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_events_lead_from_one_snapshot_to_the_next_however_late_their_cause_comes(seed: int) -> None:
+    rng, world, counted = np.random.default_rng(seed), WorldFilter(), set()
+    for one in arrived_late(rng, script(rng, 30)):
+        before, world = world.state.entities, world.update(one)
+        was, now = (
+            {one.id: one.status == "visible" for one in many} for many in (before, world.state.entities)
+        )
+        kinds = {event.entity_id: event.kind for event in world.state.events}
+        counted |= set(kinds.values()) if world.state.delivery.replayed else set()
+        for name in was.keys() | now.keys() | kinds.keys():
+            if name not in was or name not in now:
+                assert kinds[name] in (("born",) if name in now else ("died", "merged"))
+            elif was[name] != now[name]:
+                assert kinds[name] == ("handed_over" if now[name] else "hidden_again")
+            else:
+                assert kinds.get(name, "coasting") == "coasting"
+    assert {"born", "handed_over", "died"} <= counted
 
 
 @given(SEEDS)

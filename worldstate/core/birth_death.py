@@ -278,10 +278,10 @@ def published(tracks: Tracks, settings: FilterSettings) -> Tracks:
     return tracks.taken(~refuted) if refuted.any() else tracks
 
 
-def events_between(
-    before: Tracks, after: Tracks, stamp_ns: int, into: Mapping[str, str]
-) -> tuple[Event, ...]:
-    """Return what became of every entity, those that were there before first; `into` by merged ids."""
+def events_between(before: Tracks, after: Tracks, steps: Sequence[Memory]) -> tuple[Event, ...]:
+    """Return what became of every entity, those that were there before first; `steps` hold their merges."""
+    stamp_ns = steps[-1].stamp_ns
+    into = {one.entity_id: one.into for step in steps for one in step.last.events if one.into}
     left = dict(zip(after.id, zip(after.seen.tolist(), after.answer, strict=True), strict=True))
     events = list[Event]()
     for name, was_seen, answer in zip(before.id, before.seen.tolist(), before.answer, strict=True):

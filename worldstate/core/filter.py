@@ -15,7 +15,7 @@ from worldstate.ground.serialisation import Layout, decode, encode
 from worldstate.measurement import Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 
-from .birth_death import published
+from .birth_death import events_between, published
 from .cues import cues_of
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import NEWS_HOLDS_NS, Memory, first_memory
@@ -190,7 +190,11 @@ class WorldFilter:
         lag = self._lag.add(measurement, self.stamp_ns, self._step)
         if lag is None:
             return self._begun_anew(measurement)
-        if left_out and lag.latest is not self._lag.latest:
+        if lag.latest is not self._lag.latest:
+            # From what was published last on: a late measurement changes what has become of it since.
+            steps = (*(one.before for one in lag.arrivals), lag.latest)
+            known, now = (published(one.latest.tracks, self.settings) for one in (self._lag, lag))
+            lag.latest.last.events = events_between(known, now, steps)
             lag = lag.counted(boxes_left_out=left_out)
         world = self._with(lag.latest, lag)
         return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)

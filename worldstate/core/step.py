@@ -12,12 +12,12 @@ from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Tracks, hidden_shares, predict_tracks, turn
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
+from worldstate.state import Event
 
 from .acoustic_update import acoustic_update
 from .birth_death import (
     HIDDEN,
     birth_death,
-    events_between,
     hidden_on,
     hidden_rows,
     merge_tracks,
@@ -100,10 +100,9 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
         _place_hidden(memory, model.site)
     _keep_likeliest(memory)
     _note_advisories(memory, [None if k in gone else one for k, one in enumerate(held)], named)
-    into = merge_tracks(memory, model.site)
-    known, now = (published(one.tracks, model.site.settings) for one in (before, memory))
-    memory.last.events = events_between(known, now, memory.stamp_ns, into)
-    memory.relations = relations_at(memory, now, model)
+    merged = merge_tracks(memory, model.site).items()
+    memory.last.events = tuple(Event(memory.stamp_ns, "merged", name, into) for name, into in merged)
+    memory.relations = relations_at(memory, published(memory.tracks, model.site.settings), model)
 
 
 def _perceive(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
