@@ -129,10 +129,9 @@ def time_to_visible(
 
     along = np.array([math.cos(side.edge_azimuth_rad), math.sin(side.edge_azimuth_rad)])
     range_m, speed_mps = (side.corner_m, site.ego_speed_mps) if side.corner_m else (1.0, 0.0)
-    ahead_m = range_m * math.cos(side.edge_azimuth_rad)
     # Past its corner nothing is hidden by it.
-    end_s = min(within_s, ahead_m / speed_mps) if ahead_m * speed_mps > 0.0 else within_s
-    times_s = np.linspace(0.0, end_s, _STEPS)
+    abeam_s = range_m * math.cos(side.edge_azimuth_rad) / (speed_mps or _SMALLEST)
+    times_s = np.linspace(0.0, min(within_s, abeam_s) if abeam_s > 0.0 else within_s, _STEPS)
     ego, _ = arc(speed_mps, site.ego_yaw_rate_rad_s, times_s)
     ray, off = range_m * along - ego, place.mean[:2] + times_s[:, None] * place.mean[2:] - ego
     normal = side.outwards * np.stack([-ray[:, 1], ray[:, 0]], axis=1)
@@ -140,16 +139,14 @@ def time_to_visible(
     mean, edge = (normal * off).sum(axis=1), range_m * side.edge_std_rad * (off @ along)
     covariance = slope @ place.covariance @ slope.T + np.outer(edge, edge)
     std = np.sqrt(covariance.diagonal())
-    past = -mean / std
-    correlation = covariance.diagonal(1) / (std[1:] * std[:-1])
+    past, correlation = -mean / std, covariance.diagonal(1) / (std[1:] * std[:-1])
     # By steps: one that has passed the ego vehicle as well is behind its line again.
     passes = _both_below(-past[:-1], past[1:], -correlation).sum()
     chance = float(min(max(passes, 0.0) / max(ndtr(-past[0]), _SMALLEST), 1.0))
     if chance < 0.9:
         return chance, None
     past = np.maximum.accumulate(past)
-    first, last = ndtr(past[[0, -1]])
-    low, high = ndtri(first + np.array([0.05, 0.95]) * (last - first)).tolist()
+    low, high = ndtri(np.interp([0.05, 0.95], [0.0, 1.0], ndtr(past[[0, -1]]))).tolist()
     low_s, best_s, high_s = np.interp([low, 0.0, high], past, times_s).tolist()
     return chance, (low_s, best_s, high_s)
 

@@ -16,7 +16,7 @@ from worldstate.abduction.evidence import SignatureEvidence, posterior_of
 from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
-from worldstate.belief.hidden_bearing import announced
+from worldstate.belief.hidden_bearing import announced, time_to_visible
 from worldstate.belief.side_belief import TIE, SideBelief
 from worldstate.ground.values import seconds
 from worldstate.measurement import Measurement
@@ -27,7 +27,7 @@ from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceRule
 from .sequence_memory import LEAST_RISK, SequenceMemory
 from .side_update import heard_beside
 from .site_model import FilterModel, published_belief
-from .snapshot_builder import hidden_azimuth, sector, time_to_arrival, visible_in
+from .snapshot_builder import hidden_azimuth, sector, time_to_arrival
 
 _MOST_CERTAIN = 0.999  # Of a message
 NO_LOOK = Unqueried("sound alone")
@@ -233,7 +233,8 @@ def _cue(
     if track is not None and track.approach_heard:
         arrival_s = time_to_arrival(track.motion.inverse_tta_hz, track.motion.inverse_tta_std_hz)
     # Distance and speed of an announced vehicle tell more than the sound.
-    interval_s = (track and visible_in(track, model.site)) or interval_s
+    if track is not None and track.place is not None:
+        interval_s = time_to_visible(track.place, model.site.sides[track.side], model.site)[1] or interval_s
     since_ns, entity_id = memory.history[k].advised_ns, None if track is None else track.id
     advisory = held = None
     if told is not None:

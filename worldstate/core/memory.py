@@ -3,17 +3,16 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeAlias, TypeVar
 
-import numpy as np
-
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.cueing_policy import AdaptiveThreshold
 from worldstate.abduction.road_users import DomainVerdict
-from worldstate.belief.kinematics.cartesian import EgoBelief
+from worldstate.belief.kinematics.cartesian import EgoBelief, corrected
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Track, Tracks
 from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
 from worldstate.ground.serialisation import ADDED, Count, Probability, Via
 from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.measurement import Odometry
 from worldstate.measurement.measurement import Bearing, Heard
 from worldstate.state import Context, Event, Relation
 
@@ -183,7 +182,6 @@ def first_memory(context: Context, start_ns: int) -> Memory:
     else:
         belief = ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)
     history = tuple(SideHistory() for _ in range(k))
-    speed_mps = context.ego_speed_mps
     # Without odometry the ego vehicle drives straight on, and corners that are known in metres come nearer.
-    ego = EgoBelief(np.zeros(3), np.zeros((3, 3)), speed_mps, 0.0, 0.0, 0.0) if speed_mps else None
+    ego = corrected(None, Odometry("context", start_ns, speed)) if (speed := context.ego_speed_mps) else None
     return Memory(start_ns, WindowBelief(belief, ((start_ns, belief),)), history, ego=ego)

@@ -44,23 +44,21 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
         edges += _between(placed, memory.stamp_ns, model.context)
     now = {(one.src, one.dst, one.kind): one for one in edges}
     names = {*tracks.id, *(one.id for one in model.context.occluders), EGO}
-    for key, edge in before.items():
-        if key not in now and names.issuperset((edge.src, edge.dst)):
-            now[key] = Relation(*key, 0.0, memory.stamp_ns)
+    ended = [key for key in before if key not in now and names.issuperset(key[:2])]
+    now |= {key: Relation(*key, 0.0, memory.stamp_ns) for key in ended}
     held = (_held(edge, before.get(key)) for key, edge in now.items())
     return tuple(edge for edge in held if edge.probability or edge.until_ns is not None)
 
 
 def _held(edge: Relation, before: Relation | None) -> Relation:
     """Return a relation with the interval in which it has held; the last one is kept for five seconds."""
-    since_ns, until_ns = (None, None) if before is None else (before.since_ns, before.until_ns)
+    before = before or edge
     if edge.probability >= _HOLDS:
-        begins = since_ns is None or until_ns is not None
-        return replace(edge, since_ns=edge.stamp_ns if begins else since_ns)
-    until_ns = edge.stamp_ns if until_ns is None else until_ns
-    if since_ns is None or edge.stamp_ns - until_ns > _KEPT_NS:
-        return edge
-    return replace(edge, since_ns=since_ns, until_ns=until_ns)
+        begins = before.since_ns is None or before.until_ns is not None
+        return replace(edge, since_ns=edge.stamp_ns if begins else before.since_ns)
+    until_ns = edge.stamp_ns if before.until_ns is None else before.until_ns
+    is_kept = before.since_ns is not None and edge.stamp_ns - until_ns <= _KEPT_NS
+    return replace(edge, since_ns=before.since_ns, until_ns=until_ns) if is_kept else edge
 
 
 def _edges(track: Track, share: float, memory: Memory, model: FilterModel) -> Iterator[Relation]:

@@ -216,13 +216,8 @@ def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
         "position_m": (x, y, 0.0),
         "velocity_mps": (vx, vy, 0.0) if moves else None,
         "covariance": tuple(tuple(row) for row in place.covariance.tolist()),
-        "time_to_visible_s": visible_in(track, site) if hidden else None,
+        "time_to_visible_s": time_to_visible(place, site.sides[track.side], site)[1] if hidden else None,
     }
-
-
-def visible_in(track: Track, site: SiteGeometry) -> tuple[float, float, float] | None:
-    """Return low, best and high time to visible of a hidden entity by its place, if it comes in time."""
-    return None if track.place is None else time_to_visible(track.place, site.sides[track.side], site)[1]
 
 
 def ego_of(ego: EgoBelief) -> Ego:
