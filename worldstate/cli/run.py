@@ -12,7 +12,7 @@ that of detections with stamps, too).
   {"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}
 the corner that hides the arm (x ahead, y left of the ego) and the lane behind it, metres, or "open": true of
 an arm that hides nothing; optional "speed_mps" and "corner_std_m" of an arm, "rates", "priors",
-"ego_speed_mps", "site", "view_half_angle_deg". With --odometry corners move as the ego does.
+"ego_speed_mps", "site", "view_half_angle_deg". Corners move as the ego does, by --odometry or this speed.
 
 Examples
 --------

@@ -134,7 +134,8 @@ class Occluder:
         Whether it hides vehicles: not on an open road, and no longer once the ego vehicle is past it. What is
         heard from this side is then in view, or outside of the camera's view, never hidden.
     corner_m : (float, float) or None
-        Its corner in the map frame, metres; with it the edge moves as the ego vehicle does.
+        Its corner in the map frame, metres; with it the edge moves as the ego vehicle does. Past another one
+        the line of sight is assumed to keep its place on the ground.
     crossing_m : float or None
         Where the lane behind it crosses the x axis of the map, metres.
 
@@ -334,7 +335,8 @@ class Context:
         predicted to the time stamp in a snapshot. A sequence model is moved to the given ones all along, by
         -.5 to +2 nats; without them it keeps the share of hazards that it was trained at.
     ego_speed_mps, degradation : float or None
-        Ego speed, and degradation level d of the co-evidence channel in [0, 1].
+        Ego speed, by which it drives straight on unless odometry says otherwise, and degradation level d of
+        the co-evidence channel in [0, 1].
     site : str or None
         Name of the place.
     view_half_angle_rad : float

@@ -208,7 +208,7 @@ class RiskCue:
         None without a sequence model.
     time_to_visible_s : (float, float, float) or None
         Low, best and high; the interval holds nine of ten. None where no advisory names the direction and it
-        is likelier than not that none comes within five seconds.
+        is likelier than not that none comes within five seconds. Of an announced road user that of its place.
     sector_rad : (float, float) or None
         Where it is in nine of ten cases: from this azimuth to the left until that one.
     evidence : EvidenceTerms or None

@@ -117,8 +117,8 @@ class Entity:
     covariance : nested tuple of floats, shape (4, 4), or None
         Of (x, y, vx, vy), m and m/s; None unless a sensor has measured the position.
     time_to_visible_s : (float, float, float) or None
-        Low, best and high of a hidden entity with a position, nine of ten in between; None where it may not
-        come into view.
+        Low, best and high of a hidden entity with a position, nine of ten in between; None unless it comes
+        into view within eight seconds in nine of ten cases.
     inverse_tta_hz, inverse_tta_std_hz : float or None
         1/TTA = -r_dot/r, 1/s, positive while closing, and its standard deviation; None until measured.
     tta_s : float or None
@@ -220,7 +220,7 @@ class Event:
     Parameters
     ----------
     stamp_ns : int
-        Of the measurement that brought it, ns.
+        Of the state in which it is first, ns.
     kind : {"born", "handed_over", "coasting", "hidden_again", "died", "merged"}
         Begun; come into view of a sensor that had not seen it; in view before and not found by the last look;
         seen before and now behind an occluder; dropped; gone on as another one.
