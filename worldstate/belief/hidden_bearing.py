@@ -107,13 +107,13 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
 
 def time_to_visible(
     place: CartesianBelief, side: SideGeometry, site: SiteGeometry, within_s: float = COMING_S[-1]
-) -> tuple[float, tuple[float, float, float] | None]:
+) -> tuple[FloatArray, tuple[float, float, float] | None]:
     r"""Return P(an entity comes into view in time | hidden), and low, best and high time to visible, s.
 
     .. math:: P(T \le t \mid \text{hidden}) = P(S_t \le 0 \mid S_0 > 0)
 
     The best time is that of the mean place and velocity; low and high hold nine of ten of those that come in
-    time. None are stated unless nine of ten come in time: of the others the time has no mean and no end.
+    time. None are stated unless nine of ten come in time, nor of several places, which have a chance each.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def time_to_visible(
     >>> coming = CartesianBelief(np.array([10.0, 20.0, 0.0, -8.0]), np.diag([0.2, 0.2, 0.1, 0.1]))
     >>> left = SideGeometry("left", 0.56, 0.96, 0.35)
     >>> chance, times_s = time_to_visible(coming, left, SiteGeometry((left,), 0.6, FilterSettings()))
-    >>> round(chance, 3), [round(value, 1) for value in times_s]
+    >>> round(float(chance), 3), [round(value, 1) for value in times_s]
     (1.0, [1.4, 1.7, 2.0])
     """
     # Imported where it is needed: few streets have announced road users.
@@ -133,17 +133,19 @@ def time_to_visible(
     abeam_s = range_m * math.cos(side.edge_azimuth_rad) / (speed_mps or _SMALLEST)
     times_s = np.linspace(0.0, min(within_s, abeam_s) if abeam_s > 0.0 else within_s, _STEPS)
     ego, _ = arc(speed_mps, site.ego_yaw_rate_rad_s, times_s)
-    ray, off = range_m * along - ego, place.mean[:2] + times_s[:, None] * place.mean[2:] - ego
+    ray = range_m * along - ego
+    off = place.mean[..., None, :2] + times_s[:, None] * place.mean[..., None, 2:] - ego
     normal = side.outwards * np.stack([-ray[:, 1], ray[:, 0]], axis=1)
     slope = np.hstack([normal, times_s[:, None] * normal])
-    mean, edge = (normal * off).sum(axis=1), range_m * side.edge_std_rad * (off @ along)
-    covariance = slope @ place.covariance @ slope.T + np.outer(edge, edge)
-    std = np.sqrt(covariance.diagonal())
-    past, correlation = -mean / std, covariance.diagonal(1) / (std[1:] * std[:-1])
+    mean, edge = (normal * off).sum(axis=-1), range_m * side.edge_std_rad * (off @ along)
+    spread = slope @ place.covariance
+    std = np.sqrt((spread * slope).sum(axis=-1) + edge**2)
+    shared = (spread[..., 1:, :] * slope[:-1]).sum(axis=-1) + edge[..., 1:] * edge[..., :-1]
+    past, correlation = -mean / std, shared / (std[..., 1:] * std[..., :-1])
     # By steps: one that has passed the ego vehicle as well is behind its line again.
-    passes = _both_below(-past[:-1], past[1:], -correlation).sum()
-    chance = float(min(max(passes, 0.0) / max(ndtr(-past[0]), _SMALLEST), 1.0))
-    if chance < 0.9:
+    passes = _both_below(-past[..., :-1], past[..., 1:], -correlation).sum(axis=-1)
+    chance = np.clip(passes / np.maximum(ndtr(-past[..., 0]), _SMALLEST), 0.0, 1.0)
+    if chance.ndim or chance < 0.9:
         return chance, None
     past = np.maximum.accumulate(past)
     low, high = ndtri(np.interp([0.05, 0.95], [0.0, 1.0], ndtr(past[[0, -1]]))).tolist()
@@ -163,9 +165,10 @@ def _both_below(h: FloatArray, k: FloatArray, correlation: FloatArray) -> FloatA
 
 def announced(tracks: Tracks, site: SiteGeometry) -> tuple[float, ...]:
     """Return for each side the probability that a hidden entity with a place comes into view, shape (K,)."""
-    chances = [0.0] * len(site.sides)
-    for i in np.flatnonzero(tracks.placed & ~tracks.seen & tracks.moving).tolist():
-        k, place = int(tracks.side[i]), CartesianBelief(tracks.place_mean[i], tracks.place_covariance[i])
-        comes, _ = time_to_visible(place, site.sides[k], site)
-        chances[k] = max(chances[k], float(tracks.existence[i] * tracks.behind[i]) * comes)
+    hidden, chances = tracks.placed & ~tracks.seen & tracks.moving, [0.0] * len(site.sides)
+    for k in set(tracks.side[hidden].tolist()):
+        rows = np.flatnonzero(hidden & (tracks.side == k))
+        places = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
+        comes, _ = time_to_visible(places, site.sides[k], site)
+        chances[k] = float((tracks.existence[rows] * tracks.behind[rows] * comes).max())
     return tuple(chances)

@@ -81,7 +81,7 @@ def _edges(track: Track, share: float, memory: Memory, model: FilterModel) -> It
 def _comes(track: Track, side: int, memory: Memory, model: FilterModel) -> float:
     """Return P(it comes into view from there within five seconds | hidden), by its place or the sound."""
     if track.place is not None:
-        return time_to_visible(track.place, model.site.sides[side], model.site, LONGEST_S)[0]
+        return float(time_to_visible(track.place, model.site.sides[side], model.site, LONGEST_S)[0])
     if memory.sequence is None:
         return 1.0
     coming = memory.sequence.coming[side]
