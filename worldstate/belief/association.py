@@ -63,6 +63,11 @@ class Association:
     new: list[int]  # Detections of no track
 
     @property
+    def unclaimed(self) -> FloatArray:
+        """P(it is of no track) of every detection."""
+        return np.asarray(np.maximum(1.0 - self.pairs.sum(axis=1), 0.0))
+
+    @property
     def chances(self) -> list[float]:
         """P(one of them is its) of every track."""
         chances: list[float] = np.minimum(self.pairs.sum(axis=0), 1.0).tolist()

@@ -25,6 +25,9 @@ class FilterSettings:
         side, and dropped when its existence falls below the second.
     delete_existence : float
         A visible entity is dropped below this existence.
+    births_per_look : float
+        New road users that a look finds, on the mean: against the clutter rate of the look and the score of
+        a detection it decides how far a first detection is believed.
     stream : str
         Name that entity ids are derived from: the same stream gives the same ids.
 
@@ -46,6 +49,7 @@ class FilterSettings:
     death_probability: Probability = 0.1
     # Three full looks that find nothing take .99 below it, at a miss rate of .04.
     delete_existence: Probability = 0.05
+    births_per_look: float = 0.05  # Assumed: one new road user in twenty images
     stream: str = "worldstate"
 
     def __post_init__(self) -> None:

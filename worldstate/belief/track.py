@@ -238,19 +238,10 @@ def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
     return missed / (missed + 1.0 - existence)
 
 
-def after_sighting(existence: NumbersT, miss_rate: float, clutter_rate: float) -> NumbersT:
-    r"""Return the existence after a detection.
-
-    .. math:: r \leftarrow \frac{r\, (1 - \beta (1 - c))}{r\, (1 - \beta (1 - c)) + (1 - r)\, c}
-    """
-    # A look finds something where the entity is detected or, if it is missed, where there is clutter.
-    found = existence * (1.0 - miss_rate * (1.0 - clutter_rate))
-    return found / (found + (1.0 - existence) * clutter_rate)
-
-
 def predict_tracks(tracks: Tracks, sides: SideBelief, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
     shares, polar = hidden_shares(tracks, sides), np.ones(len(tracks), bool)
+    tracks.existence[tracks.seen] *= math.exp(-step_s / _VISIBLE_LIFE_S)
     if tracks.placed.any():
         _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
         polar = ~tracks.placed  # Those that have just lost their place, too
@@ -298,7 +289,6 @@ def _relax(
     towards = MotionBelief(expected.mean[of], expected.covariance[of])
     relaxed = relax(motion, towards, kept, math.exp(-step_s / _RELAXATION_S))
     tracks.mean[rows], tracks.covariance[rows] = relaxed.mean, relaxed.covariance
-    tracks.existence[rows] *= np.where(seen, math.exp(-step_s / _VISIBLE_LIFE_S), 1.0)
 
 
 def follow_places(tracks: Tracks, site: SiteGeometry) -> None:

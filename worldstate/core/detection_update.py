@@ -25,7 +25,6 @@ from worldstate.belief.track import (
     Track,
     Tracks,
     after_empty_look,
-    after_sighting,
     born,
     follow_places,
     merged,
@@ -83,7 +82,8 @@ def update_looks(
 ) -> None:
     """Update the memory with the new looks of a measurement, all cameras at once."""
     if looks:
-        scans = [camera_scan(seen, model.site.view(seen.look), weight) for seen, weight in looks]
+        births = model.site.settings.births_per_look
+        scans = [camera_scan(seen, model.site.view(seen.look), weight, births) for seen, weight in looks]
         detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
 
 
@@ -92,7 +92,8 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     settings, last = model.site.settings, memory.looks.get(scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     weight = min(elapsed_s / settings.look_interval_s, 1.0)
-    detection_update(memory, [position_scan(scan, weight)], None, scan.stamp_ns, model.site)
+    scans = [position_scan(scan, weight, settings.births_per_look)]
+    detection_update(memory, scans, None, scan.stamp_ns, model.site)
     memory.looks[scan.source] = _scan_look(scan)
     if isinstance(memory.belief, SequenceMemory):
         memory.belief = alerted(memory.belief, model.context)
@@ -128,6 +129,9 @@ def detection_update(
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
     whose = associated(known, detections, site)
+    if detections.in_sight:
+        # A detection that may be of a known entity is a new one the less.
+        detections = replace(detections, existence=detections.existence * whose.unclaimed)
     fresh = [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
     memory.tracks = tracks = known.joined(fresh)
     chances, detection = np.ones(len(tracks)), np.full(len(tracks), -1)
@@ -138,12 +142,13 @@ def detection_update(
     if scans[0].sector is None:
         existence = _told(tracks, found, scans[0])
     else:
-        hits = np.zeros((len(tracks), len(scans)))
-        hits[: len(known)] = np.minimum(whose.pairs.T @ by_look, 1.0)
-        # Certain of a first detection.
-        first = rows[~was_seen[rows]]
-        hits[first] = by_look[detection[first]]
-        existence = _existence(tracks, found, hits, scans)
+        existence = tracks.existence.copy()
+        hits = np.minimum(whose.pairs.T @ by_look, 1.0)
+        existence[: len(known)] = _existence(known, hits, scans)
+        # What was only heard is found, or another one is.
+        first = np.flatnonzero((detection[: len(known)] >= 0) & ~known.detected)
+        another = (1.0 - chances[first]) * detections.existence[detection[first]]
+        existence[first] = chances[first] + another
     _move(tracks, found)
     _see(tracks, found, chances, scans, stamp_ns, site)
     if len(missed):
@@ -181,31 +186,25 @@ def _born(
     return replace(track, side=side, came_from=1.0, sources=(scan.source,))
 
 
-def _existence(tracks: Tracks, found: _Found, hits: FloatArray, scans: Sequence[Scan]) -> FloatArray:
+def _existence(tracks: Tracks, hits: FloatArray, scans: Sequence[Scan]) -> FloatArray:
     r"""Return the existence after every look s of an instant, each with the chance c that it has detected it.
 
-    .. math:: r_s = c_s\, r_+ + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
+    .. math:: r_s = c_s + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
               p_s = p_D\, P_{range}\, (1 - P_{hidden}), \qquad
               \frac{r'}{1 - r'} = \frac{r}{1 - r} \prod_s \frac{r_s}{1 - r_s} \frac{1 - r}{r}
+
+    Of what is only heard the belief of its side decides.
     """
-    seen, counts, before = tracks.seen, tracks.detected, tracks.existence
-    if not seen.all():
-        # A first detection counts before it is certain which entity it is of.
-        first = ~seen[found.rows]
-        rows, told = found.rows[first], found.detections.existence[found.by[first]]
-        counts, before = counts.copy(), before.copy()
-        counts[rows], before[rows] = True, np.maximum(before[rows], told)
-    r = np.minimum(np.maximum(before, _ROUNDING), 1.0 - _ROUNDING)
-    in_sight = np.where(seen, 1.0, 1.0 - tracks.behind)
+    r = np.minimum(np.maximum(tracks.existence, _ROUNDING), 1.0 - _ROUNDING)
+    in_sight = np.where(tracks.seen, 1.0, 1.0 - tracks.behind)
     odds = ratio = r / (1.0 - r)
     for hit, scan in zip(hits.T, scans, strict=True):
         detected = _searched(tracks, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
         missed = after_empty_look(r, 1.0 - detected)
-        missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
-        now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
-        now = np.minimum(np.maximum(now, _ROUNDING), 1.0 - _ROUNDING)
+        missed = np.where(tracks.seen, missed, np.maximum(missed, LEAST_EXISTENCE))
+        now = np.minimum(np.maximum(hit + (1.0 - hit) * missed, _ROUNDING), 1.0 - _ROUNDING)
         ratio = ratio * (now / (1.0 - now)) / odds
-    return np.where(counts, ratio / (1.0 + ratio), before)
+    return np.where(tracks.detected, ratio / (1.0 + ratio), tracks.existence)
 
 
 def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
