@@ -326,7 +326,7 @@ def test_the_interval_of_the_time_holds_nine_of_ten_of_a_group_and_its_margin(gr
 
 def seen(azimuth_rad: float, existence: float):
     motion = MotionBelief.around((azimuth_rad, 0.0, 0.0, 3.2), (0.05, 0.1, 0.1, 0.3))
-    return replace(born("visible", 0, existence, 0, SITE), seen=True, motion=motion, existence=existence)
+    return replace(born("visible", 0, existence, 0, SITE), seen=True, motion=motion, behind=0.0)
 
 
 def box_scan(azimuth_rad: float, miss_rate: float, name: str = "camera", std_rad: float = 0.02):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from operator import attrgetter, methodcaller
 
 import numpy as np
@@ -57,6 +57,13 @@ class Detections:
         """Return detections by their numbers, a row each, and what else is told of them."""
         azimuth, std, width, moving, existence, log_new, found = np.array(rows, float).reshape(-1, 7).T
         return cls(azimuth, std, width, moving, existence, log_new, found, classes, positions, in_sight)
+
+    def seen_through(self, in_sight: FloatArray) -> "Detections":
+        """Return the detections if new objects are only found in line of sight, P(n,)."""
+        total = 1.0 - self.existence * (1.0 - in_sight)
+        return replace(
+            self, existence=self.existence * in_sight / total, log_new=self.log_new + np.log(total)
+        )
 
     def __len__(self) -> int:
         return len(self.classes)

@@ -48,6 +48,7 @@ class SideGeometry:
     pace_hz: float = 0.5  # Speed over the distance of the crossing lane
     hides: bool = True
     yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
+    certainty: float = 1.0  # P(the occluder stands there)
 
     @property
     def outwards(self) -> float:
@@ -115,11 +116,22 @@ class SiteGeometry:
         return MotionBelief.stacked([*(side.prior() for side in self.sides), IN_VIEW])
 
     def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
-        """Return the chances that azimuths lie past the edge on their way: 1 to the left, -1, 0 of none."""
+        """Return the chances that azimuths lie past the edges on their way, shape (n, K).
+
+        The way is 1 to the left, -1 to the right, 0 of none.
+        """
         edge_rad, edge_std, outwards = self._edges
-        past = way * (azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
-        farthest = np.where(way * outwards > 0.0, past, -np.inf).max(axis=0)
-        return np.array([normal_share(one) for one in farthest.tolist()])
+        past = way * wrap_angle(azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
+        hides = np.array([[one.hides] for one in self.sides])
+        return normal_shares(np.where((way * outwards > 0.0) & hides, past, -np.inf).T)
+
+    def line_of_sight(self, azimuth_rad: FloatArray, std_rad: FloatArray) -> FloatArray:
+        """Return P(no occluder stands before what is at some azimuths)."""
+        hidden = [
+            [one.certainty * one.behind(at, math.hypot(std, one.edge_std_rad)) for one in self.sides]
+            for at, std in zip(azimuth_rad.tolist(), std_rad.tolist(), strict=True)
+        ]
+        return np.asarray(1.0 - np.reshape(hidden, (-1, len(self.sides))).max(axis=1))
 
     def view(self, look: Look) -> Sector:
         """Return where a look has searched."""
@@ -146,6 +158,11 @@ class SiteGeometry:
             return replace(look, answer=Absent(miss, answer.clutter_rate))
         # With a clutter rate of zero a box would rule out everything else.
         return replace(look, answer=Present(miss, answer.clutter_rate or CLUTTER_RATE))
+
+
+def normal_shares(deviations: FloatArray) -> FloatArray:
+    """Return the shares of a normal distribution below so many deviations."""
+    return np.reshape([normal_share(one) for one in deviations.ravel().tolist()], deviations.shape)
 
 
 def normal_share(deviations: float) -> float:

@@ -123,7 +123,7 @@ class WorldFilter:
             stamp_ns=memory.stamp_ns,
             seq=memory.counts.measurements,
             entities=entities_of(tracks, memory, model.site),
-            relations=memory.relations if is_fresh else relations_at(memory, tracks, context),
+            relations=memory.relations if is_fresh else relations_at(memory, tracks, context, model.site),
             context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
             calibrated=self.policy.alpha > 0.0 and not deaf and not broken,

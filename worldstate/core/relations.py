@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import STATED
-from worldstate.belief.site_geometry import normal_share
-from worldstate.belief.track import Track, Tracks, hidden_shares, side_weights
+from worldstate.belief.site_geometry import SiteGeometry, normal_share
+from worldstate.belief.track import Track, Tracks, hidden_shares, occluded, side_weights
 from worldstate.ground import FloatArray, nanoseconds
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
@@ -26,10 +26,13 @@ _BESIDE = 10.0  # Metres ahead that a metre beside the lane counts for
 _LEAST = 0.05  # What is less likely is not named
 
 
-def relations_at(memory: Memory, tracks: Tracks, context: Context) -> tuple[Relation, ...]:
+def relations_at(
+    memory: Memory, tracks: Tracks, context: Context, site: SiteGeometry
+) -> tuple[Relation, ...]:
     """Return the relations of some tracks, with the interval in which each has held by those in memory."""
     # What a camera alone has found, first in view, has none.
     related = ~tracks.seen | (tracks.came_from >= _LEAST) | tracks.approach_heard | tracks.placed
+    related |= tracks.behind >= _LEAST
     if not memory.relations and not related.any():
         return ()
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
@@ -42,6 +45,7 @@ def relations_at(memory: Memory, tracks: Tracks, context: Context) -> tuple[Rela
     placed = [one for one in some if one.place and one.place.known]
     if placed:
         edges += _between(placed, memory.stamp_ns, context)
+    edges += _hiding(tracks, memory.stamp_ns, context, site)
     now = {(one.src, one.dst, one.kind): one for one in edges}
     names = set(tracks.id)
     for key, edge in before.items():
@@ -73,11 +77,22 @@ def _edges(track: Track, share: float, memory: Memory, context: Context) -> Iter
                 comes = hidden * _comes(track, k, memory)
                 yield Relation(track.id, one.id, "occluded_by", hidden, stamp_ns)
                 yield Relation(track.id, one.id, "approaching_from", comes, stamp_ns)
-    elif track.came_from >= _LEAST:
+    elif track.came_from >= _LEAST and share < _HOLDS:
         yield Relation(track.id, occluder, "emerged_from", track.came_from, stamp_ns)
     if track.approach_heard:
         deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
         yield Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns)
+
+
+def _hiding(tracks: Tracks, stamp_ns: int, context: Context, site: SiteGeometry) -> Iterator[Relation]:
+    """Yield which corners and entities hide those that were in view before."""
+    rows = np.flatnonzero(tracks.seen & (tracks.behind >= _LEAST))
+    if len(rows):
+        by, names = occluded(tracks, site)[rows], [*(one.id for one in context.occluders), *tracks.id]
+        chances = tracks.behind[rows, None] * by / np.maximum(by.sum(axis=1, keepdims=True), _LEAST)
+        for i, k in zip(*np.nonzero(chances >= _LEAST), strict=True):
+            chance = min(float(chances[i, k]), 1.0)
+            yield Relation(tracks.id[rows[i]], names[k], "occluded_by", chance, stamp_ns)
 
 
 def _comes(track: Track, side: int, memory: Memory) -> float:

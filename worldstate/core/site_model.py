@@ -47,6 +47,7 @@ def site_geometry_of(
             one.pace_hz,
             one.hides,
             0.0 if one.corner_m is None else yaw_rad,
+            settings.assumed_certainty if one.assumed else 1.0,
         )
         for one in context.occluders
     )

@@ -102,7 +102,7 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
     into = merge_tracks(memory, model.site)
     known, now = (published(one.tracks, model.site.settings) for one in (before, memory))
     memory.last.events = events_between(known, now, memory.stamp_ns, into)
-    memory.relations = relations_at(memory, now, model.context)
+    memory.relations = relations_at(memory, now, model.context, model.site)
 
 
 def _perceive(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
