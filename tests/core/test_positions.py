@@ -414,3 +414,17 @@ def test_radar_and_camera_speak_of_one_car() -> None:
     # The box is the sharper one across, the radar the only one along.
     across = [math.sqrt(np.linalg.eigvalsh(np.array(one.covariance)[:2, :2])[0]) for one in entities]
     assert max(across) < 0.25
+
+
+@given(st.integers(1, 4), SEEDS)
+@settings(max_examples=10, deadline=None)
+def test_beside_certain_vehicles_in_view_nothing_is_no_explanation(cars: int, seed: int) -> None:
+    rng, world = np.random.default_rng(seed), WorldFilter()
+    lanes = [(15.0 + 8.0 * k, float(rng.uniform(-4.0, 4.0))) for k in range(cars)]
+    for hop in range(1, 12):
+        there = [Position((x + 0.3 * hop, y), diagonal(0.4, 0.4, 0.3, 0.3), (3.0, 0.0)) for x, y in lanes]
+        scan = replace(radar(hop / 10 + 0.02, *there), searched=replace(RADAR, detection_probability=0.9))
+        world = after(heard(hop / 10), scan, world=world)
+    for cue in world.state.cues:
+        said = cue.hypotheses
+        assert said.none < 0.05 and said.hidden + said.visible + said.none == pytest.approx(1.0)

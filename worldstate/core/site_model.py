@@ -84,7 +84,7 @@ def without_open_sides(measurement: Measurement, context: Context) -> Measuremen
 
 
 def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
-    r"""Return the belief of the sides as it is published: with the policy's calibration, and with messages.
+    r"""Return the belief of the sides as it is published: with the policy's calibration, messages and tracks.
 
     .. math:: r_k = \min\big(P(hid),\ g(P(hid))\big)\, P(k \mid hid)
 
@@ -98,4 +98,6 @@ def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
         # The floor only matters where P(hidden) has underflowed; then no direction has a share.
         share = risk / max(hidden, 1e-300)
         sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
-    return sides.at_least(announced(memory.tracks, model.site))
+    tracks, moving = memory.tracks, memory.tracks.seen & memory.tracks.moving
+    unseen = 1.0 - tracks.existence[moving] * (1.0 - tracks.behind[moving])
+    return sides.at_least(announced(tracks, model.site)).beside(float(unseen.prod()))
