@@ -55,13 +55,6 @@ class SideGeometry:
         """The way from the edge to what it hides: 1 to the left, -1 to the right."""
         return math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
 
-    def behind(self, azimuth_rad: float, std_rad: float) -> float:
-        """Return the probability that what stands at an azimuth is behind this side's occluder."""
-        if not self.hides:
-            return 0.0
-        past = self.outwards * wrap_angle(azimuth_rad - self.edge_azimuth_rad) / std_rad
-        return normal_share(past) - normal_share(past - _WIDEST_RAD / std_rad)
-
     def distance_rad(self, azimuth_rad: float, width_rad: float = 0.0) -> float:
         """Return the angle, >= 0, between the occluder's edge and the end of a box that leads past it."""
         return abs(wrap_angle(azimuth_rad - 0.5 * self.outwards * width_rad - self.edge_azimuth_rad))
@@ -93,9 +86,16 @@ class SiteGeometry:
 
     def hiding_side(self, azimuth_rad: float) -> int | None:
         """Return the side whose occluder hides what stands at an azimuth, if one does."""
-        chances = [side.behind(azimuth_rad, _SHARP_RAD) for side in self.sides]
-        side = max(range(len(chances)), key=chances.__getitem__)
+        (chances,) = self.behind(np.array([azimuth_rad]), _SHARP_RAD)
+        side = int(chances.argmax())
         return side if chances[side] >= 0.5 else None
+
+    def behind(self, azimuth_rad: FloatArray, std_rad: FloatArray | float) -> FloatArray:
+        """Return the chances that what stands at some azimuths is behind the occluders, shape (n, K)."""
+        edge_rad, _, outwards = self._edges[..., 0]
+        past = outwards * wrap_angle(azimuth_rad[:, None] - edge_rad)
+        chances = normal_shares(past / std_rad) - normal_shares((past - _WIDEST_RAD) / std_rad)
+        return np.asarray(chances * [one.hides for one in self.sides])
 
     @cached_property
     def _edges(self) -> FloatArray:
@@ -127,11 +127,8 @@ class SiteGeometry:
 
     def line_of_sight(self, azimuth_rad: FloatArray, std_rad: FloatArray) -> FloatArray:
         """Return P(no occluder stands before what is at some azimuths)."""
-        hidden = [
-            [one.certainty * one.behind(at, math.hypot(std, one.edge_std_rad)) for one in self.sides]
-            for at, std in zip(azimuth_rad.tolist(), std_rad.tolist(), strict=True)
-        ]
-        return np.asarray(1.0 - np.reshape(hidden, (-1, len(self.sides))).max(axis=1))
+        hidden = self.behind(azimuth_rad, np.hypot(std_rad[:, None], self._edges[1].T))
+        return np.asarray(1.0 - (hidden * [one.certainty for one in self.sides]).max(axis=1))
 
     def view(self, look: Look) -> Sector:
         """Return where a look has searched."""
@@ -162,7 +159,10 @@ class SiteGeometry:
 
 def normal_shares(deviations: FloatArray) -> FloatArray:
     """Return the shares of a normal distribution below so many deviations."""
-    return np.reshape([normal_share(one) for one in deviations.ravel().tolist()], deviations.shape)
+    # Imported where it is needed: the association has loaded it with scipy.optimize.
+    from scipy.special import ndtr
+
+    return np.asarray(ndtr(deviations))
 
 
 def normal_share(deviations: float) -> float:

@@ -316,9 +316,8 @@ def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatAr
     at = np.zeros((len(tracks), sides + len(tracks)))
     nearer = np.zeros_like(at)
     at[:, :sides] = site.past_edge(azimuth_rad + 0.5 * way * widths, tracks.azimuth_std_rad, way)
-    for row in np.flatnonzero(tracks.placed).tolist():
-        place = float(azimuth_rad[row]), float(tracks.azimuth_std_rad[row])
-        at[row, :sides] = [one.behind(*place) for one in site.sides]
+    placed = tracks.placed
+    at[placed, :sides] = site.behind(azimuth_rad[placed], tracks.azimuth_std_rad[placed, None])
     nearer[:, :sides] = np.where(tracks.seen[:, None], [one.certainty for one in site.sides], 1.0)
     covers = (widths > 0.0) & tracks.seen & (2.0 * widths >= widths[:, None])
     np.fill_diagonal(covers, False)
