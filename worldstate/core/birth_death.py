@@ -29,7 +29,7 @@ _REARM_NS = nanoseconds(1.0)
 _MASKED = 0.5  # Of the existence below which a hidden entity ends, beside a vehicle just come into view
 # A moving entity out of sight for so long may be the one now heard hidden nearby: more than one image at
 # 10 Hz, since a single miss is no occlusion, and less than a following vehicle takes, which would get its id.
-REOCCLUSION_NS, _REOCCLUSION_END_NS = nanoseconds(0.15), nanoseconds(3.0)
+_REOCCLUSION_NS, _REOCCLUSION_END_NS = nanoseconds(0.15), nanoseconds(3.0)
 # From the edge that it was last seen near: less than the 64 degrees between the edges of a default junction.
 _REOCCLUSION_RAD = 0.8
 HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
@@ -176,7 +176,8 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
         _put_on_its_side(tracks, first, memory.sides, site)
         ended.append(second)
         into[tracks.id[second]] = tracks.id[first]
-    for other in np.flatnonzero(tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS)).tolist():
+    lost = tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS) & (tracks.behind < HIDDEN)
+    for other in np.flatnonzero(lost).tolist():
         found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
         same = next((i for i in found if _at_one_place(tracks, i, other)), None)
         if same is not None:
@@ -250,7 +251,7 @@ def _returning(memory: Memory, k: int, site: SiteGeometry) -> int | None:
         i: site.sides[k].distance_rad(at)
         for i, at in azimuth_rad.items()
         # A camera that has died since says nothing of it.
-        if _searched_ns(memory, at) >= int(tracks.last_seen_ns[i]) + REOCCLUSION_NS
+        if _searched_ns(memory, at) >= int(tracks.last_seen_ns[i]) + _REOCCLUSION_NS
     }
     near = (i for i, apart in apart_rad.items() if apart <= _REOCCLUSION_RAD)
     return min(near, key=apart_rad.__getitem__, default=None)
@@ -282,9 +283,10 @@ def events_between(before: Tracks, after: Tracks, steps: Sequence[Memory]) -> tu
     """Return what became of every entity, those that were there before first; `steps` hold their merges."""
     stamp_ns = steps[-1].stamp_ns
     into = {one.entity_id: one.into for step in steps for one in step.last.events if one.into}
-    left = dict(zip(after.id, zip(after.seen.tolist(), after.answer, strict=True), strict=True))
+    was_in_view, in_view = ((one.seen & (one.behind < HIDDEN)).tolist() for one in (before, after))
+    left = dict(zip(after.id, zip(in_view, after.answer, strict=True), strict=True))
     events = list[Event]()
-    for name, was_seen, answer in zip(before.id, before.seen.tolist(), before.answer, strict=True):
+    for name, was_seen, answer in zip(before.id, was_in_view, before.answer, strict=True):
         seen, said = left.pop(name, (None, None))
         kind: EventKind | None = None
         if seen is None:
