@@ -409,9 +409,8 @@ def test_at_its_time_to_visible_a_vehicle_stands_behind_the_corner_as_the_ego_ve
             ego, _ = arc(speed, turning, driven_s)
             corner = corner_m * np.array([math.cos(0.56), math.sin(0.56)]) - ego
             off = place.mean[:2] + times_s[1] * place.mean[2:] - ego
-            assert np.hypot(*corner) < 0.5 or math.atan2(off[1], off[0]) == pytest.approx(
-                math.atan2(corner[1], corner[0]), abs=0.02
-            )
+            apart = corner[0] * off[1] - corner[1] * off[0]
+            assert apart == pytest.approx(0.0, abs=0.02 * corner_m * max(np.hypot(*off), 1.0))
 
 
 @pytest.mark.parametrize("group", [1, 4, 7])
