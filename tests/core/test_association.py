@@ -17,7 +17,7 @@ from worldstate.belief.association import FORBIDDEN, association_probabilities, 
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 
-FOUND, CLUTTER, RANGE_M, UNHEARD = 0.7, 0.1, 1e3, 0.05
+FOUND, CLUTTER, RANGE_M, BIRTHS = 0.7, 0.1, 1e3, 0.05
 RADAR = SearchedSector(Sector(0.0, 1.2), RANGE_M, FOUND, CLUTTER)
 SCAN_S, STD = 0.5, 1.0
 NOISE = tuple(map(tuple, (np.eye(4) * STD**2).tolist()))
@@ -56,7 +56,7 @@ def stone_soup_chances(before, places):
     model = LinearGaussian(4, (0, 1, 2, 3), np.eye(4) * STD**2)
     # A scan tells velocities, too: those of anybody have 15 m/s beside the noise.
     anybody = 1.0 / (2.0 * math.pi * (STD**2 + 15.0**2))
-    density = UNHEARD / (RADAR.sector.half_width_rad * RANGE_M**2) * anybody
+    density = (BIRTHS - math.log1p(-CLUTTER)) / (RADAR.sector.half_width_rad * RANGE_M**2) * anybody
     still = CombinedLinearGaussianTransitionModel([RandomWalk(0.0)] * 4)
     association = JPDA(
         OfExistence(
@@ -86,9 +86,8 @@ def test_existence_is_summed_over_the_joint_events_of_stone_soups_jpda(seed):
     }
     for one, chance in zip(before, stone_soup_chances(before, again.tolist()), strict=True):
         r, p = one.existence_probability, FOUND
-        hit = r * (p + (1 - p) * CLUTTER) / (r * (p + (1 - p) * CLUTTER) + (1 - r) * CLUTTER)
         missed = r * (1 - p) / (1 - r * p)
-        assert after[one.id] == pytest.approx(chance * hit + (1 - chance) * missed, abs=1e-9)
+        assert after[one.id] == pytest.approx(chance + (1 - chance) * missed, abs=1e-9)
 
 
 def counted(log_ratios):

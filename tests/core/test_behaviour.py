@@ -238,11 +238,11 @@ def test_who_has_driven_to_the_edge_ahead_is_out_of_sight_rather_than_missed(azi
     hops = [(1.0 + 0.1 * hop, azimuth + 0.1 * rate * (hop - 9)) for hop in range(10)]
     boxes = [replace(car(at), width_rad=0.25) for _, at in hops]
     world = after(WorldFilter(), *[measured(t, FRONT, box) for (t, _), box in zip(hops, boxes, strict=True)])
-    (entity,) = after(world, measured(2.0, FRONT, answer=Absent(0.1))).state.entities
-    assert (entity.status, entity.visibility.answer) == ("visible", answer)
+    world = after(world, *[measured(t, FRONT, answer=Absent(0.1)) for t in (2.0, 2.1)])
+    (entity,) = world.state.entities
+    assert entity.visibility.answer == answer
+    assert entity.status == ("hidden" if answer == "unqueried" else "visible")
     # Found once more, it is in view again.
-    again = replace(car(azimuth + 0.2 * rate), width_rad=0.25)
-    (entity,) = after(
-        world, measured(2.0, FRONT, answer=Absent(0.1)), measured(2.1, FRONT, again)
-    ).state.entities
-    assert entity.visibility.answer == "visible"
+    again = replace(car(azimuth + 0.3 * rate), width_rad=0.25)
+    (entity,) = after(world, measured(2.2, FRONT, again)).state.entities
+    assert (entity.status, entity.visibility.answer) == ("visible", "visible")

@@ -326,12 +326,13 @@ def test_the_interval_of_the_time_holds_nine_of_ten_of_a_group_and_its_margin(gr
 
 def seen(azimuth_rad: float, existence: float):
     motion = MotionBelief.around((azimuth_rad, 0.0, 0.0, 3.2), (0.05, 0.1, 0.1, 0.3))
-    return replace(born("visible", 0, existence, 0, SITE), seen=True, motion=motion, existence=existence)
+    return replace(born("visible", 0, existence, 0, SITE), seen=True, motion=motion, behind=0.0)
 
 
 def box_scan(azimuth_rad: float, miss_rate: float, name: str = "camera", std_rad: float = 0.02):
     look = Look(name, 0, Present(miss_rate, 0.01), (-0.6, 0.6))
-    return camera_scan(CameraLook(look, (Sighting(azimuth_rad, std_rad, "car", 0.9),)), Sector(0.0, 0.6), 1.0)
+    boxes = (Sighting(azimuth_rad, std_rad, "car", 0.9),)
+    return camera_scan(CameraLook(look, boxes), Sector(0.0, 0.6), 1.0, 0.05)
 
 
 @given(st.floats(-0.1, 0.1), st.floats(0.1, 0.9), st.floats(0.05, 0.6))
@@ -340,7 +341,7 @@ def test_a_box_is_of_the_one_entity_there_or_of_a_new_one(apart, existence, miss
     detections = box_scan(0.1 + apart, miss_rate).detections
     variance, found = 0.05**2 + 0.02**2, 1.0 - miss_rate
     own = found * existence * math.exp(-0.5 * apart**2 / variance) / math.sqrt(2.0 * math.pi * variance)
-    new = (1.0 - found * existence) * 0.05 / 1.2  # Unheard ones, anywhere in the view
+    new = (1.0 - found * existence) * (0.05 - math.log(0.99) / 9.0) / 1.2  # New ones and clutter
     whose = associated(Tracks.of([seen(0.1, existence)]), detections, SITE)
     assert whose.pairs[0, 0] == pytest.approx(own / (own + new), rel=1e-4)
 
@@ -358,7 +359,9 @@ def test_what_two_cameras_find_is_found_unless_both_miss_it(one, other) -> None:
     both, by_look = fused(scans)
     assert both.found == pytest.approx([1.0 - one * other]) and by_look.tolist() == [[True, True]]
     assert both.std_rad**-2 == pytest.approx([0.02**-2 + 0.04**-2])
-    assert both.log_new == pytest.approx([math.log(0.05 / 1.2)])
+    assert both.log_new == pytest.approx([math.log((0.05 - math.log(0.99) / 9.0) / 1.2)])
+    clutter = 1.0 - scans[0].detections.existence[0]
+    assert both.existence == pytest.approx([1.0 - clutter**2])  # New unless clutter of both
 
 
 @given(st.floats(0.3, 1.4), st.floats(0.05, 0.4))

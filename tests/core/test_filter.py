@@ -15,7 +15,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
 from worldstate.abduction.evidence import SignatureEvidence, statistic
 from worldstate.belief.site_geometry import HIDDEN_BIAS_STD
-from worldstate.belief.track import after_empty_look, after_sighting
+from worldstate.belief.track import after_empty_look
 from worldstate.core.acoustic_update import acoustic_update
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError
 from worldstate.ground.values import NotUsable
@@ -390,13 +390,30 @@ def test_not_looking_moves_nothing_but_survival():
     assert entity.visibility.answer == "unqueried"
 
 
-@given(st.floats(0.001, 0.999), st.floats(0.01, 0.99), st.floats(0.001, 0.5))
-def test_bernoulli_updates_are_bayes(r, miss_rate, clutter):
+@given(st.floats(0.001, 0.999), st.floats(0.01, 0.99))
+def test_an_empty_look_is_bayes(r, miss_rate):
     """Against the two-hypothesis table written out."""
     empty = np.array([r * miss_rate, 1 - r])
     assert after_empty_look(r, miss_rate) == pytest.approx(empty[0] / empty.sum())
-    found = np.array([r * (1 - miss_rate * (1 - clutter)), (1 - r) * clutter])
-    assert after_sighting(r, miss_rate, clutter) == pytest.approx(found[0] / found.sum())
+
+
+@given(st.floats(0.01, 0.99), st.floats(0.01, 0.5))
+@settings(max_examples=20, deadline=None)
+def test_a_first_box_is_believed_by_its_score_and_the_cameras_clutter(score, clutter):
+    """Birth against clutter, the score as odds; a second box at the place confirms, a missing one refutes."""
+    box = Sighting(0.1, 0.02, "car", score, 0.1)
+    first = measured(1.0, FRONT, box, answer=Present(0.05, clutter))
+    world = start(settings=FilterSettings(delete_existence=1e-9)).update(first)
+    (born,) = world.state.entities
+    odds = 0.05 / -math.log1p(-clutter) * score / (1.0 - score)
+    assert born.existence_probability == pytest.approx(odds / (1.0 + odds), rel=1e-6)
+    again, gone = (
+        world.update(replace(first, stamp_ns=2 * 10**9 - 9 * 10**8, sightings=boxes)).state.entities
+        for boxes in ((box,), ())
+    )
+    assert again[0].existence_probability > gone[0].existence_probability
+    assert score < 0.5 or again[0].existence_probability > born.existence_probability
+    assert gone[0].existence_probability < born.existence_probability
 
 
 angles = st.floats(-0.6, 0.6)

@@ -12,13 +12,21 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter, WorldState
+from worldstate import (
+    Context,
+    FilterSettings,
+    Measurement,
+    NotUsable,
+    Sighting,
+    SignatureEvidence,
+    WorldFilter,
+    WorldState,
+)
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.hidden_bearing import time_to_visible
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, update_bearing
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import Tracks
 from worldstate.ground.errors import InvalidArgumentError
@@ -151,11 +159,13 @@ def test_polar_motion_is_where_a_vehicle_driving_on_is_seen(seed: int) -> None:
 def test_empty_scans_take_existence_down_by_the_bernoulli_rule(detection: float) -> None:
     searched = replace(RADAR, detection_probability=detection)
     there = Position((20.0, 2.0), diagonal(0.3, 0.3, 0.3, 0.3), (0.0, 0.0))
-    world = after(*[replace(radar(t, there), searched=searched) for t in (0.5, 1.0)])
+    patient = WorldFilter(settings=FilterSettings(delete_existence=1e-6))
+    world = after(*[replace(radar(t, there), searched=searched) for t in (0.5, 1.0)], world=patient)
     (car,) = world.state.entities
     r = car.existence_probability
     for scan in range(1, 4):
         world = world.update(replace(radar(1.0 + 0.5 * scan), searched=searched))
+        r *= math.exp(-0.05)  # Survival over half a second
         r = r * (1.0 - detection) / (1.0 - r * detection)
         assert [one.existence_probability for one in world.state.entities] == pytest.approx([r], abs=1e-12)
 
@@ -165,7 +175,7 @@ def test_a_scan_of_elsewhere_says_nothing_of_whom_it_cannot_see(searched: Search
     there = Position((20.0, 2.0), diagonal(0.1, 0.1, 0.1, 0.1), (0.0, 0.0))
     world = after(*[radar(t, there) for t in (0.1, 0.2, 0.3)])
     later = after(*[PositionScan("radar", 4 * 10**8, (), searched)], world=world)
-    before, now = (one.state.entities[0].existence_probability for one in (world, later))
+    before, now = (one.state.entities[0].existence_probability for one in (world.predict(0.1), later))
     assert now == pytest.approx(before, abs=1e-9)
 
 
@@ -265,7 +275,7 @@ def test_detections_that_are_never_of_nothing_leave_existence_a_probability(clut
     world = after(replace(heard(1.6, boxes=boxes), co_evidence=Present(0.0, clutter)), world=world)
     for found in (world, after(radar(2.0), world=world)):
         (entity,) = found.state.entities
-        assert 0.4 < entity.existence_probability <= 1.0
+        assert 0.3 < entity.existence_probability <= 1.0
 
 
 def test_a_message_joins_the_vehicle_that_is_heard() -> None:
@@ -491,3 +501,17 @@ def test_the_line_of_sight_turns_as_the_ego_vehicle_drives_up_to_the_corner(spee
     usual = [Context(ego_speed_mps=speed_mps), Context()]
     moving, standing = (after(heard(0.1), radio(0.1, crossing(0.1)), world=WorldFilter(one)) for one in usual)
     assert moving.risk == pytest.approx(standing.risk, abs=1e-9)
+
+
+@given(st.integers(1, 4), SEEDS)
+@settings(max_examples=10, deadline=None)
+def test_beside_certain_vehicles_in_view_nothing_is_no_explanation(cars: int, seed: int) -> None:
+    rng, world = np.random.default_rng(seed), WorldFilter()
+    lanes = [(15.0 + 8.0 * k, float(rng.uniform(-4.0, 4.0))) for k in range(cars)]
+    for hop in range(1, 12):
+        there = [Position((x + 0.3 * hop, y), diagonal(0.4, 0.4, 0.3, 0.3), (3.0, 0.0)) for x, y in lanes]
+        scan = replace(radar(hop / 10 + 0.02, *there), searched=replace(RADAR, detection_probability=0.9))
+        world = after(heard(hop / 10), scan, world=world)
+    for cue in world.state.cues:
+        said = cue.hypotheses
+        assert said.none < 0.05 and said.hidden + said.visible + said.none == pytest.approx(1.0)

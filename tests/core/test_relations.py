@@ -5,17 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from snapshot_laws import broken_laws
 
-from worldstate import Context, WorldFilter
+from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 from worldstate.state import Relation
+from worldstate.state.context import corner_at
 
 ALL_ROUND = SearchedSector(Sector(0.0, math.pi), range_m=100.0, detection_probability=0.9)
 STD = (0.4, 0.3, 0.3, 0.3)
 SPREAD = tuple(map(tuple, np.diag(np.square(STD)).tolist()))
+SILENT, NEUTRAL = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 
 
 def seen(
@@ -106,3 +109,86 @@ def test_relations_name_only_what_the_snapshot_holds() -> None:
         ended += sum(one.until_ns is not None for one in state.relations)
         named += len(state.relations)
     assert named > 10_000 and ended > 1_000
+
+
+# Law 17: what moves behind an occluder is hidden by it, whoever had found it.
+
+
+def driven_behind(way, speed_mps, sensor, returns, rng):
+    """Yield seconds since a car has passed a known corner, and the state; radar or boxes, 10 a second."""
+    corners = corner_at("left", (8.0, 5.0), 14.0), corner_at("right", (8.0, -5.0), 14.0)
+    world = WorldFilter(Context(occluders=corners, view_half_angle_rad=0.9))
+    edge = 0.625
+    searched = SearchedSector(Sector(0.0, 1.3), 70.0, 0.9)
+    for hop in range(1, 60):
+        y, stamp_ns = -4.0 + speed_mps * hop / 10, round((1.0 + hop / 10) * 1e9)
+        since_s = (y - 14.0 * edge) / speed_mps
+        found = (since_s < 0.0 or returns) and rng.random() < 0.9
+        if sensor == "radar":
+            x, y, vy = np.array([14.0, y, speed_mps]) + rng.normal(0.0, 0.3, 3)
+            car = Position((x, way * y), tuple(map(tuple, 0.09 * np.eye(4))), (0.0, way * vy))
+            world = world.update(PositionScan("radar", stamp_ns, (car,) if found else (), searched))
+        else:
+            # What the corner leaves of it
+            ends = math.atan2(y - 2.2, 14.0), min(math.atan2(y + 2.2, 14.0), math.atan(edge))
+            width_rad = ends[1] - ends[0]
+            seen = since_s < 0.0 and width_rad > 0.0 and rng.random() < 0.9
+            box = Sighting(way * 0.5 * sum(ends), 0.004, "car", 0.9, max(width_rad, 0.0))
+            answer = Present(0.1, 0.02) if seen else Absent(0.1, 0.02)
+            look = Measurement(stamp_ns, NEUTRAL, answer, SILENT, SILENT, (box,) if seen else ())
+            world = world.update(look)
+        if 0.3 <= since_s <= 1.5:
+            yield world.state
+
+
+@given(
+    st.sampled_from([1.0, -1.0]),
+    st.floats(3.0, 12.0),
+    st.sampled_from([("radar", False), ("radar", True), ("camera", False)]),
+    st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=15, deadline=None)
+def test_what_drives_behind_a_known_corner_is_hidden_by_it_within_three_tenths(way, speed, by, seed):
+    states = list(driven_behind(way, speed, *by, np.random.default_rng(seed)))
+    assert states
+    for state in states:
+        (car,) = (one for one in state.entities if one.existence_probability > 0.5)
+        (hidden_by,) = (one for one in state.relations if (one.src, one.kind) == (car.id, "occluded_by"))
+        assert (car.status, car.direction) == ("hidden", "left" if way > 0.0 else "right")
+        assert hidden_by.dst == f"corner_{car.direction}" and hidden_by.probability > 0.5
+
+
+@given(st.floats(0.35, 0.8), st.sampled_from([1.0, -1.0]), st.floats(15.0, 40.0))
+@settings(max_examples=15, deadline=None)
+def test_a_radar_return_behind_the_wall_is_clutter(beyond_rad, way, range_m):
+    corners = corner_at("left", (8.0, 5.0), 14.0), corner_at("right", (8.0, -5.0), 14.0)
+    world, azimuth = WorldFilter(Context(occluders=corners)), way * (math.atan2(5.0, 8.0) + beyond_rad)
+    place = range_m * math.cos(azimuth), range_m * math.sin(azimuth)
+    ghost = Position(place, tuple(map(tuple, 0.2 * np.eye(4))), (0.0, -3.0 * way))
+    for hop in range(1, 30):
+        searched = SearchedSector(Sector(0.0, 1.5), 70.0, 0.9)
+        world = world.update(PositionScan("radar", hop * 10**8, (ghost,), searched))
+        assert all(one.existence_probability < 0.2 for one in world.state.entities)
+
+
+@given(st.sampled_from([1.0, -1.0]), st.floats(0.18, 0.3), st.floats(-0.1, 0.1))
+@settings(max_examples=15, deadline=None)
+def test_a_car_that_passes_behind_a_reported_van_keeps_its_identity(way, rate, van_rad):
+    world, ids = WorldFilter(), {}
+    van = Sighting(van_rad, 0.003, "truck", 0.9, 0.4, moving=False)
+    for hop in range(60):
+        azimuth = -0.5 + rate * hop / 10
+        covered = abs(azimuth - way * van_rad) < 0.2 - 0.2 * 0.25
+        boxes = (van,) if covered else (van, Sighting(way * azimuth, 0.003, "car", 0.9, 0.25))
+        look = Measurement(10**9 + hop * 10**8, NEUTRAL, Present(0.08, 0.02), SILENT, SILENT, boxes)
+        world = world.update(look)
+        if hop > 2 and azimuth < 0.5:
+            cars = [one for one in world.state.entities if one.moving and one.existence_probability > 0.3]
+            ids.setdefault(covered, set()).add(tuple(one.id for one in cars))
+            names = {one.id for one in world.state.entities} | {"corner_left", "corner_right", "ego"}
+            assert all({one.src, one.dst} <= names for one in world.state.relations)
+            if covered and cars[0].status == "hidden":
+                (by,) = (one.dst for one in world.state.relations if one.probability > 0.5)
+                assert by == next(one.id for one in world.state.entities if not one.moving)
+                ids["hidden"] = True
+    assert ids.pop("hidden") and len(set.union(*ids.values())) == 1

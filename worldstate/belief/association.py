@@ -9,7 +9,7 @@ import numpy as np
 
 from worldstate.abduction.road_users import SEEN_AS, ClassShares
 from worldstate.belief.kinematics.cartesian import full_measurement
-from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE
+from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.ground import BoolArray, FloatArray, wrap_angle
 
 from .detection import Detections
@@ -63,6 +63,11 @@ class Association:
     new: list[int]  # Detections of no track
 
     @property
+    def unclaimed(self) -> FloatArray:
+        """P(it is of no track) of every detection."""
+        return np.asarray(np.maximum(1.0 - self.pairs.sum(axis=1), 0.0))
+
+    @property
     def chances(self) -> list[float]:
         """P(one of them is its) of every track."""
         chances: list[float] = np.minimum(self.pairs.sum(axis=0), 1.0).tolist()
@@ -84,20 +89,24 @@ def associated(tracks: Tracks, detections: Detections, site: SiteGeometry) -> As
     the first detection of the next one.
     """
     detected = tracks.detected
+    # A radar also finds some of what is hidden.
+    unseen = 1.0 - (site.settings.hidden_return if detections.positions else 0.0)
+    in_sight = detected * (1.0 - tracks.behind * (unseen if detections.in_sight else 0.0))
     if not len(tracks) or not len(detections):
-        return joint_association(np.empty((len(detections), len(tracks))), detected)
-    return joint_association(_log_ratios(tracks, detected, detections, site), detected)
+        return joint_association(np.empty((len(detections), len(tracks))), in_sight)
+    return joint_association(_log_ratios(tracks, detected, in_sight, detections, site), in_sight)
 
 
-def joint_association(log_ratios: FloatArray, detected: BoolArray) -> Association:
+def joint_association(log_ratios: FloatArray, in_sight: FloatArray | BoolArray) -> Association:
     """Return the association of detections and tracks by how much likelier than new each pair is.
 
-    Shapes: log_ratios (detections, tracks), FORBIDDEN outside the gate; detected (tracks,).
+    Shapes: log_ratios (detections, tracks), FORBIDDEN outside the gate; in_sight (tracks,), P(in line of
+    sight) of what was detected before, 0 of what was not.
     """
-    # Within its gate a detected entity takes a measurement before that counts as a new one; a maximum of
+    # Within its gate an entity in view takes a measurement before that counts as a new one; a maximum of
     # the two would be a tie of all poor pairs, which the order of measurements would settle.
     gated = log_ratios > FORBIDDEN
-    scores = np.where(gated & detected, np.logaddexp(log_ratios, 0.0), log_ratios)
+    scores = np.where(gated, np.logaddexp(log_ratios, np.log(np.maximum(in_sight, _LEAST))), log_ratios)
     found = _likeliest(scores)
     taken = set(found.values())
     new = [j for j in range(len(log_ratios)) if j not in taken]
@@ -206,14 +215,13 @@ def _likeliest(scores: FloatArray) -> dict[int, int]:
 
 
 def _log_ratios(
-    tracks: Tracks, detected: BoolArray, detections: Detections, site: SiteGeometry
+    tracks: Tracks, detected: BoolArray, in_sight: FloatArray, detections: Detections, site: SiteGeometry
 ) -> FloatArray:
     """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
     boxes, found = not detections.positions, detections.found[:, None]
     existence = np.minimum(np.maximum(tracks.existence, LEAST_EXISTENCE), MOST_EXISTENCE)
-    if boxes:
-        # What may have left the view is found as far as it may not, wherever the edge truly is.
-        found = found * np.maximum(1.0 - leaving(tracks, site), _UNFORESEEN)
+    if detections.in_sight:
+        found = np.maximum(found * np.where(detected, in_sight, 1.0), _LEAST)
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
     density = _azimuth_density(tracks, detected, detections)
     if detections.in_sight and not detected.all():
@@ -223,8 +231,10 @@ def _log_ratios(
         density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), _LEAST))
         reached = np.array([reached_edge(one, site) for one in hidden])
         likely[:, heard] = np.log(existence[heard] * reached)
+        in_view = site.line_of_sight(detections.azimuth_rad, detections.std_rad)
+        density[:, heard] += np.log(np.maximum(in_view, _LEAST))[:, None]
     if boxes:
-        density += _alike(tracks, detected, detections)
+        density += _alike(tracks, detected, detections, site)
     else:
         density = _density_m2(tracks, detections, density)
     return np.where(density > 0.5 * FORBIDDEN, density + likely - detections.log_new[:, None], FORBIDDEN)
@@ -242,10 +252,16 @@ def _azimuth_density(tracks: Tracks, detected: BoolArray, detections: Detections
     return np.where((squares > most) | (np.abs(residual) > farthest_rad), FORBIDDEN, density)
 
 
-def _alike(tracks: Tracks, detected: BoolArray, detections: Detections) -> FloatArray:
-    """Return what motion and class say of every pair of a box and a track, nats."""
+def _alike(tracks: Tracks, detected: BoolArray, detections: Detections, site: SiteGeometry) -> FloatArray:
+    """Return what motion, width and class say of every pair of a box and a track, nats."""
     moving = detections.moving[:, None] > 0.0
     alike = np.where(moving == tracks.moving, 0.0, _PARKED_MISMATCH)
+    known = (detections.width_rad[:, None] > 0.0) & (tracks.width_rad > 0.0) & detected
+    logs = [np.log(np.where(one > 0.0, one, 1.0)) for one in (detections.width_rad, tracks.width_rad)]
+    own = site.settings.width_change**2
+    others = own + 2.0 * site.settings.size_spread**2
+    squares = (logs[0][:, None] - logs[1]) ** 2
+    alike += np.where(known, 0.5 * (math.log(others / own) - squares * (1.0 / own - 1.0 / others)), 0.0)
     for i in np.flatnonzero(~detected).tolist():
         labels = tracks.labels[i]
         classes = [math.log(_shared_class(labels, shares[0][0])) for shares in detections.classes]
@@ -291,13 +307,6 @@ def _shared_class(labels: ClassShares, label: str) -> float:
         return _MISREAD if label in _ON_FOOT else 1.0
     kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in labels)
     return max(sum(share for matches, share in kinds if matches), _MISREAD)
-
-
-def leaving(tracks: Tracks, site: SiteGeometry) -> FloatArray:
-    """Return P(the leading end of an entity in view has passed the edge ahead of it), shape (tracks,)."""
-    way = np.sign(tracks.mean[:, AZIMUTH_RATE]) * (tracks.seen & tracks.moving)  # Of a first sighting none
-    end_rad = tracks.mean[:, AZIMUTH] + 0.5 * way * tracks.width_rad
-    return site.past_edge(end_rad, tracks.azimuth_std_rad, way)
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:

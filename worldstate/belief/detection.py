@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from operator import attrgetter, methodcaller
 
 import numpy as np
@@ -18,10 +18,6 @@ from .site_geometry import CLUTTER_RATE
 
 # A look said to miss everything would carry no information; its miss rate is capped here.
 _MOST_MISSES = 0.99
-# Of an object before its first box is counted: indifferent, that one decides.
-_FIRST_EXISTENCE = 0.5
-# P(a new detection was not heard before): most vehicles from a side street are.
-UNHEARD = 0.05
 # m^2: messages tell of half a disc of 100 m.
 _RADIO_AREA_M2 = 0.5 * math.pi * 100.0**2
 # m/s: slower is parked, as far as a radar or a positioning receiver can tell.
@@ -43,8 +39,8 @@ class Detections:
     std_rad: FloatArray
     width_rad: FloatArray  # NaN where it is not measured
     moving: FloatArray  # 1 or 0, NaN where nothing tells
-    existence: FloatArray  # Of objects of which nothing else is known
-    log_new: FloatArray  # Density of objects not known before, nats: 1/rad of boxes, 1/m^2 of positions
+    existence: FloatArray  # P(an object | it is of no known one)
+    log_new: FloatArray  # Density of new objects and clutter, nats: 1/rad of boxes, 1/m^2 of positions
     found: FloatArray  # P(detected | in view), 0 of messages, which need no line of sight
     classes: tuple[ClassShares, ...]
     positions: tuple[Position, ...] = ()  # None of boxes
@@ -62,6 +58,13 @@ class Detections:
         azimuth, std, width, moving, existence, log_new, found = np.array(rows, float).reshape(-1, 7).T
         return cls(azimuth, std, width, moving, existence, log_new, found, classes, positions, in_sight)
 
+    def seen_through(self, in_sight: FloatArray) -> "Detections":
+        """Return the detections if new objects are only found in line of sight, P(n,)."""
+        total = 1.0 - self.existence * (1.0 - in_sight)
+        return replace(
+            self, existence=self.existence * in_sight / total, log_new=self.log_new + np.log(total)
+        )
+
     def __len__(self) -> int:
         return len(self.classes)
 
@@ -74,7 +77,6 @@ class Scan:
     detections: Detections  # Ordered by what they are: the sensor's order carries no meaning
     sector: Sector | None  # None of messages, which search nothing
     miss_rate: float | None  # None where it was not asked
-    clutter_rate: float
     weight: float  # Of a miss: looks that follow closely repeat each other's
     range_m: float = math.inf
     names_sector: bool = False  # Whether it is one of several cameras, each with a view of its own
@@ -91,44 +93,68 @@ def miss_rates(scans: Sequence[Scan], azimuth_rad: FloatArray) -> FloatArray:
     return rates
 
 
-def camera_scan(seen: CameraLook, view: Sector, weight: float) -> Scan:
+def birth(births: float, clutter_rate: float, score: float, size: float) -> tuple[float, float]:
+    r"""Return P(a detection of no known object is of a new one), and the log density of such detections.
+
+    .. math:: r = \frac{\lambda_b}{\lambda_b + \lambda_c / L}, \qquad
+              u = \frac{\lambda_b + \lambda_c / L}{A}, \qquad
+              L = \frac{s}{1 - s}, \quad \lambda_c = -\log(1 - c)
+
+    with the new objects :math:`\lambda_b` and the false detections :math:`\lambda_c` that a look expects in
+    its view of size A, and the detector's score s as a likelihood ratio, of an object against clutter.
+    Source: D. Musicki, R. Evans, "Joint integrated probabilistic data association: JIPDA", IEEE Trans.
+    Aerosp. Electron. Syst. 40, 2004.
+
+    Examples
+    --------
+    >>> [round(birth(0.05, 0.01, score, 1.2)[0], 2) for score in (0.05, 0.5, 0.9)]
+    [0.21, 0.83, 0.98]
+    """
+    clutter = -math.log1p(-clutter_rate) * (1.0 / max(score, LEAST_STD) - 1.0)
+    return births / (births + clutter), math.log((births + clutter) / size)
+
+
+def camera_scan(seen: CameraLook, view: Sector, weight: float, births: float) -> Scan:
     """Return the scan that a camera has made of a view."""
     answer, miss_rate, clutter_rate = seen.look.answer, None, CLUTTER_RATE
     if not isinstance(answer, Unqueried):
-        miss_rate, clutter_rate = min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or CLUTTER_RATE
+        miss_rate = min(answer.miss_rate, _MOST_MISSES)
+        clutter_rate = min(answer.clutter_rate, _MOST_MISSES) or CLUTTER_RATE
     # Boxes that come without an answer were found without a stated miss rate.
     found, width_rad = 1.0 - (miss_rate or 0.0), 2.0 * max(view.half_width_rad, LEAST_STD)
-    log_new = math.log(UNHEARD / width_rad)
     boxes = sorted(seen.sightings, key=BY_ALL)
-    rows = [(*_MEASURED(one), _FIRST_EXISTENCE, log_new, found) for one in boxes]
+    rows = [(*_MEASURED(one), *birth(births, clutter_rate, one.score, width_rad), found) for one in boxes]
     detections = Detections.of(rows, tuple(((one.label, one.score),) for one in boxes))
     np.maximum(detections.std_rad, LEAST_STD, out=detections.std_rad)
     named = seen.look.sector_rad is not None
-    return Scan("vision", detections, view, miss_rate, clutter_rate, weight, names_sector=named)
+    return Scan("vision", detections, view, miss_rate, weight, names_sector=named)
 
 
-def position_scan(scan: PositionScan, weight: float) -> Scan:
+def position_scan(scan: PositionScan, weight: float, births: float) -> Scan:
     """Return the scan of a radar or a lidar, or what messages tell."""
     searched, places = scan.searched, tuple(sorted(scan.positions, key=_BY_PLACE))
     if searched is None:
-        told = _of_positions(places, math.log(UNHEARD / _RADIO_AREA_M2), None)
-        return Scan(scan.source, told, None, None, CLUTTER_RATE, weight)
+        log_new = math.log(births / _RADIO_AREA_M2)
+        new = [(one.existence_probability, log_new) for one in places]
+        return Scan(scan.source, _of_positions(places, new, None), None, None, weight)
     sector, found = searched.sector, searched.detection_probability
-    log_new = math.log(UNHEARD / max(sector.half_width_rad * searched.range_m**2, 1.0))
-    rates = 1.0 - found, searched.clutter_rate
-    return Scan(scan.source, _of_positions(places, log_new, found), sector, *rates, weight, searched.range_m)
+    area_m2 = max(sector.half_width_rad * searched.range_m**2, 1.0)
+    new = [birth(births, searched.clutter_rate, one.existence_probability, area_m2) for one in places]
+    return Scan(scan.source, _of_positions(places, new, found), sector, 1.0 - found, weight, searched.range_m)
 
 
-def _of_positions(places: tuple[Position, ...], log_new: float, found: float | None) -> Detections:
+def _of_positions(
+    places: tuple[Position, ...], new: Sequence[tuple[float, float]], found: float | None
+) -> Detections:
     rows = []
-    for one in places:
+    for one, existence_and_density in zip(places, new, strict=True):
         (x, y), covariance, velocity = one.position_m, np.array(one.covariance)[:2, :2], one.velocity_mps
         range_m = max(math.hypot(x, y), 1.0)
         across = np.array([-y, x]) / range_m
         std_rad = math.sqrt(across @ covariance @ across) / range_m
         moving = math.nan if velocity is None else float(math.hypot(*velocity) > _PARKED_MPS)
         measured = math.atan2(y, x), std_rad, math.nan, moving
-        rows.append((*measured, one.existence_probability, log_new, found or 0.0))
+        rows.append((*measured, *existence_and_density, found or 0.0))
     return Detections.of(rows, tuple(one.classes for one in places), places, found is not None)
 
 
@@ -195,6 +221,8 @@ def _joined(boxes: Detections, groups: Sequence[list[int]]) -> Detections:
             offsets = wrap_angle(boxes.azimuth_rad[group] - middle_rad)
             azimuth[at] = wrap_angle(middle_rad + float(weights @ offsets / weights.sum()))
             std[at], width[at] = 1.0 / math.sqrt(weights.sum()), boxes.width_rad[group].max()
-            log_new[at], found[at] = boxes.log_new[group].max(), 1.0 - (1.0 - boxes.found[group]).prod()
+            log_new[at] = boxes.log_new[group].max()
+            existence[at] = 1.0 - (1.0 - boxes.existence[group]).prod()
+            found[at] = 1.0 - (1.0 - boxes.found[group]).prod()
     classes = tuple(boxes.classes[i] for i in best)
     return Detections(azimuth, std, width, moving, existence, log_new, found, classes)

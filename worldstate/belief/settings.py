@@ -25,6 +25,18 @@ class FilterSettings:
         side, and dropped when its existence falls below the second.
     delete_existence : float
         A visible entity is dropped below this existence.
+    births_per_look : float
+        New road users that a look finds, on the mean: against the clutter rate of the look and the score of
+        a detection it decides how far a first detection is believed.
+    assumed_certainty : float
+        Probability that an occluder stands where the context only assumes one.
+    hidden_return : float
+        Probability that a radar detects what an occluder hides, over that of what is in line of sight.
+    width_change : float
+        Standard deviation of the logarithm of an entity's width from box to box.
+    size_spread : float
+        Standard deviation of the logarithm of the widths of road users: of two at one azimuth the wider box
+        is the nearer one as far as this allows.
     stream : str
         Name that entity ids are derived from: the same stream gives the same ids.
 
@@ -46,6 +58,11 @@ class FilterSettings:
     death_probability: Probability = 0.1
     # Three full looks that find nothing take .99 below it, at a miss rate of .04.
     delete_existence: Probability = 0.05
+    births_per_look: float = 0.05  # Assumed: one new road user in twenty images
+    assumed_certainty: Probability = 0.9  # Assumed
+    hidden_return: Probability = 0.1  # Assumed
+    width_change: float = 0.3  # Assumed: the box of what comes past an edge grows by a third an image
+    size_spread: float = 0.5  # Assumed: from persons of 0.6 m to vans of 4.6 m seen from the side
     stream: str = "worldstate"
 
     def __post_init__(self) -> None:

@@ -50,6 +50,20 @@ class SideBelief:
         shares = np.where(shares >= least * shares.sum(), shares, 0.0)
         return tuple((shares / shares.sum()).tolist())
 
+    def beside(self, nothing: float) -> "SideBelief":
+        r"""Return the belief if no vehicle is in view with a probability e.
+
+        .. math:: P(none) \leftarrow \min(P(none), e), \qquad P(vis) \text{ takes what that loses}
+
+        Examples
+        --------
+        >>> quiet = SideBelief((0.1, 0.1), (0.0, 0.0), (0.1, 0.1), 0.2, (0.2, 0.3, 0.5))
+        >>> [round(one, 2) for one in quiet.beside(0.02).hypotheses]
+        [0.2, 0.78, 0.02]
+        """
+        hidden, visible, none = self.hypotheses
+        return replace(self, hypotheses=(hidden, visible + max(none - nothing, 0.0), min(none, nothing)))
+
     def at_least(self, announced: Sequence[float]) -> "SideBelief":
         r"""Return the belief with the vehicles that messages announce, by side.
 

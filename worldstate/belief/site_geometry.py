@@ -49,18 +49,12 @@ class SideGeometry:
     hides: bool = True
     yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
     corner_m: float | None = None  # Distance of the corner; None if it is not known
+    certainty: float = 1.0  # P(the occluder stands there)
 
     @property
     def outwards(self) -> float:
         """The way from the edge to what it hides: 1 to the left, -1 to the right."""
         return math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
-
-    def behind(self, azimuth_rad: float, std_rad: float) -> float:
-        """Return the probability that what stands at an azimuth is behind this side's occluder."""
-        if not self.hides:
-            return 0.0
-        past = self.outwards * wrap_angle(azimuth_rad - self.edge_azimuth_rad) / std_rad
-        return normal_share(past) - normal_share(past - _WIDEST_RAD / std_rad)
 
     def distance_rad(self, azimuth_rad: float, width_rad: float = 0.0) -> float:
         """Return the angle, >= 0, between the occluder's edge and the end of a box that leads past it."""
@@ -93,9 +87,16 @@ class SiteGeometry:
 
     def hiding_side(self, azimuth_rad: float) -> int | None:
         """Return the side whose occluder hides what stands at an azimuth, if one does."""
-        chances = [side.behind(azimuth_rad, _SHARP_RAD) for side in self.sides]
-        side = max(range(len(chances)), key=chances.__getitem__)
+        (chances,) = self.behind(np.array([azimuth_rad]), _SHARP_RAD)
+        side = int(chances.argmax())
         return side if chances[side] >= 0.5 else None
+
+    def behind(self, azimuth_rad: FloatArray, std_rad: FloatArray | float) -> FloatArray:
+        """Return the chances that what stands at some azimuths is behind the occluders, shape (n, K)."""
+        edge_rad, _, outwards = self._edges[..., 0]
+        past = outwards * wrap_angle(azimuth_rad[:, None] - edge_rad)
+        chances = normal_shares(past / std_rad) - normal_shares((past - _WIDEST_RAD) / std_rad)
+        return np.asarray(chances * [one.hides for one in self.sides])
 
     @cached_property
     def _edges(self) -> FloatArray:
@@ -116,11 +117,19 @@ class SiteGeometry:
         return MotionBelief.stacked([*(side.prior() for side in self.sides), IN_VIEW])
 
     def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
-        """Return the chances that azimuths lie past the edge on their way: 1 to the left, -1, 0 of none."""
+        """Return the chances that azimuths lie past the edges on their way, shape (n, K).
+
+        The way is 1 to the left, -1 to the right, 0 of none.
+        """
         edge_rad, edge_std, outwards = self._edges
-        past = way * (azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
-        farthest = np.where(way * outwards > 0.0, past, -np.inf).max(axis=0)
-        return np.array([normal_share(one) for one in farthest.tolist()])
+        past = way * wrap_angle(azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
+        hides = np.array([[one.hides] for one in self.sides])
+        return normal_shares(np.where((way * outwards > 0.0) & hides, past, -np.inf).T)
+
+    def line_of_sight(self, azimuth_rad: FloatArray, std_rad: FloatArray) -> FloatArray:
+        """Return P(no occluder stands before what is at some azimuths)."""
+        hidden = self.behind(azimuth_rad, np.hypot(std_rad[:, None], self._edges[1].T))
+        return np.asarray(1.0 - (hidden * [one.certainty for one in self.sides]).max(axis=1))
 
     def view(self, look: Look) -> Sector:
         """Return where a look has searched."""
@@ -147,6 +156,14 @@ class SiteGeometry:
             return replace(look, answer=Absent(miss, answer.clutter_rate))
         # With a clutter rate of zero a box would rule out everything else.
         return replace(look, answer=Present(miss, answer.clutter_rate or CLUTTER_RATE))
+
+
+def normal_shares(deviations: FloatArray) -> FloatArray:
+    """Return the shares of a normal distribution below so many deviations."""
+    # Imported where it is needed: the association has loaded it with scipy.optimize.
+    from scipy.special import ndtr
+
+    return np.asarray(ndtr(deviations))
 
 
 def normal_share(deviations: float) -> float:

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.kinematics.cartesian import CartesianBelief, NumbersT, polar_motion, predict_place
-from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, MotionBelief, predict, relax
-from worldstate.ground import BoolArray, FloatArray
+from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, MotionBelief, predict, relax
+from worldstate.ground import BoolArray, FloatArray, wrap_angle
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
 from worldstate.ground.typing import IntArray
 from worldstate.ground.values import Answer
 
 from .side_belief import SideBelief
-from .site_geometry import IN_VIEW, SiteGeometry
+from .site_geometry import IN_VIEW, SiteGeometry, normal_shares
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
@@ -68,7 +68,7 @@ class Track:
     # P(it was hidden on its side): of one in view, that of the association at its hand-over.
     came_from: Probability = 0.0
     place: CartesianBelief | None = None  # Then `motion` follows from it
-    behind: Probability = 1.0  # P(behind its side's occluder), by that place
+    behind: Probability = 1.0  # P(no line of sight to it | exists), of one that was detected
     width_rad: float = 0.0  # Of its last box
     # P(it is of a side | exists) of one only heard, whose side is not known; empty where it is.
     side_shares: tuple[Probability, ...] = ()
@@ -237,25 +237,17 @@ def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
     return missed / (missed + 1.0 - existence)
 
 
-def after_sighting(existence: NumbersT, miss_rate: float, clutter_rate: float) -> NumbersT:
-    r"""Return the existence after a detection.
-
-    .. math:: r \leftarrow \frac{r\, (1 - \beta (1 - c))}{r\, (1 - \beta (1 - c)) + (1 - r)\, c}
-    """
-    # A look finds something where the entity is detected or, if it is missed, where there is clutter.
-    found = existence * (1.0 - miss_rate * (1.0 - clutter_rate))
-    return found / (found + (1.0 - existence) * clutter_rate)
-
-
 def predict_tracks(tracks: Tracks, sides: SideBelief, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
     shares, polar = hidden_shares(tracks, sides), np.ones(len(tracks), bool)
+    tracks.existence[tracks.seen] *= math.exp(-step_s / _VISIBLE_LIFE_S)
     if tracks.placed.any():
         _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
         polar = ~tracks.placed  # Those that have just lost their place, too
     if polar.any():
         # All of them are read and written where they stand.
         _relax(tracks, slice(None) if polar.all() else polar, shares, step_s, site)
+    occlude(tracks, site, step_s)
 
 
 def turn(tracks: Tracks, faster_rad_s: float) -> None:
@@ -292,25 +284,62 @@ def _relax(
     motion = predict(before, step_s, acceleration_psd(tracks.moving[rows]))
     # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle still hidden has not passed the
     # corner, whatever its last rates said.
-    kept = np.exp(-step_s * hidden[rows] / _RELAXATION_S)
+    kept = np.exp(-step_s * np.where(seen, 0.0, hidden[rows]) / _RELAXATION_S)
     expected, of = site.expected, np.where(seen, -1, tracks.side[rows])
     towards = MotionBelief(expected.mean[of], expected.covariance[of])
     relaxed = relax(motion, towards, kept, math.exp(-step_s / _RELAXATION_S))
     tracks.mean[rows], tracks.covariance[rows] = relaxed.mean, relaxed.covariance
-    tracks.existence[rows] *= np.where(seen, math.exp(-step_s / _VISIBLE_LIFE_S), 1.0)
 
 
 def follow_places(tracks: Tracks, site: SiteGeometry) -> None:
-    """Give tracks the polar motion, and the chance to be hidden, that follow from their places."""
+    """Give tracks the polar motion that follows from their places."""
     if not tracks.placed.any():
         return
     rows = np.flatnonzero(tracks.placed)
     places = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
     polar = polar_motion(places, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
     tracks.mean[rows], tracks.covariance[rows] = polar.mean, polar.covariance
-    for i, motion in zip(rows.tolist(), polar.each(), strict=True):
-        side = site.sides[tracks.side[i]]
-        tracks.behind[i] = side.behind(motion.azimuth_rad, motion.azimuth_std_rad)
+
+
+def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatArray:
+    r"""Return P(an occluder hides it) of every track, for each side's and each other track, shape (n, K + n).
+
+    .. math:: P_k = P(\text{it stands at the azimuths of } k)\, \max(P(k \text{ is nearer}), P_{hidden})
+
+    Where a corner stands is known or assumed; of two boxes the wider one is nearer as far as ranges and the
+    spread of sizes allow. What was hidden there before, still is. A box ends where its corner begins: of an
+    entity without a place the leading end counts.
+    """
+    azimuth_rad, widths, sides = tracks.mean[:, AZIMUTH], tracks.width_rad, len(site.sides)
+    way = np.sign(tracks.mean[:, AZIMUTH_RATE]) * tracks.moving  # Of a first sighting none
+    at = np.zeros((len(tracks), sides + len(tracks)))
+    nearer = np.zeros_like(at)
+    at[:, :sides] = site.past_edge(azimuth_rad + 0.5 * way * widths, tracks.azimuth_std_rad, way)
+    placed = tracks.placed
+    at[placed, :sides] = site.behind(azimuth_rad[placed], tracks.azimuth_std_rad[placed, None])
+    nearer[:, :sides] = np.where(tracks.seen[:, None], [one.certainty for one in site.sides], 1.0)
+    covers = (widths > 0.0) & tracks.seen & (2.0 * widths >= widths[:, None])
+    np.fill_diagonal(covers, False)
+    i, j = np.nonzero(covers & tracks.detected[:, None])
+    if len(i):
+        apart_rad, variance = wrap_angle(azimuth_rad[i] - azimuth_rad[j]), tracks.covariance
+        std_rad = np.sqrt(variance[i, AZIMUTH, AZIMUTH] + variance[j, AZIMUTH, AZIMUTH])
+        ends = normal_shares((0.5 * widths[j] * np.array([[1.0], [-1.0]]) - apart_rad) / std_rad)
+        at[i, sides + j] = (ends[0] - ends[1]) * tracks.existence[j]
+        ranges = variance[i, LOG_RANGE, LOG_RANGE] + variance[j, LOG_RANGE, LOG_RANGE]
+        sizes = np.where(widths[i] > 0.0, 2.0 * site.settings.size_spread**2, np.inf)
+        wider = np.log(widths[j] / np.where(widths[i] > 0.0, widths[i], 1.0))
+        farther = (tracks.mean[i, LOG_RANGE] - tracks.mean[j, LOG_RANGE]) / ranges + wider / sizes
+        nearer[i, sides + j] = normal_shares(farther / np.sqrt(1.0 / ranges + 1.0 / sizes))
+    before = np.where(tracks.seen, tracks.behind, 0.0)[:, None]
+    changed = np.where(nearer < 1.0, 1.0 - math.exp(-step_s / site.settings.look_interval_s), 1.0)
+    return np.asarray(at * np.maximum(before, before + (nearer - before) * changed))
+
+
+def occlude(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> None:
+    """Give the tracks that were detected the chance to be hidden that follows from where they are."""
+    if tracks.detected.any():
+        tracks.behind = np.where(tracks.detected, occluded(tracks, site, step_s).max(axis=1), tracks.behind)
 
 
 def relabelled(
@@ -330,10 +359,8 @@ def relabelled(
 
 
 def hidden_shares(tracks: Tracks, sides: SideBelief) -> FloatArray:
-    """Return P(hidden | exists) of every track, 0 once it was seen."""
-    if tracks.seen.all():
-        return np.zeros(len(tracks))
-    shares = np.where(tracks.seen, 0.0, tracks.behind)
+    """Return P(hidden | exists) of every track."""
+    shares = tracks.behind.copy()
     for i in np.flatnonzero(~tracks.detected).tolist():
         shares[i] = sides.hidden_share(tracks.of_side(i))
     return shares

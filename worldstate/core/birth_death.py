@@ -163,7 +163,8 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
         _put_on_its_side(tracks, first, memory.sides, site)
         ended.append(second)
         into[tracks.id[second]] = tracks.id[first]
-    for other in np.flatnonzero(tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS)).tolist():
+    lost = tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS) & (tracks.behind < HIDDEN)
+    for other in np.flatnonzero(lost).tolist():
         found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
         same = next((i for i in found if _at_one_place(tracks, i, other)), None)
         if same is not None:
@@ -242,9 +243,10 @@ def events_between(before: Tracks, after: Tracks, steps: Sequence[Memory]) -> tu
     """Return what became of every entity, those that were there before first; `steps` hold their merges."""
     stamp_ns = steps[-1].stamp_ns
     into = {one.entity_id: one.into for step in steps for one in step.last.events if one.into}
-    left = dict(zip(after.id, zip(after.seen.tolist(), after.answer, strict=True), strict=True))
+    was_in_view, in_view = ((one.seen & (one.behind < HIDDEN)).tolist() for one in (before, after))
+    left = dict(zip(after.id, zip(in_view, after.answer, strict=True), strict=True))
     events = list[Event]()
-    for name, was_seen, answer in zip(before.id, before.seen.tolist(), before.answer, strict=True):
+    for name, was_seen, answer in zip(before.id, was_in_view, before.answer, strict=True):
         seen, said = left.pop(name, (None, None))
         kind: EventKind | None = None
         if seen is None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, associated, leaving
+from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, associated
 from worldstate.belief.detection import Detections, Scan, camera_scan, fused, miss_rates, position_scan
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import (
@@ -25,17 +25,18 @@ from worldstate.belief.track import (
     Track,
     Tracks,
     after_empty_look,
-    after_sighting,
     born,
     follow_places,
     merged,
+    occlude,
+    occluded,
     relabelled,
 )
-from worldstate.ground import BoolArray, FloatArray, nanoseconds, seconds, wrap_angle
+from worldstate.ground import FloatArray, seconds, wrap_angle
 from worldstate.ground.typing import IndexArray
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
-from .birth_death import after_look
+from .birth_death import HIDDEN, after_look
 from .cues import NO_LOOK, claimed_nats, update_rule
 from .fixed_lag import LAG_NS
 from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory, SourceRule
@@ -83,7 +84,8 @@ def update_looks(
 ) -> None:
     """Update the memory with the new looks of a measurement, all cameras at once."""
     if looks:
-        scans = [camera_scan(seen, model.site.view(seen.look), weight) for seen, weight in looks]
+        births = model.site.settings.births_per_look
+        scans = [camera_scan(seen, model.site.view(seen.look), weight, births) for seen, weight in looks]
         detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
 
 
@@ -92,7 +94,8 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     settings, last = model.site.settings, memory.looks.get(scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     weight = min(elapsed_s / settings.look_interval_s, 1.0)
-    detection_update(memory, [position_scan(scan, weight)], None, scan.stamp_ns, model.site)
+    scans = [position_scan(scan, weight, settings.births_per_look)]
+    detection_update(memory, scans, None, scan.stamp_ns, model.site)
     memory.looks[scan.source] = _scan_look(scan)
     if isinstance(memory.belief, SequenceMemory):
         memory.belief = alerted(memory.belief, model.context)
@@ -127,7 +130,12 @@ def detection_update(
     `asked` is what cameras answer of the sector of a sound; None of positions.
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
+    if detections.in_sight:
+        detections = detections.seen_through(site.line_of_sight(detections.azimuth_rad, detections.std_rad))
     whose = associated(known, detections, site)
+    if detections.in_sight:
+        # A detection that may be of a known entity is a new one the less.
+        detections = replace(detections, existence=detections.existence * whose.unclaimed)
     fresh = [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
     memory.tracks = tracks = known.joined(fresh)
     chances, detection = np.ones(len(tracks)), np.full(len(tracks), -1)
@@ -138,21 +146,25 @@ def detection_update(
     if scans[0].sector is None:
         existence = _told(tracks, found, scans[0])
     else:
-        hits = np.zeros((len(tracks), len(scans)))
-        hits[: len(known)] = np.minimum(whose.pairs.T @ by_look, 1.0)
-        # Certain of a first detection.
-        first = rows[~was_seen[rows]]
-        hits[first] = by_look[detection[first]]
-        existence = _existence(tracks, found, hits, scans)
+        existence = tracks.existence.copy()
+        hits = np.minimum(whose.pairs.T @ by_look, 1.0)
+        existence[: len(known)], detected = _existence(known, hits, scans)
+        # What was only heard is found, or another one is.
+        first = np.flatnonzero((detection[: len(known)] >= 0) & ~known.detected)
+        another = (1.0 - chances[first]) * detections.existence[detection[first]]
+        existence[first] = chances[first] + another
     _move(tracks, found)
     _see(tracks, found, chances, scans, stamp_ns, site)
-    if len(missed):
-        _miss(memory, missed, scans, asked, stamp_ns, site)
-    tracks.existence = existence
-    if scans[0].sector is None:
-        for i in rows.tolist():
-            _announce(tracks, i, site)
     follow_places(tracks, site)
+    if scans[0].sector is None:
+        occlude(tracks, site)
+    else:
+        tracks.behind[: len(known)] = _hidden(known, detected, whose.chances, scans[0], site)
+        tracks.behind[first] = 0.0
+    if len(missed):
+        _miss(memory, missed, scans, asked)
+    tracks.existence = existence
+    _hide(tracks, site)
     emerged = [i for i in whose.found if tracks.seen[i] and not was_seen[i]]
     after_look(memory, {i: float(chances[i]) for i in emerged}, len(known), stamp_ns, site)
 
@@ -175,37 +187,51 @@ def _born(
     if side is None:
         track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
         memory.counts.sighted += 1
-        return replace(track, side=site.nearest_side(azimuth_rad), sources=(scan.source,))
+        return replace(track, side=site.nearest_side(azimuth_rad), sources=(scan.source,), behind=0.0)
     track = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
     memory.history[side].births += 1
     return replace(track, side=side, came_from=1.0, sources=(scan.source,))
 
 
-def _existence(tracks: Tracks, found: _Found, hits: FloatArray, scans: Sequence[Scan]) -> FloatArray:
-    r"""Return the existence after every look s of an instant, each with the chance c that it has detected it.
+def _existence(tracks: Tracks, hits: FloatArray, scans: Sequence[Scan]) -> tuple[FloatArray, FloatArray]:
+    r"""Return the existence after every look s of an instant, and P(a look detects it | in line of sight).
 
-    .. math:: r_s = c_s\, r_+ + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
+    With the chance c that a look has detected it,
+
+    .. math:: r_s = c_s + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
               p_s = p_D\, P_{range}\, (1 - P_{hidden}), \qquad
               \frac{r'}{1 - r'} = \frac{r}{1 - r} \prod_s \frac{r_s}{1 - r_s} \frac{1 - r}{r}
+
+    Of what is only heard the belief of its side decides.
     """
-    seen, counts, before = tracks.seen, tracks.detected, tracks.existence
-    if not seen.all():
-        # A first detection counts before it is certain which entity it is of.
-        first = ~seen[found.rows]
-        rows, told = found.rows[first], found.detections.existence[found.by[first]]
-        counts, before = counts.copy(), before.copy()
-        counts[rows], before[rows] = True, np.maximum(before[rows], told)
-    r = np.minimum(np.maximum(before, _ROUNDING), 1.0 - _ROUNDING)
-    in_sight = np.where(seen, 1.0, 1.0 - tracks.behind)
+    r = np.minimum(np.maximum(tracks.existence, _ROUNDING), 1.0 - _ROUNDING)
+    detected = np.zeros(len(r))
     odds = ratio = r / (1.0 - r)
     for hit, scan in zip(hits.T, scans, strict=True):
-        detected = _searched(tracks, scan) * in_sight * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
-        missed = after_empty_look(r, 1.0 - detected)
-        missed = np.where(seen, missed, np.maximum(missed, LEAST_EXISTENCE))
-        now = missed + hit * (after_sighting(r, scan.miss_rate or 0.0, scan.clutter_rate) - missed)
-        now = np.minimum(np.maximum(now, _ROUNDING), 1.0 - _ROUNDING)
+        by_one = _searched(tracks, scan) * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
+        detected = 1.0 - (1.0 - detected) * (1.0 - by_one)
+        missed = after_empty_look(r, 1.0 - by_one * (1.0 - tracks.behind))
+        missed = np.where(tracks.seen, missed, np.maximum(missed, LEAST_EXISTENCE))
+        now = np.minimum(np.maximum(hit + (1.0 - hit) * missed, _ROUNDING), 1.0 - _ROUNDING)
         ratio = ratio * (now / (1.0 - now)) / odds
-    return np.where(counts, ratio / (1.0 + ratio), before)
+    return np.where(tracks.detected, ratio / (1.0 + ratio), tracks.existence), detected
+
+
+def _hidden(
+    tracks: Tracks, detected: FloatArray, chances: Sequence[float], scan: Scan, site: SiteGeometry
+) -> FloatArray:
+    r"""Return P(hidden | exists) after the looks of an instant, with the chance c that they detected it.
+
+    .. math:: P = c\, \frac{b q}{b q + 1 - b} + (1 - c)\, \frac{b}{b + (1 - b)(1 - p)}
+
+    with P(hidden) b before, P(detected | in line of sight) p, and for what is hidden q times as much: a radar
+    also finds some of that, by multipath and diffraction.
+    """
+    b, q = tracks.behind, site.settings.hidden_return if scan.detections.positions else 0.0
+    found = b * q / np.maximum(b * q + 1.0 - b, _ROUNDING)
+    missed = b / np.maximum(b + (1.0 - b) * (1.0 - detected), _ROUNDING)
+    after = np.array(chances) * found + (1.0 - np.array(chances)) * missed
+    return np.where(tracks.detected, after, b)
 
 
 def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
@@ -308,27 +334,17 @@ def _see(
     tracks.miss_rate[rows] = miss_rates(scans, azimuth_rad)
 
 
-# Out of sight for longer: more than one image at 10 Hz, since a single miss is no occlusion.
-_OUT_OF_SIGHT_NS = nanoseconds(0.15)
+def _hide(tracks: Tracks, site: SiteGeometry) -> None:
+    """Put the tracks that a corner hides on its side; what has a place is announced there."""
+    rows = np.flatnonzero(tracks.detected & (tracks.behind >= HIDDEN))
+    if len(rows):
+        by = occluded(tracks, site)[rows].argmax(axis=1)
+        rows, by = rows[by < len(site.sides)], by[by < len(site.sides)]
+        tracks.side[rows], tracks.came_from[rows] = by, 1.0
+        tracks.seen[rows] &= ~tracks.placed[rows]
 
 
-def _announce(tracks: Tracks, row: int, site: SiteGeometry) -> None:
-    """Put a track that a message has placed on the side whose occluder hides it there, if one does."""
-    x, y = tracks.place_mean[row, :2].tolist()
-    side = site.hiding_side(math.atan2(y, x))
-    unseen_ns = tracks.unseen_ns(int(tracks.updated_ns[row]))[row]
-    if side is not None and (not tracks.seen[row] or unseen_ns > _OUT_OF_SIGHT_NS):
-        tracks.side[row], tracks.seen[row], tracks.came_from[row] = side, False, 1.0
-
-
-def _miss(
-    memory: Memory,
-    rows: IndexArray,
-    scans: Sequence[Scan],
-    asked: CoEvidence | None,
-    stamp_ns: int,
-    site: SiteGeometry,
-) -> None:
+def _miss(memory: Memory, rows: IndexArray, scans: Sequence[Scan], asked: CoEvidence | None) -> None:
     """Update the last answer about the tracks that none of the looks of an instant has found."""
     tracks, views = memory.tracks, _other_views(memory, scans)
     azimuth_rad, detected = tracks.mean[rows, AZIMUTH], tracks.detected[rows]
@@ -338,7 +354,7 @@ def _miss(
     rates[~detected] = asked.miss_rate if isinstance(asked, Absent) else math.nan
     if asked is not None:
         within = [any(one.touches(at) for one in views) for at in azimuth_rad.tolist()]
-        left = detected & _has_left(tracks, rows, rates, stamp_ns, site)
+        left = detected & (tracks.behind[rows] >= HIDDEN)
         holds = detected & within & ~left
         rates[left] = math.nan
     absent = ~np.isnan(rates)
@@ -354,18 +370,3 @@ def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
     recent = (one for one in memory.looks.values() if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
     asked = (one for one in recent if not isinstance(one.answer, Unqueried))
     return [Sector.between(*one.sector_rad) for one in asked if one.sector_rad is not None]
-
-
-def _has_left(
-    tracks: Tracks, rows: IndexArray, rates: FloatArray, stamp_ns: int, site: SiteGeometry
-) -> BoolArray:
-    r"""Tell whether the likelier reason of a miss is that a leading end has passed the edge ahead of it.
-
-    .. math:: p \ge (1 - p)\, \beta^{\min(t / T, 1)}
-
-    with the chance p of that, the time t since the last box and the interval T of looks. Boxes end as soon as
-    a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
-    """
-    past = leaving(tracks, site)[rows]
-    unseen = tracks.unseen_ns(stamp_ns)[rows] / nanoseconds(site.settings.look_interval_s)
-    return (past > 0.0) & (past >= (1.0 - past) * rates ** np.minimum(unseen, 1.0))

@@ -9,7 +9,7 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_model import LONGEST_S, STATED
 from worldstate.belief.hidden_bearing import time_to_visible
 from worldstate.belief.site_geometry import normal_share
-from worldstate.belief.track import Track, Tracks, hidden_shares, side_weights
+from worldstate.belief.track import Track, Tracks, hidden_shares, occluded, side_weights
 from worldstate.ground import FloatArray, nanoseconds
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
@@ -32,6 +32,7 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
     """Return the relations of some tracks, with the interval in which each has held by those in memory."""
     # What a camera alone has found, first in view, has none.
     related = ~tracks.seen | (tracks.came_from >= _LEAST) | tracks.approach_heard | tracks.placed
+    related |= tracks.behind >= _LEAST
     if not memory.relations and not related.any():
         return ()
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
@@ -42,6 +43,7 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
     placed = [one for one in some if one.place and one.place.known]
     if placed:
         edges += _between(placed, memory.stamp_ns, model.context)
+    edges += _hiding(tracks, memory.stamp_ns, model)
     now = {(one.src, one.dst, one.kind): one for one in edges}
     names = {*tracks.id, *(one.id for one in model.context.occluders), EGO}
     ended = [key for key in before if key not in now and names.issuperset(key[:2])]
@@ -71,11 +73,25 @@ def _edges(track: Track, share: float, memory: Memory, model: FilterModel) -> It
                 comes = hidden * _comes(track, k, memory, model)
                 yield Relation(track.id, one.id, "occluded_by", hidden, stamp_ns)
                 yield Relation(track.id, one.id, "approaching_from", comes, stamp_ns)
-    elif track.came_from >= _LEAST:
+    elif track.came_from >= _LEAST and share < _HOLDS:
         yield Relation(track.id, occluders[track.side].id, "emerged_from", track.came_from, stamp_ns)
     if track.approach_heard:
         deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
         yield Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns)
+
+
+def _hiding(tracks: Tracks, stamp_ns: int, model: FilterModel) -> Iterator[Relation]:
+    """Yield which corners and entities hide those that were in view before."""
+    rows = np.flatnonzero(tracks.seen & (tracks.behind >= _LEAST))
+    if len(rows):
+        by, names = (
+            occluded(tracks, model.site)[rows],
+            [*(one.id for one in model.context.occluders), *tracks.id],
+        )
+        chances = tracks.behind[rows, None] * by / np.maximum(by.sum(axis=1, keepdims=True), _LEAST)
+        for i, k in zip(*np.nonzero(chances >= _LEAST), strict=True):
+            chance = min(float(chances[i, k]), 1.0)
+            yield Relation(tracks.id[rows[i]], names[k], "occluded_by", chance, stamp_ns)
 
 
 def _comes(track: Track, side: int, memory: Memory, model: FilterModel) -> float:

@@ -48,6 +48,7 @@ def site_geometry_of(
             one.hides,
             0.0 if one.corner_m is None else yaw_rad,
             None if one.corner_m is None else math.dist(one.corner_m, (x, y)),
+            settings.assumed_certainty if one.assumed else 1.0,
         )
         for one in context.occluders
     )
@@ -84,7 +85,7 @@ def without_open_sides(measurement: Measurement, context: Context) -> Measuremen
 
 
 def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
-    r"""Return the belief of the sides as it is published: with the policy's calibration, and with messages.
+    r"""Return the belief of the sides as it is published: with the policy's calibration, messages and tracks.
 
     .. math:: r_k = \min\big(P(hid),\ g(P(hid))\big)\, P(k \mid hid)
 
@@ -98,4 +99,6 @@ def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
         # The floor only matters where P(hidden) has underflowed; then no direction has a share.
         share = risk / max(hidden, 1e-300)
         sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
-    return sides.at_least(announced(memory.tracks, model.site))
+    tracks, moving = memory.tracks, memory.tracks.seen & memory.tracks.moving
+    unseen = 1.0 - tracks.existence[moving] * (1.0 - tracks.behind[moving])
+    return sides.at_least(announced(tracks, model.site)).beside(float(unseen.prod()))

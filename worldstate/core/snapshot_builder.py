@@ -97,7 +97,7 @@ def _entity(
     mean, std, (variance, mixed, rate_variance), forecast = moments
     existence = existence_of(track, sides)
     hidden = share >= 0.5
-    heard_only = hidden and track.place is None
+    heard_only = hidden and not track.detected
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
     closing_hz = -mean[RADIAL_RATE] if track.approach_heard else None
     # Rounded up, what stands right behind would be beyond a half turn.
@@ -117,7 +117,7 @@ def _entity(
         azimuth_std_rad=std_rad,
         azimuth_rate_rad_s=None if hidden else mean[AZIMUTH_RATE],
         range_m=range_m,
-        **_place(track, hidden, site),
+        **_place(track, hidden and not track.seen, site),
         inverse_tta_hz=closing_hz,
         inverse_tta_std_hz=None if closing_hz is None else std[RADIAL_RATE],
         tta_s=time_to_arrival(closing_hz, std[RADIAL_RATE]),
