@@ -131,7 +131,7 @@ def detection_update(
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
     if detections.in_sight:
-        detections = detections.seen_through(site.line_of_sight(detections.azimuth_rad, detections.std_rad))
+        detections = detections.seen_through(site)
     whose = associated(known, detections, site)
     if detections.in_sight:
         # A detection that may be of a known entity is a new one the less.
@@ -182,7 +182,7 @@ def _born(
 ) -> Track:
     """Return a new entity before its detection counts; hidden where messages say so."""
     azimuth_rad = float(detections.azimuth_rad[by])
-    side = None if detections.in_sight else site.hiding_side(azimuth_rad)
+    side = None if detections.in_sight else site.hiding_side(detections.positions[by].position_m)
     existence = min(float(detections.existence[by]), MOST_EXISTENCE)
     if side is None:
         track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
