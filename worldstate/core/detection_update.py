@@ -20,7 +20,7 @@ from worldstate.belief.kinematics.cartesian import (
 )
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, RADIAL_RATE, MotionBelief, update
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.site_geometry import SiteGeometry, normal_share
+from worldstate.belief.site_geometry import SiteGeometry, normal_shares
 from worldstate.belief.track import (
     Track,
     Tracks,
@@ -244,7 +244,7 @@ def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
         return covers.astype(float)
     stds = np.sqrt(tracks.covariance[:, LOG_RANGE, LOG_RANGE])
     deviations = (math.log(scan.range_m) - tracks.mean[:, LOG_RANGE]) / stds
-    return np.where(covers, [normal_share(one) for one in deviations.tolist()], 0.0)
+    return np.where(covers, normal_shares(deviations), 0.0)
 
 
 def _told(tracks: Tracks, found: _Found, scan: Scan) -> FloatArray:
