@@ -153,7 +153,7 @@ def detection_update(
         first = np.flatnonzero((detection[: len(known)] >= 0) & ~known.detected)
         another = (1.0 - chances[first]) * detections.existence[detection[first]]
         existence[first] = chances[first] + another
-    _move(tracks, found)
+    _move(tracks, found, chances)
     _see(tracks, found, chances, scans, stamp_ns, site)
     follow_places(tracks, site)
     if scans[0].sector is None:
@@ -258,7 +258,7 @@ def _told(tracks: Tracks, found: _Found, scan: Scan) -> FloatArray:
     return after
 
 
-def _move(tracks: Tracks, found: _Found) -> None:
+def _move(tracks: Tracks, found: _Found, chances: FloatArray) -> None:
     """Update the motion or the place of the found tracks with what was measured of them."""
     rows, by, detections = found
     placed = tracks.placed[rows] | bool(detections.positions)
@@ -271,7 +271,7 @@ def _move(tracks: Tracks, found: _Found) -> None:
     if usual.any():
         rows, by = rows[usual], by[usual]
         before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
-        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by])
+        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by], chances[rows])
         tracks.mean[rows], tracks.covariance[rows] = after.mean, after.covariance
 
 
