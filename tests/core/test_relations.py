@@ -192,3 +192,17 @@ def test_a_car_that_passes_behind_a_reported_van_keeps_its_identity(way, rate, v
                 assert by == next(one.id for one in world.state.entities if not one.moving)
                 ids["hidden"] = True
     assert ids.pop("hidden") and len(set.union(*ids.values())) == 1
+
+
+@given(st.floats(0.8, 1.3), st.sampled_from([1.0, -1.0]), st.floats(2.0, 4.5))
+@settings(max_examples=10, deadline=None)
+def test_what_stands_in_front_of_the_wall_is_in_view(azimuth, way, beside_m):
+    """On the near pavement, past the azimuth of the corner, and nearer than the wall that begins there."""
+    corners = corner_at("left", (8.0, 5.0), 14.0), corner_at("right", (8.0, -5.0), 14.0)
+    world, place = WorldFilter(Context(occluders=corners)), (beside_m / math.tan(azimuth), way * beside_m)
+    walks = Position(place, tuple(map(tuple, 0.1 * np.eye(4))), (0.0, 0.0))
+    for hop in range(1, 6):
+        searched = SearchedSector(Sector(0.0, 1.5), 70.0, 0.9)
+        world = world.update(PositionScan("radar", hop * 10**8, (walks,), searched))
+    (one,) = world.state.entities
+    assert one.status == "visible" and one.existence_probability > 0.9

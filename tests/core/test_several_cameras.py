@@ -383,7 +383,8 @@ def mirrored(one):
 def published(state, sign):
     """Return what a state says of entities and sides, as one row, in a mirror if sign is -1."""
     entities = sorted(
-        (one.existence_probability, one.hidden_probability, sign * one.azimuth_rad, one.azimuth_std_rad)
+        # By the azimuth: two may exist alike but for rounding.
+        (sign * one.azimuth_rad, one.existence_probability, one.hidden_probability, one.azimuth_std_rad)
         for one in state.entities
     )
     cues = sorted(state.cues, key=lambda cue: sign * cue.azimuth_rad)

@@ -231,8 +231,7 @@ def _log_ratios(
         density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), _LEAST))
         reached = np.array([reached_edge(one, site) for one in hidden])
         likely[:, heard] = np.log(existence[heard] * reached)
-        in_view = site.line_of_sight(detections.azimuth_rad, detections.std_rad)
-        density[:, heard] += np.log(np.maximum(in_view, _LEAST))[:, None]
+        density[:, heard] += np.log(np.maximum(detections.line_of_sight(site), _LEAST))[:, None]
     if boxes:
         density += _alike(tracks, detected, detections, site)
     else:

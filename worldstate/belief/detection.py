@@ -14,7 +14,7 @@ from worldstate.ground import FloatArray, wrap_angle
 from worldstate.measurement import CameraLook, Sector
 from worldstate.measurement.position import Position, PositionScan
 
-from .site_geometry import CLUTTER_RATE
+from .site_geometry import CLUTTER_RATE, SiteGeometry
 
 # A look said to miss everything would carry no information; its miss rate is capped here.
 _MOST_MISSES = 0.99
@@ -58,8 +58,16 @@ class Detections:
         azimuth, std, width, moving, existence, log_new, found = np.array(rows, float).reshape(-1, 7).T
         return cls(azimuth, std, width, moving, existence, log_new, found, classes, positions, in_sight)
 
-    def seen_through(self, in_sight: FloatArray) -> "Detections":
-        """Return the detections if new objects are only found in line of sight, P(n,)."""
+    def line_of_sight(self, site: SiteGeometry) -> FloatArray:
+        """Return P(no occluder stands before what is detected there): a box is proof of it."""
+        if not self.positions:
+            return np.ones(len(self))
+        range_m = np.array([math.hypot(*one.position_m) for one in self.positions])
+        return site.line_of_sight(self.azimuth_rad, self.std_rad, range_m)
+
+    def seen_through(self, site: SiteGeometry) -> "Detections":
+        """Return the detections if new objects are only found in line of sight."""
+        in_sight = self.line_of_sight(site)
         total = 1.0 - self.existence * (1.0 - in_sight)
         return replace(
             self, existence=self.existence * in_sight / total, log_new=self.log_new + np.log(total)

@@ -50,6 +50,7 @@ class SideGeometry:
     yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
     corner_m: float | None = None  # Distance of the corner; None if it is not known
     certainty: float = 1.0  # P(the occluder stands there)
+    wall_m: float = 0.0  # How far beside the ego its wall runs: what is nearer stands in front; 0 if unknown
 
     @property
     def outwards(self) -> float:
@@ -85,18 +86,21 @@ class SiteGeometry:
         """Return the index of the side whose edge is nearest to an azimuth."""
         return min(range(len(self.sides)), key=lambda k: self.sides[k].distance_rad(azimuth_rad))
 
-    def hiding_side(self, azimuth_rad: float) -> int | None:
-        """Return the side whose occluder hides what stands at an azimuth, if one does."""
-        (chances,) = self.behind(np.array([azimuth_rad]), _SHARP_RAD)
+    def hiding_side(self, position_m: tuple[float, float]) -> int | None:
+        """Return the side whose occluder hides what stands at a place, if one does."""
+        x, y = position_m
+        (chances,) = self.behind(np.array([math.atan2(y, x)]), _SHARP_RAD, np.array([math.hypot(x, y)]))
         side = int(chances.argmax())
         return side if chances[side] >= 0.5 else None
 
-    def behind(self, azimuth_rad: FloatArray, std_rad: FloatArray | float) -> FloatArray:
-        """Return the chances that what stands at some azimuths is behind the occluders, shape (n, K)."""
+    def behind(self, azimuth_rad: FloatArray, std_rad: FloatArray | float, range_m: FloatArray) -> FloatArray:
+        """Return the chances that what stands at some places is behind the occluders, shape (n, K)."""
         edge_rad, _, outwards = self._edges[..., 0]
+        yaw_rad, wall_m = np.array([(one.yaw_rad, one.wall_m) for one in self.sides]).T
+        beside_m = range_m[:, None] * np.abs(np.sin(azimuth_rad[:, None] + yaw_rad))
         past = outwards * wrap_angle(azimuth_rad[:, None] - edge_rad)
         chances = normal_shares(past / std_rad) - normal_shares((past - _WIDEST_RAD) / std_rad)
-        return np.asarray(chances * [one.hides for one in self.sides])
+        return np.asarray(chances * [one.hides for one in self.sides] * (beside_m > wall_m))
 
     @cached_property
     def _edges(self) -> FloatArray:
@@ -126,9 +130,9 @@ class SiteGeometry:
         hides = np.array([[one.hides] for one in self.sides])
         return normal_shares(np.where((way * outwards > 0.0) & hides, past, -np.inf).T)
 
-    def line_of_sight(self, azimuth_rad: FloatArray, std_rad: FloatArray) -> FloatArray:
-        """Return P(no occluder stands before what is at some azimuths)."""
-        hidden = self.behind(azimuth_rad, np.hypot(std_rad[:, None], self._edges[1].T))
+    def line_of_sight(self, azimuth_rad: FloatArray, std_rad: FloatArray, range_m: FloatArray) -> FloatArray:
+        """Return P(no occluder stands before what is at some places)."""
+        hidden = self.behind(azimuth_rad, np.hypot(std_rad[:, None], self._edges[1].T), range_m)
         return np.asarray(1.0 - (hidden * [one.certainty for one in self.sides]).max(axis=1))
 
     def view(self, look: Look) -> Sector:

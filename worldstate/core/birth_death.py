@@ -166,7 +166,10 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
     lost = tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS) & (tracks.behind < HIDDEN)
     for other in np.flatnonzero(lost).tolist():
         found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
-        same = next((i for i in found if _at_one_place(tracks, i, other)), None)
+        apart = np.abs(wrap_angle(tracks.mean[:, AZIMUTH] - tracks.mean[other, AZIMUTH]))
+        # The nearest: the first of several would be another one in a mirror.
+        there = [i for i in found if _at_one_place(tracks, i, other)]
+        same = min(there, key=apart.__getitem__, default=None)
         if same is not None:
             first, second = sorted((same, other), key=partial(_age, tracks))
             into[tracks.id[second]] = tracks.id[first]

@@ -20,7 +20,7 @@ from worldstate.belief.kinematics.cartesian import (
 )
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, RADIAL_RATE, MotionBelief, update
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.site_geometry import SiteGeometry, normal_share
+from worldstate.belief.site_geometry import SiteGeometry, normal_shares
 from worldstate.belief.track import (
     Track,
     Tracks,
@@ -131,7 +131,7 @@ def detection_update(
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
     if detections.in_sight:
-        detections = detections.seen_through(site.line_of_sight(detections.azimuth_rad, detections.std_rad))
+        detections = detections.seen_through(site)
     whose = associated(known, detections, site)
     if detections.in_sight:
         # A detection that may be of a known entity is a new one the less.
@@ -153,7 +153,7 @@ def detection_update(
         first = np.flatnonzero((detection[: len(known)] >= 0) & ~known.detected)
         another = (1.0 - chances[first]) * detections.existence[detection[first]]
         existence[first] = chances[first] + another
-    _move(tracks, found)
+    _move(tracks, found, chances)
     _see(tracks, found, chances, scans, stamp_ns, site)
     follow_places(tracks, site)
     if scans[0].sector is None:
@@ -182,7 +182,7 @@ def _born(
 ) -> Track:
     """Return a new entity before its detection counts; hidden where messages say so."""
     azimuth_rad = float(detections.azimuth_rad[by])
-    side = None if detections.in_sight else site.hiding_side(azimuth_rad)
+    side = None if detections.in_sight else site.hiding_side(detections.positions[by].position_m)
     existence = min(float(detections.existence[by]), MOST_EXISTENCE)
     if side is None:
         track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
@@ -244,7 +244,7 @@ def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
         return covers.astype(float)
     stds = np.sqrt(tracks.covariance[:, LOG_RANGE, LOG_RANGE])
     deviations = (math.log(scan.range_m) - tracks.mean[:, LOG_RANGE]) / stds
-    return np.where(covers, [normal_share(one) for one in deviations.tolist()], 0.0)
+    return np.where(covers, normal_shares(deviations), 0.0)
 
 
 def _told(tracks: Tracks, found: _Found, scan: Scan) -> FloatArray:
@@ -258,7 +258,7 @@ def _told(tracks: Tracks, found: _Found, scan: Scan) -> FloatArray:
     return after
 
 
-def _move(tracks: Tracks, found: _Found) -> None:
+def _move(tracks: Tracks, found: _Found, chances: FloatArray) -> None:
     """Update the motion or the place of the found tracks with what was measured of them."""
     rows, by, detections = found
     placed = tracks.placed[rows] | bool(detections.positions)
@@ -271,7 +271,7 @@ def _move(tracks: Tracks, found: _Found) -> None:
     if usual.any():
         rows, by = rows[usual], by[usual]
         before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
-        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by])
+        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by], chances[rows])
         tracks.mean[rows], tracks.covariance[rows] = after.mean, after.covariance
 
 

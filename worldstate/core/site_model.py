@@ -10,6 +10,7 @@ from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import EgoBelief
+from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
@@ -49,6 +50,7 @@ def site_geometry_of(
             0.0 if one.corner_m is None else yaw_rad,
             None if one.corner_m is None else math.dist(one.corner_m, (x, y)),
             settings.assumed_certainty if one.assumed else 1.0,
+            0.0 if one.corner_m is None else abs(one.corner_m[1] - y),
         )
         for one in context.occluders
     )
@@ -99,6 +101,8 @@ def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
         # The floor only matters where P(hidden) has underflowed; then no direction has a share.
         share = risk / max(hidden, 1e-300)
         sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
-    tracks, moving = memory.tracks, memory.tracks.seen & memory.tracks.moving
-    unseen = 1.0 - tracks.existence[moving] * (1.0 - tracks.behind[moving])
+    tracks = memory.tracks
+    # What drives behind the ego explains nothing of what is ahead.
+    ahead = tracks.seen & tracks.moving & (np.cos(tracks.mean[:, AZIMUTH]) > 0.0)
+    unseen = 1.0 - tracks.existence[ahead] * (1.0 - tracks.behind[ahead])
     return sides.at_least(announced(tracks, model.site)).beside(float(unseen.prod()))
