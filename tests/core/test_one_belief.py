@@ -357,6 +357,20 @@ def test_high_risk_without_advisory_says_why() -> None:
     assert cue.not_advised is not None and "three seconds" in cue.not_advised
 
 
+@given(SEEDS, st.integers(1, 30))
+@settings(max_examples=8, deadline=None)
+def test_an_array_that_never_hears_leaves_the_risk_of_the_prior(seed: int, hops: int) -> None:
+    """Whatever its samples hold, and whatever the policy's map makes of a quiet window."""
+    rng, policy = np.random.default_rng(seed), replace(uncalibrated_policy(), risk_map=PlattMap(-3.0, 2.0))
+    world = first = WorldFilter(policy=policy)
+    for number in range(1, hops + 1):
+        said = replace(hop(rng, number, sequence=False), sightings=(), heard=Heard(0.0, "no common sound"))
+        world = world.update(replace(said, look=None, co_evidence=Unqueried("-")))
+    settled = first.predict_to(world.stamp_ns).belief
+    assert [cue.risk for cue in world.state.cues] == pytest.approx(settled.risks)
+    assert min(settled.risks) > 0.08
+
+
 @pytest.mark.parametrize("sequence", [False, True])
 @given(SEEDS)
 @settings(max_examples=5, deadline=None)

@@ -92,10 +92,12 @@ def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
     .. math:: r_k = \min\big(P(hid),\ g(P(hid))\big)\, P(k \mid hid)
 
     without a sequence model, whose probabilities are calibrated: of what is hidden at most all comes into
-    view, so that the calibrated map g of the policy can only lower it.
+    view, so that the calibrated map g of the policy can only lower it. It is a map of what windows heard:
+    before the first one the risk is that of the prior, or an array that hears nothing would report a street
+    quieter than any.
     """
     sides = memory.sides
-    if isinstance(memory.belief, WindowBelief):
+    if isinstance(memory.belief, WindowBelief) and memory.belief.heard:
         hidden = sides.hypotheses[0]
         risk = min(float(model.policy.risk_map(hidden)), hidden)
         # The floor only matters where P(hidden) has underflowed; then no direction has a share.
