@@ -91,12 +91,15 @@ class Senses:
 
     Parameters
     ----------
+    now_ns : int
+        Time of the next sample.
     ears : FrontEnd
         The sound of the last window, and what the channels' health is judged by.
     eyes : mapping of str to VisionQuery
         The last images of each camera, by its name.
     """
 
+    now_ns: int
     ears: FrontEnd | SpectrumFrontEnd
     eyes: Mapping[str, VisionQuery]
 
@@ -201,7 +204,7 @@ class Listener:
         if one != other or not np.array_equal(hear.array.positions_m, before.array.positions_m):
             raise InvalidArgumentError("resume: expected the array, rate, bands and azimuths of its listener")
         self._adapter.front_end = deepcopy(before)
-        self._first_ns = self.world.stamp_ns
+        self._first_ns = senses.now_ns  # Later than the belief, by the samples since the last hop
         for name, query in self._cameras.items():
             if name in senses.eyes:
                 query.go_on(senses.eyes[name])
@@ -363,7 +366,7 @@ class Listener:
         """
         # Ears are changed by what they hear, a camera's memory is replaced.
         eyes = {name: copy(query) for name, query in self._cameras.items()}
-        return replace(self._learned(), senses=Senses(deepcopy(self._adapter.front_end), eyes))
+        return replace(self._learned(), senses=Senses(self._now_ns(), deepcopy(self._adapter.front_end), eyes))
 
     def _learned(self) -> Checkpoint:
         """Return the belief and what was learned of site and street."""

@@ -91,8 +91,9 @@ def _json_lines(path: Path) -> Iterator[str]:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
             # What keeps the last bytes of a log begins within a line; a running one ends within one.
             inner = number > 1 and line.endswith((b"}\n", b"}\r\n")) and line.startswith(b"{")
+            # Written with bytes that are no text, or so long, a whole line is refused by its number.
             if inner or len(line) == MOST_CHARACTERS or not _is_cut(line):
-                yield line.decode("utf-8-sig").strip()
+                yield line.decode("utf-8-sig", "replace").strip()
             elif number == 1 and line.startswith(_PACKED):
                 raise InvalidArgumentError("line 1: expected UTF-8, unpacked as by gunzip")
             else:

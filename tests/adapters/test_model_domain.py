@@ -366,7 +366,7 @@ def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
     quiet, mics = tmp_path / "quiet.wav", array_file(tmp_path / "mics.csv", elsewhere.positions_m)
     soundfile.write(quiet, 0.01 * RNG.standard_normal((RATE * 2, 56)), RATE, subtype="FLOAT")
     out, streams = tmp_path / "out.json", tmp_path / "s.npz"
-    words = ["--alpha", "0.2", "--method", "plain", "--out", str(out)]
+    words = ["--alpha", "0.2", "--out", str(out)]
     assert main(["model", "threshold", str(quiet), "--array", str(mics), *words]) == 2
     assert "looks mirrored" in capsys.readouterr().err and not out.exists()
     heard = ["--array", str(mics), "--model", str(tmp_path / "own.json"), "--save-streams", str(streams)]
