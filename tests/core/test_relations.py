@@ -11,7 +11,7 @@ from snapshot_laws import broken_laws
 
 from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present
-from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement import Odometry, Position, PositionScan, SearchedSector, Sector
 from worldstate.state import Relation
 from worldstate.state.context import corner_at
 
@@ -206,3 +206,22 @@ def test_what_stands_in_front_of_the_wall_is_in_view(azimuth, way, beside_m):
         world = world.update(PositionScan("radar", hop * 10**8, (walks,), searched))
     (one,) = world.state.entities
     assert one.status == "visible" and one.existence_probability > 0.9
+
+
+@given(st.sampled_from([1.0, -1.0]), st.floats(0.15, 0.5), st.integers(1, 4))
+@settings(max_examples=10, deadline=None)
+def test_messages_that_carry_nothing_leave_how_likely_a_vehicle_is_hidden(way, rate, between):
+    """Law 9: towards an assumed corner, with empty odometry of a standing ego between the looks."""
+    alone = crowded = WorldFilter()
+    for hop in range(40):
+        stamp_ns, azimuth = 10**9 + hop * 10**8, way * (0.2 + rate * hop / 10)
+        boxes = (Sighting(azimuth, 0.01, "car", 0.9, 0.1),) if abs(azimuth) < 0.55 else ()
+        answer = Present(0.1, 0.02) if boxes else Absent(0.1, 0.02)
+        look = Measurement(stamp_ns, NEUTRAL, answer, SILENT, SILENT, boxes)
+        alone = alone.update(look)
+        for number in range(between):
+            early_ns = (between - number) * 2 * 10**7
+            crowded = crowded.update(Odometry("wheels", stamp_ns - early_ns, 0.0, 0.0))
+        crowded = crowded.update(look)
+        for one, other in zip(alone.state.entities, crowded.state.entities, strict=True):
+            assert one.hidden_probability == pytest.approx(other.hidden_probability, abs=0.05)

@@ -304,11 +304,12 @@ def follow_places(tracks: Tracks, site: SiteGeometry) -> None:
 def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatArray:
     r"""Return P(an occluder hides it) of every track, for each side's and each other track, shape (n, K + n).
 
-    .. math:: P_k = P(\text{it stands at the azimuths of } k)\, \max(P(k \text{ is nearer}), P_{hidden})
+    .. math:: P_k = \min\big(a_k,\ P + (1 - e^{-dt / T})\, (a_k n_k - P)_+\big)
 
-    Where a corner stands is known or assumed; of two boxes the wider one is nearer as far as ranges and the
-    spread of sizes allow. What was hidden there before, still is. A box ends where its corner begins: of an
-    entity without a place the leading end counts.
+    with the chances P that it was hidden before, a that it stands at the azimuths of k, and n that k is
+    nearer: however a time is divided into steps, it is as likely hidden. Where a corner stands is known or
+    assumed; of two boxes the wider one is nearer as far as ranges and the spread of sizes allow. A box ends
+    where its corner begins: of an entity without a place the leading end counts.
     """
     azimuth_rad, widths, sides = tracks.mean[:, AZIMUTH], tracks.width_rad, len(site.sides)
     way = np.sign(tracks.mean[:, AZIMUTH_RATE]) * tracks.moving  # Of a first sighting none
@@ -334,7 +335,7 @@ def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatAr
         nearer[i, sides + j] = normal_shares(farther / np.sqrt(1.0 / ranges + 1.0 / sizes))
     before = np.where(tracks.seen, tracks.behind, 0.0)[:, None]
     changed = np.where(nearer < 1.0, 1.0 - math.exp(-step_s / site.settings.look_interval_s), 1.0)
-    return np.asarray(at * np.maximum(before, before + (nearer - before) * changed))
+    return np.asarray(np.minimum(before + np.maximum(at * nearer - before, 0.0) * changed, at))
 
 
 def occlude(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> None:
