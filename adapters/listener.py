@@ -366,7 +366,8 @@ class Listener:
         """
         # Ears are changed by what they hear, a camera's memory is replaced.
         eyes = {name: copy(query) for name, query in self._cameras.items()}
-        return replace(self._learned(), senses=Senses(self._now_ns(), deepcopy(self._adapter.front_end), eyes))
+        senses = Senses(self._now_ns(), deepcopy(self._adapter.front_end), eyes)
+        return replace(self._learned(), senses=senses)
 
     def _learned(self) -> Checkpoint:
         """Return the belief and what was learned of site and street."""
