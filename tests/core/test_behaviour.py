@@ -218,7 +218,8 @@ def test_a_certain_entity_survives_a_checkpoint():
     for hop in range(1, 300):
         certain = SignatureEvidence(("left", "right"), (float(rng.uniform(8, 40)), 0.0), 3.0, 0.0)
         world = after(world, measured(hop / 10, certain))
-        assert WorldFilter.from_dict(world.to_dict()).state == world.state
+        if hop % 10 == 9:
+            assert WorldFilter.from_dict(world.to_dict()).state == world.state
 
 
 @pytest.mark.parametrize(("miss_rate", "stays"), [(0.9, True), (0.04, False)])

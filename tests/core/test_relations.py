@@ -93,10 +93,10 @@ def test_who_is_announced_behind_a_corner_approaches_from_its_arm() -> None:
 
 
 def test_relations_name_only_what_the_snapshot_holds() -> None:
-    """Over 2,000 steps in which vehicles of two lanes come and go, and of which some are hidden."""
+    """Over 500 steps in which vehicles of two lanes come and go, and of which some are hidden."""
     rng, world, ended, named = np.random.default_rng(3), WorldFilter(), 0, 0
     there = list[np.ndarray]()
-    for step in range(1, 2001):
+    for step in range(1, 501):
         there = [one + 0.1 * np.append(one[2:], (0.0, 0.0)) for one in there if rng.random() < 0.97]
         if len(there) < 5 and rng.random() < 0.3:
             lane = (10.0, rng.uniform(5.0, 25.0), 0.0, -6.0), (rng.uniform(5.0, 40.0), 0.5, 5.0, 0.0)
@@ -108,7 +108,7 @@ def test_relations_name_only_what_the_snapshot_holds() -> None:
         assert not broken_laws(state), step
         ended += sum(one.until_ns is not None for one in state.relations)
         named += len(state.relations)
-    assert named > 10_000 and ended > 1_000
+    assert named > 2_500 and ended > 250
 
 
 # Law 17: what moves behind an occluder is hidden by it, whoever had found it.
