@@ -349,7 +349,7 @@ def open_source(
     others : sequence of callables, optional
         What other sensors measured: functions that return `Measurement` and `PositionScan` in their order.
     settings : ListenSettings, optional
-        How it is listened to: budget, band, azimuths, site adaptation, ego-noise, boxes.
+        How it is listened to: budget, band, azimuths, site adaptation, boxes.
 
     Returns
     -------

@@ -623,8 +623,8 @@ def coco_log(
 
     A result is ``{"image_id", "category_id", "bbox": [x, y, w, h], "score"}``; image i is taken i / rate
     after the start, and without a score it counts as 1. Images whose ids count from 1, are arbitrary or names
-    stand in the order of the numbers that their ``"file_name"`` or id ends in; a listed
-    size has to be `size_px`. Categories without names are COCO's, counted from 1; if one is 0, YOLO's.
+    stand in the order of the numbers that their ``"file_name"`` or id ends in; a listed size has to be
+    `size_px`. Categories without names are COCO's, counted from 1; if one is 0, YOLO's.
     """
     with refused_as_file(path):
         held = {"annotations": document} if isinstance(document, list) else document
