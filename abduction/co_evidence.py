@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, wrap_angle
+from worldstate.ground import TINY, FloatArray, InvalidArgumentError, finite_array, wrap_angle
 from worldstate.ground.checks import check_fields, in_range
 from worldstate.ground.serialisation import Layout
 
@@ -212,7 +212,8 @@ Rows = tuple[tuple[float, ...], ...]
 
 # What the paper measured on clean frames: .04 at boresight, .14 at 20-30 deg; .97 under the harshest noise.
 BORESIGHT_MISS_RATE = 0.04
-MISS_RATE_PER_DEG = (0.14 - 0.04) / 25.0
+MISS_RATE_PER_DEG = BORESIGHT_MISS_RATE / 10.0
+_ABEAM_DEG = 90.0
 HARSHEST_MISS_RATE = 0.97
 # A look that misses more watches nothing: one in view would be counted as none.
 MOSTLY_MISSED = 0.5
@@ -259,7 +260,7 @@ class MissRateTable:
     per_class: Mapping[str, Rows] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_axis("azimuth_deg", self.azimuth_deg, 180.0)
+        _check_axis("azimuth_deg", self.azimuth_deg, 2.0 * _ABEAM_DEG)
         _check_axis("degradation", self.degradation, 1.0)
         shape = (len(self.azimuth_deg), len(self.degradation))
         _check_rates("beta", self.beta, shape)
@@ -298,8 +299,8 @@ def default_miss_rates() -> MissRateTable:
     """
     # Clean frames: .04 at boresight, .14 at 25 deg and on at that slope over the half plane, for a view ends
     # by the camera's own angle; from there linearly in d to .97 everywhere.
-    clean = BORESIGHT_MISS_RATE, BORESIGHT_MISS_RATE + MISS_RATE_PER_DEG * 90.0
-    return MissRateTable((0.0, 90.0), (0.0, 1.0), tuple((rate, HARSHEST_MISS_RATE) for rate in clean))
+    clean = BORESIGHT_MISS_RATE, BORESIGHT_MISS_RATE + MISS_RATE_PER_DEG * _ABEAM_DEG
+    return MissRateTable((0.0, _ABEAM_DEG), (0.0, 1.0), tuple((rate, HARSHEST_MISS_RATE) for rate in clean))
 
 
 def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:
@@ -318,7 +319,6 @@ def _check_rates(name: str, rows: Rows, shape: tuple[int, int]) -> None:
 
 # Far below the resolution of any miss rate that is counted.
 _SWEEPS = 2000
-_TOLERANCE = 1e-10
 
 
 def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
@@ -345,7 +345,7 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
         along_rows += grid - by_row
         grid = _pooled_rows((by_row + along_columns).T, weight.T).T
         along_columns += by_row - grid
-        if max(np.abs(grid - before).max(), np.abs(grid - by_row).max()) < _TOLERANCE:
+        if max(np.abs(grid - before).max(), np.abs(grid - by_row).max()) < TINY:
             break
     # What is left of the alternation, far below any rate that could be measured, must not break the order.
     return np.maximum.accumulate(np.maximum.accumulate(grid, axis=0), axis=1)

@@ -107,7 +107,7 @@ class SignatureEvidence:
     sides: SideEvidence | None = None
 
     def __post_init__(self) -> None:
-        labels = all_of("directions", self.directions, str, most=64)
+        labels = all_of("directions", self.directions, str)
         if not labels or len(set(labels)) != len(labels):
             raise InvalidArgumentError(f"directions: expected different labels, got {labels!r}")
         _check_each("hidden", self.hidden, self.directions)

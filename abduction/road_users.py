@@ -52,7 +52,7 @@ def class_shares(name: str, value: object) -> ClassShares:
     (('car', 0.75), ('van', 0.25))
     """
     shares = list[tuple[str, float]]()
-    for one in all_of(name, value, tuple, most=64):
+    for one in all_of(name, value, tuple):
         if len(one) != 2:
             raise InvalidArgumentError(f"{name}: expected a class and its probability, got {one!r:.40}")
         label, share = one

@@ -122,9 +122,9 @@ class Listener:
         channel. The snapshots state no budget, and how well could be heard is null.
     **parts
         As `open_source` takes them: `model`, `camera`, `miss_rates`, `context`, `sides`, `moving_ego`,
-        `settings`, and `resume`, a `Checkpoint` or a file of one. The checkpoint of a listener goes on at the
-        next sample. One of a file holds no sound: begin a second or more before it with `start_s`; what is
-        heard up to its time fills the windows.
+        `budget` or `alpha`, `settings`, and `resume`, a `Checkpoint` or a file of one. The checkpoint of a
+        listener goes on at the next sample. One of a file holds no sound: begin a second or more before it
+        with `start_s`; what is heard up to its time fills the windows.
 
     Attributes
     ----------
@@ -417,7 +417,7 @@ def listen(path: SoundInput | str | Sequence[str], **parts: Unpack[SourceParts])
     path : path, sequence of paths, SoundStream or Audio
         Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
         a stream (raw samples from a pipe, the sound of a bag), or an open recording.
-    array, detections, detector, camera, miss_rates, model, context, settings
+    array, detections, detector, camera, miss_rates, model, context, budget, alpha, settings
         As `open_source` takes them: files, or the objects that they hold.
 
     Yields

@@ -11,6 +11,7 @@ import numpy as np
 from worldstate.abduction.co_evidence import Sector
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.road_users import DomainGuard, RoadUserModel
+from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import SidePatterns, StreetHearing, StreetListener
@@ -30,6 +31,8 @@ from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.street_model import StreetModel
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz
@@ -51,9 +54,11 @@ class ListenSettings:
 
     Parameters
     ----------
-    alpha : float or None
-        False-positive budget that the threshold was set for; the model file says which it holds. None takes
-        the first one, where sound is only measured.
+    budget : float, optional
+        False alarms an hour, by the curve in the model file; the file's own budget if neither is given.
+    alpha : float, optional
+        Share of hazard-free time in alarm, by the same curve; of a model without a sequence the budget of
+        one of its policies, 0.02 or its first one if none is given.
     band_hz : (float, float), optional
         Band of the spatial spectrum, Hz; it follows the spacing of the microphones where not given.
     azimuth_span_deg : float
@@ -79,11 +84,12 @@ class ListenSettings:
 
     Examples
     --------
-    >>> ListenSettings(azimuth_span_deg=360).alpha
-    0.02
+    >>> ListenSettings(azimuth_span_deg=360, budget=12.0).budget
+    12.0
     """
 
-    alpha: float | None = 0.02
+    budget: float | None = None
+    alpha: float | None = None
     band_hz: tuple[float, float] | None = None
     azimuth_span_deg: float = 180.0
     mask_dead: bool = False
@@ -130,7 +136,7 @@ class Source:
     model : Signature
         From features to likelihoods.
     policy : CueingPolicy
-        Threshold, sustained rule and risk map.
+        Threshold and risk map.
     context : Context
         Rates, occluders, ego motion.
     settings : ListenSettings
@@ -156,6 +162,8 @@ class Source:
         Tells which kind of road user is heard.
     sequence : SequenceModel, NotUsable or None
         Reads when a vehicle comes into view; or why the model's cannot be used here.
+    street : StreetModel or None
+        Numbers of the belief; those that ship if the model file holds none.
     sides : SidePatterns or None
         What either arm of a known street sounds like; not read where `before` holds what was heard of it.
     co_evidence : SeveralCameras or None
@@ -196,6 +204,7 @@ class Source:
     guard: DomainGuard | None = None
     road_users: RoadUserModel | None = None
     sequence: SequenceModel | NotUsable | None = None
+    street: StreetModel | None = None
     sides: SidePatterns | None = None
     co_evidence: SeveralCameras | None = None
     others: tuple[OtherModality, ...] = ()
@@ -203,7 +212,8 @@ class Source:
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
         if self.before is None:
-            return WorldFilter(context=self.context, policy=self.policy)
+            settings = FilterSettings(street=self.street or StreetModel())
+            return WorldFilter(self.context, self.policy, settings)
         return replace(self.before.world, policy=self.policy)
 
     @property
@@ -266,6 +276,8 @@ def street_listener(
 
 
 class _Parts(TypedDict, total=False):
+    budget: float | None
+    alpha: float | None
     camera: Path | str | PinholeCamera | None
     miss_rates: Path | str | MissRates | None
     model: Path | str | Model | None
@@ -305,6 +317,8 @@ def open_source(
     ego: OdometryLog | None = None,
     moving_ego: bool = False,
     others: Sequence[OtherModality] = (),
+    budget: float | None = None,
+    alpha: float | None = None,
     settings: ListenSettings | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
@@ -348,6 +362,8 @@ def open_source(
         Whether the ego vehicle will be told to move, as by a running odometry: chooses the model.
     others : sequence of callables, optional
         What other sensors measured: functions that return `Measurement` and `PositionScan` in their order.
+    budget, alpha : float, optional
+        How many false alarms are allowed, in place of those of `settings`.
     settings : ListenSettings, optional
         How it is listened to: budget, band, azimuths, site adaptation, boxes.
 
@@ -361,8 +377,8 @@ def open_source(
     InputFileError
         If a file is missing or damaged; the message names it.
     InvalidArgumentError
-        If the model holds no threshold for the budget, both detections and a detector are given, or
-        either without the camera that took the images, where the array is not OVAD's.
+        If the model holds no threshold for the budget, or budget and alpha are given, or detections and a
+        detector, or either without the camera that took the images, where the array is not OVAD's.
     OutOfDomainError
         If the array is not that of the data set, or not the model's.
 
@@ -375,22 +391,25 @@ def open_source(
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder) / "noise.wav"
     ...     soundfile.write(path, noise, 48_000)
-    ...     source = open_source(path, settings=ListenSettings(alpha=0.05))
-    >>> len(source.array.positions_m), source.policy.alpha
-    (56, 0.05)
+    ...     source = open_source(path, alpha=0.02)
+    >>> len(source.array.positions_m), source.sequence.alarm.asked_alpha
+    (56, 0.02)
     """
     settings, context = settings or ListenSettings(), context or Context()
+    if (budget, alpha) != (None, None):
+        settings = replace(settings, budget=budget, alpha=alpha)
     sound = as_sound(path)
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     told = moving_ego or (ego is not None and ego.moves)
     moves = bool(told or (recording and recording.moving_ego) or context.ego_speed_mps)
     known = model if isinstance(model, Model) else read_model(model, moving_ego=moves)
-    heard_by, policy = _array_and_policy(sound, known, _read(array, read_array), settings, moves)
+    sequence, policy = _alarm_of(known, settings, moves)
+    heard_by, policy = _array_and_policy(sound, known, policy, _read(array, read_array), settings, moves)
     if camera is None and (detections, detector) != (None, None):
         check_mounting(heard_by)
-    if len(policy.reference_prior) != len(context.directions) + 2:
-        expected = f'{len(policy.reference_prior) - 2} sides as the model, of an open road "open"'
-        raise InvalidArgumentError(f"context.arms: expected {expected}, got {', '.join(context.directions)}")
+    if not set(SIDES) & set(context.directions):
+        named = ", ".join(context.directions)
+        raise InvalidArgumentError(f"context.arms: expected left or right, as the model names, got {named}")
     first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
     start_ns = nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns
     t0_s = None if recording is None else recording.t0_s
@@ -410,13 +429,15 @@ def open_source(
         start_ns=start_ns,
         guard=known.guard,
         road_users=known.road_users,
-        sequence=_sequence_of(known, moves, settings.uncalibrated),
+        sequence=sequence,
+        street=known.street,
         sides=sides,
         others=tuple(others) if ego is None else (*others, ego.told.__iter__),
     )
     return _with_camera(source, recording, detections, detector)
 
 
+_ALPHA = 0.02  # The paper's budget, of a model without a sequence
 # Of a pipe or of microphones, whose end is not known, seconds.
 _ONE_DAY_S = 86_400.0
 # Stamps closer together are in another unit, and so are those of what begins with the sound and lasts so many
@@ -514,17 +535,33 @@ def _read(given: Path | str | T | None, reader: Callable[[Path | str], T]) -> T 
 
 
 def _array_and_policy(
-    sound: SoundInput, model: Model, array: MicrophoneArray | None, settings: ListenSettings, moves: bool
+    sound: SoundInput,
+    model: Model,
+    policy: CueingPolicy,
+    array: MicrophoneArray | None,
+    settings: ListenSettings,
+    moves: bool,
 ) -> tuple[MicrophoneArray, CueingPolicy]:
-    """Return by which array is heard, and the thresholds; alpha is 0 where no budget can be stated."""
-    alpha, policies = settings.alpha, model.policies
-    policy = policies.policies[0] if alpha is None else policies.for_alpha(alpha)
+    """Return the array of the sound, and the policy, whose alpha is 0 if no budget can be stated."""
     if array is None and isinstance(sound, SoundStream):
         raise InputFileError(sound.name, "expected --array: such a stream names no microphones")
     assumed = None if model.domain is None else array_of(model.domain)
     heard_by = choose_array(path_of(sound), array, assumed=assumed, trust_given=settings.uncalibrated)
     stated = not settings.uncalibrated and states_budget(model, heard_by, moves)
     return heard_by, policy if stated else replace(policy, alpha=0.0)
+
+
+def _alarm_of(
+    model: Model, settings: ListenSettings, moves: bool
+) -> tuple[SequenceModel | NotUsable, CueingPolicy]:
+    """Return the sequence model with the alarm that was asked for, and the policy, by alpha without one."""
+    sequence, policies = _sequence_of(model, moves, settings.uncalibrated), model.policies
+    usual = next((one for one in policies.policies if one.alpha == _ALPHA), policies.policies[0])
+    if isinstance(sequence, SequenceModel):
+        return sequence.asking(settings.budget, settings.alpha), usual
+    if settings.budget is not None:
+        raise InvalidArgumentError(f"budget: expected a model with a sequence ({sequence.reason})")
+    return sequence, usual if settings.alpha is None else policies.for_alpha(settings.alpha)
 
 
 def _sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable:

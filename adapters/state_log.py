@@ -10,15 +10,19 @@ from worldstate.adapters.export.log_messages import (
     MCAP_MAGIC,
     SNAPSHOT_TOPIC,
     SOUND_TOPIC,
+    SRP_TOPIC,
+    LogMessage,
     read_messages,
+    state_messages,
 )
-from worldstate.adapters.export.scene import CompressedImage, RawAudio
+from worldstate.adapters.export.scene import CompressedImage, RawAudio, SceneUpdate
 from worldstate.adapters.files.file_io import plain_file, refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
 from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.serialisation import MOST_CHARACTERS, decode, decode_json
 from worldstate.state import WorldState
+from worldstate.state.world_state import is_former
 
 _LOG = logging.getLogger(__name__)
 # A hop: the last decision of a recording ends up to so long before it does.
@@ -30,11 +34,16 @@ _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
 
 def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
-    """Yield every snapshot, beside the line of JSON that was written; refuse a log without any."""
+    """Yield every snapshot, beside the line of JSON that was written; refuse a log without any.
+
+    One of schema 3.x is upgraded, and so is its line.
+    """
     empty = True
     with refused_as_file(path):
         for line in _lines(path):
-            yield line, WorldState.from_json(line)
+            value = decode_json(line, "snapshot")
+            state = WorldState.from_dict(value)
+            yield state.to_json() if is_former(value) else line, state
             empty = False
     if empty:
         raise InputFileError(path, _EMPTY)
@@ -45,17 +54,30 @@ def read_media(path: Path) -> Iterator[tuple[int, CompressedImage | RawAudio]]:
     kinds: dict[str, type[CompressedImage] | type[RawAudio]]
     kinds = {IMAGE_TOPIC: CompressedImage, SOUND_TOPIC: RawAudio}
     with refused_as_file(path):
-        for stamp_ns, topic, text in read_messages(path, *kinds) if _is_own_mcap(path) else ():
+        for stamp_ns, topic, text in read_messages(path, *kinds) if is_own_mcap(path) else ():
             yield stamp_ns, decode(kinds[topic], decode_json(text, topic), topic)
 
 
+def upgraded_messages(path: Path) -> Iterator[LogMessage]:
+    """Yield every message of an MCAP file of `--export` as this version writes it, in its order."""
+    # What follows from a snapshot is written anew; the power of the sound, images and sound are not.
+    kinds = {SRP_TOPIC: SceneUpdate, IMAGE_TOPIC: CompressedImage, SOUND_TOPIC: RawAudio}
+    with refused_as_file(path):
+        for stamp_ns, topic, text in read_messages(path, SNAPSHOT_TOPIC, *kinds):
+            if topic == SNAPSHOT_TOPIC:
+                yield from state_messages(WorldState.from_json(text))
+            else:
+                yield LogMessage(topic, stamp_ns, decode(kinds[topic], decode_json(text, topic), topic))
+
+
 def _lines(path: Path) -> Iterator[str]:
-    if _is_own_mcap(path):
+    if is_own_mcap(path):
         return (text for _, _, text in read_messages(path, SNAPSHOT_TOPIC))
     return bag_snapshot_lines(path) if is_bag(path) else _json_lines(path)
 
 
-def _is_own_mcap(path: Path) -> bool:
+def is_own_mcap(path: Path) -> bool:
+    """Return whether a log is an MCAP file that `--export mcap` writes, and not one of ROS 2."""
     if not path.is_file():
         return False
     with plain_file(path, "snapshots") as file:

@@ -9,8 +9,6 @@ from worldstate import WorldState
 
 # Names of what a reader may assume; no filter sets another value.
 CONSTANT = {"WorldState.frame_id", "WorldState.clock"}
-# Zero since no threshold moves; they leave with the next major version of a snapshot.
-CONSTANT |= {"Budget.threshold_shift_nats", "Tally.lost"}
 
 
 def published(kind: Any = WorldState) -> dict[type, list[str]]:

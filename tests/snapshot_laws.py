@@ -7,6 +7,7 @@ from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 
 SLACK = 1e-9
 LEAST_RISK, HIGH_RISK, HOLDS_NS = 0.1, 0.7, 1_005_000_000
+_BUDGET_LOST = {"uncalibrated", "unheard", "budget broken"}
 
 
 def broken_laws(state: WorldState, before: WorldState | None = None) -> list[str]:
@@ -49,6 +50,10 @@ def _chances(state: WorldState) -> Iterator[str]:
 def _advisories(state: WorldState) -> Iterator[str]:
     """Yield where an advisory stands or is missing against what is published beside it."""
     for cue in state.cues:
+        if cue.usable != (not cue.why_not):
+            yield f"{cue.direction}: usable {cue.usable} beside {cue.why_not}"
+        if state.calibrated != _BUDGET_LOST.isdisjoint(cue.why_not):
+            yield f"{cue.direction}: why not {cue.why_not}, but calibrated {state.calibrated}"
         terms, told, where = cue.evidence, cue.advisory, f"{cue.direction}: "
         assert terms is not None
         over, allowed = terms.compared_nats >= terms.threshold_nats, cue.risk >= LEAST_RISK

@@ -61,7 +61,7 @@ class CueingPolicy:
         in_range("alpha", self.alpha, 0.0, 1.0, open_high=True)
         in_range("miss_rate", self.miss_rate, 0.0, 1.0)
         prior = finite_array("reference_prior", self.reference_prior, (None,))
-        if prior.size < 3 or (prior <= 0).any() or not np.isclose(prior.sum(), 1.0, atol=1e-6):
+        if prior.size <= 2 or (prior <= 0).any() or not np.isclose(prior.sum(), 1.0):
             raise InvalidArgumentError("reference_prior: expected 3 or more positive numbers, sum one")
 
 
@@ -110,7 +110,7 @@ class CueingPolicies:
         """
         held: Sequence[CueingPolicy] = self.policies
         for name, wanted in (("alpha", alpha), ("miss_rate", miss_rate)):
-            found = [one for one in held if np.isclose(getattr(one, name), wanted, rtol=1e-6)]
+            found = [one for one in held if np.isclose(getattr(one, name), wanted)]
             if not found:
                 known = ", ".join(sorted({f"{getattr(one, name):g}" for one in held}))
                 raise InvalidArgumentError(f"{name}: expected a calibrated budget ({known}), got {wanted:g}")

@@ -11,7 +11,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array
+from worldstate.ground import TINY, BoolArray, FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import IndexArray
@@ -198,7 +198,7 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
 
 
 def _logit(statistic: FloatArray) -> FloatArray:
-    bounded = np.clip(statistic, 1e-9, 1.0 - 1e-9)
+    bounded = np.clip(statistic, TINY, 1.0 - TINY)
     return np.asarray(np.log(bounded / (1.0 - bounded)))
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
+from worldstate.ground import TINY, FloatArray, InvalidArgumentError, finite_array, in_range
 
 from .cueing_policy import sustained_statistic
 
@@ -55,7 +55,7 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
     if not held.size:
         raise InvalidArgumentError("hazard_free: expected at least one window")
     # The next float above the first window that the budget cannot pay for.
-    paid, least = int(budget * held.size + 1e-9), float(np.finfo(np.float64).min)
+    paid, least = int(budget * held.size * (1.0 + TINY)), float(np.finfo(np.float64).min)
     return least if paid >= held.size else max(float(np.nextafter(np.sort(held)[-1 - paid], np.inf)), least)
 
 
@@ -77,4 +77,4 @@ def risk_controlling(losses: FloatArray, alpha: float, largest: float) -> int:
     """
     # Onsets are no monotone loss, since alarms that grow together are one: what counts is the worst so far.
     worst = np.maximum.accumulate(np.minimum(losses, largest), axis=1)
-    return int(np.sum(worst.sum(axis=0) + largest <= alpha * (len(losses) + 1) * (1.0 + 1e-9)))
+    return int(np.sum(worst.sum(axis=0) + largest <= alpha * (len(losses) + 1) * (1.0 + TINY)))

@@ -10,7 +10,7 @@ nothing beside the feature was measured, the classifier's evidence is handed on 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import pi
 
 import numpy as np
@@ -21,14 +21,18 @@ from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finit
 
 LINE_SPACING = "line_spacing_hz"
 SPEED_OF_SOUND_M_S = 343.0
-# Total ratio of gearbox and final drive, first to fifth gear: ordinary numbers of a passenger car (3.6, 2.05,
-# 1.4, 1.05 and 0.85 times 3.9), no measured ones.
-GEAR_RATIOS = (14.0, 8.0, 5.4, 4.1, 3.3)
+# Total ratio of gearbox and final drive, first to fifth gear, in even steps: ordinary numbers of a passenger
+# car (3.6 to 0.85 times 3.9), no measured ones.
+GEAR_RATIOS = tuple(np.geomspace(14.0, 3.3, 5).tolist())
 WHEEL_RADIUS_M = 0.3
 FIRINGS_PER_TURN = 2.0
 IDLE_HZ = 25.0
-REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 / 3.6, 20.0 / 3.6
-_KNOTS_M_S = np.linspace(-40.0, 40.0, 161)
+_KMH_M_S = 1.0 / 3.6
+REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 * _KMH_M_S, 20.0 * _KMH_M_S
+# Of the quadrature, towards the listener.
+_SPEED_CELL_M_S = 0.5
+_SPEEDS_M_S = np.arange(-5.0, 30.0 + _SPEED_CELL_M_S, _SPEED_CELL_M_S)
+_DECIBELS = 10.0 / np.log(10.0)  # A neper of power
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +152,7 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
     with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
     """
     per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
-    curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(_KNOTS_M_S)) for ratio in GEAR_RATIOS]
+    curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(_SPEEDS_M_S)) for ratio in GEAR_RATIOS]
     return _coupling(LINE_SPACING, curves, std_hz)
 
 
@@ -161,7 +165,7 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
     """
-    at = np.maximum(np.abs(_KNOTS_M_S), LOWEST_SPEED_M_S)
+    at = np.maximum(np.abs(_SPEEDS_M_S), LOWEST_SPEED_M_S)
     low = _octave_db(at, rolling=(85.7, 41.5), propulsion=(89.2, 7.2))
     high = _octave_db(at, rolling=(97.3, 32.5), propulsion=(84.2, 8.0))
     return _coupling("tyre_shape_db", [high - low], std_db)
@@ -181,7 +185,7 @@ def doppler_trajectory(std: float = 0.01) -> Coupling:
     >>> doppler_trajectory().expected([10.0]).round(3)
     array([[1.06]])
     """
-    ratio = (SPEED_OF_SOUND_M_S + _KNOTS_M_S) / (SPEED_OF_SOUND_M_S - _KNOTS_M_S)
+    ratio = (SPEED_OF_SOUND_M_S + _SPEEDS_M_S) / (SPEED_OF_SOUND_M_S - _SPEEDS_M_S)
     return _coupling("doppler_ratio", [ratio], std)
 
 
@@ -203,14 +207,15 @@ def car() -> Descriptor:
 
 
 def motorcycle() -> Descriptor:
-    """Return a motorcycle: faster, with an engine line of its own gearing left open.
+    """Return a motorcycle: as fast as a car, with an engine line of its own gearing left open.
 
     Returns
     -------
     Descriptor
         With the Doppler coupling only.
     """
-    return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0, (doppler_trajectory(),))
+    labels, couplings = ("motorcycle",), (doppler_trajectory(),)
+    return replace(car(), name="motorcycle", labels=labels, weight=0.1, couplings=couplings)
 
 
 def _octave_db(
@@ -219,11 +224,12 @@ def _octave_db(
     ratio = speed_m_s / REFERENCE_SPEED_M_S
     rolling_db = rolling[0] + rolling[1] * np.log10(ratio)
     propulsion_db = propulsion[0] + propulsion[1] * (ratio - 1.0)
-    return np.asarray(10.0 * np.log10(10.0 ** (rolling_db / 10.0) + 10.0 ** (propulsion_db / 10.0)))
+    total = np.logaddexp(rolling_db / _DECIBELS, propulsion_db / _DECIBELS)
+    return np.asarray(_DECIBELS * total)
 
 
 def _coupling(observable: str, curves: Sequence[FloatArray], std: float) -> Coupling:
-    knots, *rows = (tuple(values.tolist()) for values in (_KNOTS_M_S, *curves))
+    knots, *rows = (tuple(values.tolist()) for values in (_SPEEDS_M_S, *curves))
     return Coupling(observable, knots, tuple(rows), std)
 
 
@@ -270,9 +276,7 @@ class GroundedObservation:
     signature: Mapping[str, Observable] = field(default_factory=dict)
 
 
-_SPEEDS_M_S = np.linspace(-5.0, 30.0, 141)
-_AZIMUTHS_RAD = np.radians(np.arange(-90.0, 90.5, 1.0))
-_SPEED_CELL_M_S = 0.25
+_AZIMUTHS_RAD = np.linspace(-0.5 * pi, 0.5 * pi, 181)
 _AZIMUTH_CELL_RAD = float(np.radians(1.0))
 _RANGES_M = np.geomspace(5.0, 60.0, 24)
 

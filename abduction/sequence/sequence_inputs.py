@@ -9,19 +9,22 @@ import numpy as np
 
 from worldstate.ground.typing import FloatArray
 
-RECENT_HOPS, MEMORY_HOPS = 31, 81  # three seconds, eight, and the hop itself
-QUIET_HOPS = 600
+_SECOND = 10  # hops
+_HALF, _TWO, _THREE = _SECOND // 2, 2 * _SECOND, _SECOND + 2 * _SECOND
+_FOUR, _SIX = 2 * _TWO, 2 * _THREE
+RECENT_HOPS, MEMORY_HOPS = _THREE + 1, 2 * _FOUR + 1  # three seconds, eight, and the hop itself
+QUIET_HOPS = _SIX * _SECOND  # a minute
 # The street's own level is what the quietest fifth of the last minute stays below, its own evidence what half
 # of the minute does: another junction moves both, and a vehicle a few seconds long neither.
 QUIET_SHARE, USUAL_SHARE = 0.2, 0.5
-_HALF, _SECOND, _TWO, _THREE, _FOUR, _SIX = 5, 10, 20, 30, 40, 60
 # Groups of neighbouring bands, read as means over so many hops more. Behind a corner sound is dull: the
 # nearer a vehicle comes to the edge, the more of its high frequencies come round it, and they go first when
 # it has passed. At junctions left out, Brier skill at 3 s .265 without, .273 with the four levels above the
 # street's own, .293 with their changes, too; time to visible .756, .751, .727 of the constant's error.
 BANDS, _BAND_HOPS = 4, 3
 SIDES = ("left", "right")
-HOP_S = 0.1
+_UNKNOWN_HZ = 10.0  # Deviation of an approach rate of which nothing is known
+HOP_S = 1.0 / _SECOND
 
 
 _BANDS = tuple(f"band_{number}" for number in range(1, BANDS + 1))
@@ -57,8 +60,10 @@ COLUMNS = (
     *("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing"),
     *_BANDS,
 )
-_CHANGING, _HIGHEST, _LOUDNESS = 5, 3, 4
-_PROMINENCE, _RATE, _SPREAD, _BEARING = range(5, 9)
+_HIGHEST, _LOUDNESS, _PROMINENCE, _RATE, _SPREAD, _BEARING = map(
+    COLUMNS.index, COLUMNS[COLUMNS.index("level") : -BANDS]
+)
+_CHANGING = _LOUDNESS + 1
 _BAND_COLUMNS = slice(_BEARING + 1, _BEARING + 1 + BANDS)
 # What eight seconds are kept of: the level, both sides and the visible; the first three have a dip.
 _FOLLOWED = [_LOUDNESS, *range(_HIGHEST)]
@@ -124,7 +129,7 @@ def hop_columns(
         energy.mean(axis=1),
         np.log(prominence),
         np.where(refused, 0.0, looming_hz),
-        np.where(refused, 10.0, np.minimum(looming_std_hz, 10.0)),
+        np.where(refused, _UNKNOWN_HZ, np.minimum(looming_std_hz, _UNKNOWN_HZ)),
         np.where(np.isfinite(bearing_rad), bearing_rad, 0.0),
     ]
     bands = [part.mean(axis=1) for part in np.array_split(energy, BANDS, axis=1)]
@@ -203,8 +208,8 @@ def _remembered(whole: FloatArray) -> list[FloatArray]:
         HOP_S * (last - at),
         now[:1] - highest[:1],
         highest[1:],
-        now[3:] - highest[3:],
-        (now - dip)[:3],
+        now[_HIGHEST:] - highest[_HIGHEST:],
+        (now - dip)[:_HIGHEST],
         np.array([np.add.reduce(lean) / len(lean), lean[max(last - _FOUR, 0)]]),
     ]
 

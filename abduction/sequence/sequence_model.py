@@ -8,14 +8,15 @@ other side, no vehicle. With q the posterior of the groups at the share of hazar
           \hat T = \frac{\sum_{g\ \mathrm{coming}} q_g t_g}{\sum_{g\ \mathrm{coming}} q_g}
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 import numpy as np
 
-from worldstate.ground.checks import freeze_arrays
+from worldstate.ground import TINY
+from worldstate.ground.checks import freeze_arrays, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import Layout
+from worldstate.ground.serialisation import ADDED, Layout, Probability
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 
 from .sequence_inputs import INPUTS, SIDES, sequence_inputs
@@ -153,10 +154,10 @@ HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
 LONGEST_S = 5.0
 STATED = COMING_S.index(LONGEST_S) + 1  # So many groups
 _HORIZONS = [COMING_S.index(end_s) for end_s in HORIZONS_S]
-_LEVELS = np.array([[0.05], [0.95]])
+TAIL = 0.05  # Of either end: intervals hold nine of ten
+_LEVELS = np.array([[TAIL], [1.0 - TAIL]])
 SMOOTHED_HOPS, HELD_HOPS = 3, 10
 _OTHER = GROUPS.index("other")
-_SMALLEST = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,13 +180,40 @@ class SequencePosterior:
         """
         mass = self.groups[..., :STATED]
         edges = np.array([0.0, *COMING_S[:STATED]])
-        share = mass / np.maximum(mass.sum(axis=-1, keepdims=True), 1e-300)
+        share = mass / np.maximum(mass.sum(axis=-1, keepdims=True), TINY)
         mean = share @ (0.5 * (edges[1:] + edges[:-1]))
         below = np.cumsum(share, axis=-1) - share
         # Of every bin the part that lies below the level, linear within the bin.
-        parts = (_LEVELS - below[..., None, :]) / np.maximum(share[..., None, :], 1e-12)
+        parts = (_LEVELS - below[..., None, :]) / np.maximum(share[..., None, :], TINY)
         low, high = np.moveaxis(np.clip(parts, 0.0, 1.0) @ np.diff(edges), -1, 0)
         return np.stack([np.maximum(low - self.margin_s, 0.0), mean, high + self.margin_s], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmPromise:
+    """Alarms of hazard-free streams at one threshold of a curve; its intervals are for other junctions.
+
+    Parameters
+    ----------
+    onsets_per_hour : float
+        Alarms that began, the most at this threshold or a higher one.
+    onsets_low, onsets_high : float
+        95 % interval of the mean rate at four other junctions; at one alone it differs more.
+    alpha, alpha_low, alpha_high : float
+        Share of the hops in alarm, with its interval.
+
+    Examples
+    --------
+    >>> AlarmPromise(25.0, 17.5, 36.2, 0.012, 0.008, 0.017).alpha
+    0.012
+    """
+
+    onsets_per_hour: float
+    onsets_low: float
+    onsets_high: float
+    alpha: Probability
+    alpha_low: Probability
+    alpha_high: Probability
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,12 +221,9 @@ class SequenceAlarm:
     """When a side is in alarm: log-odds of coming into view within three seconds, smoothed and held."""
 
     threshold_nats: float  # Of the mean log-odds of .3 s
-    onsets_per_hour: float  # That hazard-free streams were allowed when it was set
-
-    def raised(self, posterior: SequencePosterior) -> BoolArray:
-        """Return whether each side is in alarm at every hop of a stream, shape (n, 2)."""
-        deciding = self.deciding(smoothed_log_odds(posterior), posterior.groups)
-        return np.stack([held(side) for side in (deciding >= self.threshold_nats).T], axis=1)
+    onsets_per_hour: float  # Budget: what was asked, or the curve's promise if a share was asked
+    asked_alpha: Probability | None = field(default=None, metadata=ADDED)  # In place of a budget
+    promise: AlarmPromise | None = field(default=None, metadata=ADDED)  # None if no curve was measured
 
     def deciding(
         self, log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
@@ -223,16 +248,21 @@ class SequenceAlarm:
         [[0.1, -1.0]]
         """
         here, elsewhere = groups[..., : len(COMING_S)].sum(axis=-1), groups[..., _OTHER]
-        apart = np.log(np.maximum(here, _SMALLEST)) - np.log(np.maximum(elsewhere, _SMALLEST)) - learned_nats
+        apart = np.log(np.maximum(here, TINY)) - np.log(np.maximum(elsewhere, TINY)) - learned_nats
         likelier = log_odds >= log_odds.max(axis=-1, keepdims=True)
         # One that is exactly as likely alone as here is not named.
-        least = self.threshold_nats + np.where(apart > 0.0, apart, np.minimum(apart, -_SMALLEST))
+        least = self.threshold_nats + np.where(apart > 0.0, apart, np.minimum(apart, -TINY))
         return np.asarray(np.where(likelier, log_odds, np.minimum(log_odds, least)))
+
+
+def _last(rates: FloatArray, most: float) -> int:
+    """Return the last point whose rate is not above a number but for what was rounded."""
+    return int(np.searchsorted(rates, most * (1.0 + TINY), side="right")) - 1
 
 
 def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
     """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
-    within = np.clip(posterior.within()[..., HORIZONS_S.index(3.0)], _SMALLEST, 1.0 - _SMALLEST)
+    within = np.clip(posterior.within()[..., -1], TINY, 1.0 - TINY)
     log_odds = np.log(within) - np.log1p(-within)
     recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
     return np.asarray(log_odds[np.maximum(recent, 0)].mean(axis=1))
@@ -252,6 +282,97 @@ def held(over: BoolArray, hops: int = HELD_HOPS) -> BoolArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class AlarmCurve:
+    r"""From a budget to the threshold, measured on hazard-free streams: points of ever lower thresholds.
+
+    .. math:: \gamma(b) = \min \{ \gamma_i : r_i \le b \}, \qquad
+              \gamma(\alpha) = \min \{ \gamma_i : \alpha_i \le \alpha \}
+
+    with r the onsets an hour, the most at a threshold or a higher one, and the share of hops in alarm.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the arrays differ in length, a threshold does not fall or a rate does.
+
+    Examples
+    --------
+    >>> low, high = ([1.0, 3.0, 9.0], [0.0, 0.0, 0.02]), ([9.0, 17.0, 38.0], [0.01, 0.02, 0.08])
+    >>> points = [2.0, 0.0, -1.0], [4.0, 8.0, 20.0], low[0], high[0], [0.0, 0.01, 0.04], low[1], high[1]
+    >>> curve = AlarmCurve(*points, hours=2.0, least_onsets=3.0)
+    >>> curve.for_budget(10.0).threshold_nats, curve.for_alpha(0.04).onsets_per_hour
+    (0.0, 20.0)
+    >>> curve.for_budget(1.0)
+    Traceback (most recent call last):
+        ...
+    worldstate...InvalidArgumentError: budget: expected 4 to 20 onsets an hour, ... supports, got 1
+    """
+
+    threshold_nats: FloatArray  # shape (points,)
+    onsets_per_hour: FloatArray  # shape (points,): The most so far: alarms that grow together count as one
+    onsets_low: FloatArray  # shape (points,): 95 % interval at four other junctions
+    onsets_high: FloatArray  # shape (points,)
+    alpha: FloatArray  # shape (points,): Share of the hops in alarm
+    alpha_low: FloatArray  # shape (points,)
+    alpha_high: FloatArray  # shape (points,)
+    hours: float  # Of hazard-free streams
+    least_onsets: float  # A budget is too small if fewer are expected in these hours: chance would decide
+
+    def __post_init__(self) -> None:
+        thresholds, *names = (one.name for one in fields(self)[:-2])
+        freeze_arrays(self, **dict.fromkeys([thresholds, *names], (len(self.threshold_nats),)))
+        if not self.threshold_nats.size or (np.diff(self.threshold_nats) >= 0.0).any():
+            raise InvalidArgumentError(f"{thresholds}: expected thresholds that fall")
+        for name in names:
+            if (np.diff(getattr(self, name), prepend=0.0) < 0.0).any():
+                raise InvalidArgumentError(f"{name}: expected numbers from 0 on that do not fall")
+        in_range("hours", self.hours, 0.0, np.inf, open_low=True)
+        in_range("alpha_high", self.alpha_high[-1], 0.0, 1.0)
+
+    def _promise(self, point: int) -> AlarmPromise:
+        return AlarmPromise(*(float(getattr(self, one.name)[point]) for one in fields(AlarmPromise)))
+
+    def for_budget(self, onsets_per_hour: float) -> SequenceAlarm:
+        """Return the alarm with the lowest threshold that has no more onsets an hour than this.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the hours of the curve expect fewer than its least onsets, or no point has as many.
+        """
+        least = self.least_onsets / self.hours
+        self._check("budget", onsets_per_hour, self.onsets_per_hour, least, "onsets an hour")
+        return self.default(onsets_per_hour)
+
+    def default(self, onsets_per_hour: float) -> SequenceAlarm:
+        """Return the alarm for the budget that a model file is made with, however few hours it has."""
+        point = max(_last(self.onsets_per_hour, onsets_per_hour), 0)
+        return SequenceAlarm(float(self.threshold_nats[point]), onsets_per_hour, None, self._promise(point))
+
+    def for_alpha(self, alpha: float) -> SequenceAlarm:
+        """Return the alarm with the lowest threshold at which no more of the hazard-free hops are in alarm.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the curve has fewer than its least onsets at that share, or no point has as much.
+        """
+        too_few = (1.0 - 2.0 * TINY) * self.least_onsets / self.hours
+        known = self.alpha[_last(self.onsets_per_hour, too_few) + 1 :]
+        least = float(known.min(initial=self.alpha[-1]))
+        self._check("alpha", alpha, self.alpha, least, "of the hops")
+        point = _last(self.alpha, alpha)
+        promise = self._promise(point)
+        return SequenceAlarm(float(self.threshold_nats[point]), promise.onsets_per_hour, alpha, promise)
+
+    def _check(self, name: str, asked: float, values: FloatArray, least: float, unit: str) -> None:
+        least, most = max(least, float(values[0])), float(values[-1])
+        if not least <= asked <= most:
+            known = f"{least:.3g} to {most:.3g} {unit}, which the model's curve supports"
+            raise InvalidArgumentError(f"{name}: expected {known}, got {asked:g}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SequenceModel:
     """Trees over the groups, the shares that they were trained at, and how far times may be off."""
 
@@ -260,8 +381,9 @@ class SequenceModel:
     trees: BoostedTrees
     share: FloatArray  # shape (groups,): Of hops and sides of the streams that it was trained on
     margin_s: float = 0.0  # Beyond the trees' own interval, so that it holds nine of ten
-    alarm: SequenceAlarm | None = None  # Before one is set
+    alarm: SequenceAlarm | None = None  # That decides; of a file the one that is taken if none is asked for
     inputs: tuple[str, ...] = INPUTS  # The first of them; a model learned before others were added has fewer
+    curve: AlarmCurve | None = field(default=None, metadata=ADDED)  # Files of 0.3 hold one alarm alone
 
     def __post_init__(self) -> None:
         freeze_arrays(self, share=(len(GROUPS),))
@@ -274,6 +396,28 @@ class SequenceModel:
         if read > len(self.inputs) or groups != len(GROUPS):
             expected = f"{len(self.inputs)} inputs and {len(GROUPS)} groups"
             raise InvalidArgumentError(f"trees: expected {expected}, got {read} and {groups}")
+
+    def asking(self, budget: float | None = None, alpha: float | None = None) -> "SequenceModel":
+        """Return the model with the alarm for a budget, onsets an hour, or a share of hazard-free hops.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If both are given, or the curve does not support it; without a curve the alarm of the file has the
+            only budget.
+        """
+        if budget is not None and alpha is not None:
+            raise InvalidArgumentError("budget, alpha: expected one of them, each sets the threshold")
+        if self.curve is not None and alpha is not None:
+            return replace(self, alarm=self.curve.for_alpha(alpha))
+        if self.curve is not None and budget is not None:
+            return replace(self, alarm=self.curve.for_budget(budget))
+        only = None if self.alarm is None else self.alarm.onsets_per_hour
+        if alpha is None and budget in (None, only):
+            return self
+        name, held = "budget" if alpha is None else "alpha", "none" if only is None else f"only {only:g}"
+        problem = f"expected a model file with a curve of budgets, this one holds {held} onsets an hour"
+        raise InvalidArgumentError(f"{name}: {problem}: `worldstate model make` writes one with a curve")
 
     def posterior(self, columns: FloatArray) -> SequencePosterior:
         """Return what is believed at every hop of a stream, `hop_columns`, by what was heard until then."""

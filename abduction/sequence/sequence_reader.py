@@ -10,11 +10,11 @@ from worldstate.ground.checks import freeze_arrays
 from worldstate.ground.serialisation import ADDED, Count
 
 from . import sequence_inputs as inputs
-from .sequence_model import GROUPS, SequenceAlarm, SequenceModel
+from .sequence_model import GROUPS, HELD_HOPS, SequenceAlarm, SequenceModel
 from .street_sides import StreetListener
 
 # Before, what is usual in a street is what was heard just now.
-LEAST_HOPS = 10
+LEAST_HOPS = HELD_HOPS
 TOO_FEW = NotUsable(f"less than {LEAST_HOPS} hops of evidence")
 
 
@@ -81,7 +81,7 @@ class SequenceReading:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, groups=(len(inputs.SIDES), len(GROUPS)), share=(len(GROUPS),))
-        if (self.groups < 0.0).any() or not np.allclose(self.groups.sum(axis=1), 1.0, atol=1e-6):
+        if (self.groups < 0.0).any() or not np.allclose(self.groups.sum(axis=1), 1.0):
             raise InvalidArgumentError("groups: expected probabilities that sum to one on each side")
         if (self.share <= 0.0).any():
             raise InvalidArgumentError(f"share: expected positive numbers, got {self.share.min()}")

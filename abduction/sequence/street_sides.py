@@ -15,10 +15,10 @@ from functools import partial
 
 import numpy as np
 
-from worldstate.ground import FloatArray, InvalidArgumentError
+from worldstate.ground import TINY, FloatArray, InvalidArgumentError
 from worldstate.ground.checks import freeze_arrays
 
-from .sequence_inputs import SIDES
+from .sequence_inputs import RECENT_HOPS, SIDES
 from .sequence_model import COMING_S, GROUPS
 
 # Neighbouring azimuths of the spatial spectrum together, 15 degrees of half a circle.
@@ -26,7 +26,6 @@ SECTORS = 12
 # The sequence has read the same sound, and windows overlap: none counts for more.
 _MOST_NATS = 3.0
 _COMING, _OTHER = len(COMING_S), GROUPS.index("other")
-_SMALLEST = 1e-12
 
 
 def arrival_pattern(feature: FloatArray) -> FloatArray:
@@ -77,10 +76,10 @@ class StreetSides:
         told = self.log_ratio(feature)
         coming, other = groups[..., :_COMING], groups[..., _OTHER]
         here = coming.sum(axis=-1)
-        odds = np.log(here + _SMALLEST) - np.log(other + _SMALLEST) + np.stack([told, -told], axis=-1)
+        odds = np.log(here + TINY) - np.log(other + TINY) + np.stack([told, -told], axis=-1)
         moved = (here + other) / (1.0 + np.exp(-odds))
         found = groups.copy()
-        found[..., :_COMING] = coming * (moved / (here + _SMALLEST))[..., None]
+        found[..., :_COMING] = coming * (moved / (here + TINY))[..., None]
         found[..., _OTHER] = here + other - found[..., :_COMING].sum(axis=-1)
         return found
 
@@ -89,9 +88,6 @@ class StreetSides:
 # hops to .859, .878, .876 and .877 (version 0.2).
 _DRAWN_TOGETHER, _DOUBT = 0.5, 0.5
 _ROUND = 0.1
-# Below, both means are the same within rounding.
-_LEAST_WEIGHT = 0.1
-_LEAST_SCATTER = 1e-9  # Of patterns that never differ
 _EMPTY = (0.0,) * SECTORS
 
 
@@ -160,7 +156,8 @@ class SidePatterns:
     def sides(self) -> StreetSides | None:
         """Return what they say of windows, None as long as one arm was hardly heard."""
         weights, sums = np.array(self.weights), np.array(self.sums)
-        if weights.min() < _LEAST_WEIGHT:
+        # Below, both means are the same within rounding.
+        if weights.min() < _ROUND:
             return None
         usual = (sums / weights[:, None]).mean(axis=0)
         means = (sums + _DRAWN_TOGETHER * usual) / (weights + _DRAWN_TOGETHER)[:, None]
@@ -168,7 +165,7 @@ class SidePatterns:
         crossed = sums.T @ means
         about = np.array(self.squares) - crossed - crossed.T + (means.T * weights) @ means
         scatter = about / weights.sum()
-        even = max(float(np.trace(scatter)) / SECTORS, _LEAST_SCATTER)
+        even = max(float(np.trace(scatter)) / SECTORS, TINY)
         rounded = (1.0 - _ROUND) * scatter + _ROUND * even * np.eye(SECTORS)
         direction = np.linalg.solve(rounded, means[0] - means[1])
         offset, certainty = -0.5 * direction @ means.sum(axis=0), 1.0 / (1.0 + _DOUBT * (1.0 / weights).sum())
@@ -176,7 +173,7 @@ class SidePatterns:
 
 
 # A vehicle that comes is heard for some three seconds; with one in the other arm the sound has no known side.
-HEARD_HOPS = 30
+HEARD_HOPS = RECENT_HOPS - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -339,7 +339,7 @@ class EnsembleModel:
             raise InvalidArgumentError(f"experts: expected 1 to {MOST_EXPERTS}, got {len(self.experts)}")
         known = (len(checked_classes(self.classes)),)
         freeze_arrays(self, class_prior=known, empty=(self.n_features,))
-        if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):
+        if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0):
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")

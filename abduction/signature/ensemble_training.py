@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import InvalidArgumentError, finite_array
+from worldstate.ground import TINY, InvalidArgumentError, finite_array
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
@@ -19,6 +19,7 @@ from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, m
 # to 3 and parts from .15 to .35 the areas of real junctions left out stay within .002 and the side within
 # .03; without such a part the side is right in .85 of the windows instead of .93, with half of it in .84.
 SIMULATED_WEIGHT, OTHER_SIDE = 1.0, 0.25
+_RIDGE = 1e-3
 # Part of a real window's weight that is compared with what was heard of its site before it: more of it costs
 # the worst junction of a standing ego .01 of its AUROC, none leaves a moving one .01 lower.
 HEARD_PART = 0.25
@@ -39,9 +40,9 @@ class Recipe:
 
 # Chosen on eight junctions, every choice judged on a junction it was not made on: lab/NOTES.md.
 RECIPES = (
-    Recipe("mean", 1e-3),
-    Recipe("median", 1e-3),
-    Recipe("quiet", 1e-3),
+    Recipe("mean", _RIDGE),
+    Recipe("median", _RIDGE),
+    Recipe("quiet", _RIDGE),
     Recipe(ensemble.SHAPE, 1e-1),
     Recipe(ensemble.SHAPE_CHANGE, 1e-2),
 )
@@ -216,7 +217,7 @@ def checked_labels(y: ArrayLike, n: int) -> TextArray:
     present = set(labels.tolist())
     hazards = {CLASSES[LEFT], CLASSES[RIGHT]}
     if not present <= set(CLASSES) or not {CLASSES[FRONT], CLASSES[NONE]} <= present or not present & hazards:
-        raise InvalidArgumentError(f"y: expected the classes {CLASSES}, got {sorted(present)[:8]}")
+        raise InvalidArgumentError(f"y: expected the classes {CLASSES}, got {sorted(present)}")
     return labels
 
 
@@ -302,4 +303,4 @@ def standardisation(inputs: FloatArray, weights: FloatArray | None = None) -> tu
     mean = np.average(inputs, axis=0, weights=weights)
     deviation = np.sqrt(np.average((inputs - mean) ** 2, axis=0, weights=weights))
     # A column that never changes carries nothing; leave it as it is.
-    return mean, np.where(deviation > 10 * np.finfo(float).eps, deviation, 1.0)
+    return mean, np.where(deviation > TINY, deviation, 1.0)

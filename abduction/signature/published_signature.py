@@ -139,7 +139,7 @@ class SignatureModel:
         freeze_arrays(self, intercepts=(pairs,), slopes=(pairs,), offsets=(pairs,), class_prior=known)
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
-        if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):
+        if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0):
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
 
     @property

@@ -17,7 +17,7 @@ from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 
 CLASSES = ("front", "left", "none", "right")
 DIRECTIONS = ("left", "right")
-FRONT, LEFT, NONE, RIGHT = range(4)
+FRONT, LEFT, NONE, RIGHT = range(len(CLASSES))
 # Columns of the posteriors in the order of the explanations: hidden left, hidden right, visible, none.
 EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
 

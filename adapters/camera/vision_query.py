@@ -18,7 +18,7 @@ from worldstate.abduction.co_evidence import (
     Unqueried,
     default_miss_rates,
 )
-from worldstate.core.filter import MOST_BOXES
+from worldstate.core.memory import MOST_BOXES
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle

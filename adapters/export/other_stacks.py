@@ -70,7 +70,7 @@ def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[
     and a hidden one comes towards the axis of the ego at the pace of its occluder, on each of its sides.
     """
     paces = {occluder.direction: occluder.pace_hz for occluder in state.context.occluders}
-    coming = {cue.direction: (cue.within or {}).get("3") for cue in state.cues}
+    coming = {cue.direction: (cue.within or {}).get("3") for cue in state.cues if cue.direction}
     moving = (part for one in state.entities if one.moving for part in one.on_each_side())
     for entity in moving:
         within = coming.get(entity.direction or "") if entity.status == "hidden" else None
@@ -204,7 +204,7 @@ def autoware_lines(
 
 def likeliest_label(one: LaneObject) -> int:
     """Return Autoware's number of the likeliest known class, 0 where none is known."""
-    known = [said for said in one.entity.classification if LABELS.get(said.label, 0)]
+    known = [said for said in one.entity.classification or () if LABELS.get(said.label, 0)]
     return LABELS[max(known, key=lambda said: said.probability).label] if known else 0
 
 
@@ -244,7 +244,7 @@ def _object(one: LaneObject) -> dict[str, Any]:
 
 def _kinds(entity: Entity) -> list[tuple[str, float]]:
     """Return the classes with their probabilities, the likeliest first; what is left to one is unknown."""
-    told = [(said.label, said.probability) for said in entity.classification]
+    told = [(said.label, said.probability) for said in entity.classification or ()]
     left = 1.0 - sum(probability for _, probability in told)
     return sorted(told + [("unknown", left)] * (left > 1e-6), key=lambda kind: -kind[1])
 

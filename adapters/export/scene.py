@@ -276,8 +276,9 @@ def sector_of(
 
     Examples
     --------
-    >>> sector_of(1.0, 0.1, None)
-    (0.8355, 1.1645)
+    >>> right_rad, left_rad = sector_of(1.0, 0.1, None)
+    >>> round(right_rad, 3), round(left_rad, 3)
+    (0.836, 1.164)
     """
     half_rad = NINE_OF_TEN * std_rad
     return sector_rad or (azimuth_rad - half_rad, azimuth_rad + half_rad)
@@ -298,9 +299,10 @@ def label_of(entity: Entity) -> str:
     >>> label_of(Entity("id", "hidden", 0.9, 0.8, 0.8, azimuth_std_rad=0.3, created_ns=0, updated_ns=0))
     'hidden .90'
     """
-    likeliest = max(entity.classification, key=lambda one: one.probability, default=None)
-    kind = f" {likeliest.label}" if likeliest is not None and likeliest.label != "unknown" else ""
-    return f"{entity.status}{kind} {_short(entity.existence_probability)}"
+    likeliest = max(entity.classification or (), key=lambda one: one.probability, default=None)
+    kind = likeliest.label if likeliest is not None and likeliest.label != "unknown" else None
+    told = entity.status, kind, _short(entity.existence_probability)
+    return " ".join(one for one in told if one is not None)
 
 
 def _ego() -> SceneArrow:
@@ -327,15 +329,19 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
     """Draw the risk of a side, the denser the higher, and in words what comes within three seconds."""
     sector_rad = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
     raised = cue.advisory is not None
-    color = Rgba(*(_DECISION if raised else _HIDDEN), 0.05 + 0.5 * cue.risk)
-    shape = _sector(sector_rad, CUE_M, color, "cue")
-    said = f"{cue.direction}: risk {_short(cue.risk)}"
+    color = Rgba(*(_DECISION if raised else _HIDDEN), 0.05 + 0.5 * (cue.risk or 0.0))
+    shape = () if cue.risk is None else (_sector(sector_rad, CUE_M, color, "cue"),)
+    said = [] if cue.risk is None else [f"risk {_short(cue.risk)}"]
     if cue.within is not None and "3" in cue.within:
-        said += f", in 3 s {_short(cue.within['3'])}"
-    said += (" ADVISORY" if raised else "") + ("" if state.calibrated else ", not calibrated")
-    text = _text(cue.azimuth_rad, CUE_M + 2.0, said, _DECISION if raised else _GREY)
-    pairs = _pairs(risk=cue.risk, confidence=cue.confidence, advisory=raised, within=cue.within)
-    return _item(state, f"cue {cue.direction}", metadata=pairs, triangles=(shape,), texts=(text,))
+        said.append(f"in 3 s {_short(cue.within['3'])}")
+    said += ["ADVISORY"] * raised + [f"not usable: {', '.join(cue.why_not)}"] * (not cue.usable)
+    side = cue.direction or "side unknown"
+    text = _text(cue.azimuth_rad, CUE_M + 2.0, f"{side}: {', '.join(said)}", _DECISION if raised else _GREY)
+    pairs = _pairs(
+        risk=cue.risk, confidence=cue.confidence, advisory=raised, within=cue.within, usable=cue.usable,
+        why_not=", ".join(cue.why_not) or None,
+    )  # fmt: skip
+    return _item(state, f"cue {side}", metadata=pairs, triangles=shape, texts=(text,))
 
 
 def _entity(state: WorldState, entity: Entity) -> SceneItem:
@@ -355,7 +361,7 @@ def _entity(state: WorldState, entity: Entity) -> SceneItem:
         existence_probability=entity.existence_probability,
         hidden_probability=entity.hidden_probability,
         time_to_visible_s=entity.time_to_visible_s,
-        **{f"P({one.label})": one.probability for one in entity.classification},
+        **{f"P({one.label})": one.probability for one in entity.classification or ()},
     )
     text = _text(entity.azimuth_rad, SECTOR_M + 2.0, label_of(entity), color)
     return _item(

@@ -16,6 +16,7 @@ from worldstate.abduction.road_users import DomainGuard, RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.ensemble import AnySignature
 from worldstate.abduction.signature.published_signature import ModelDomain
+from worldstate.belief.street_model import StoredStreet, StreetModel
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Via, encode
 
@@ -77,11 +78,14 @@ class Model:
     signature : SignatureModel or EnsembleModel
         From features to likelihoods.
     policies : CueingPolicies
-        Threshold, sustained rule and risk map for each budget.
+        Threshold and risk map for each budget.
     provenance : Provenance
         Where it comes from.
     sequence : SequenceModel, optional
         From seconds of the signature's evidence to the sides a vehicle comes from, and when.
+    street : StreetModel, optional
+        Numbers of the belief about the approach sides; None of files of a version before 1.7, which are read
+        with those that ship.
 
     Examples
     --------
@@ -91,7 +95,7 @@ class Model:
     """
 
     LAYOUT: ClassVar = Layout(
-        "worldstate.Model", "1.6.0", order="provenance signature policies sequence guard road_users"
+        "worldstate.Model", "1.7.0", order="provenance signature policies sequence guard road_users street"
     )
 
     signature: AnySignature
@@ -100,6 +104,7 @@ class Model:
     sequence: SequenceModel | None = field(default=None, metadata=ADDED)
     guard: DomainGuard | None = field(default=None, metadata=ADDED)
     road_users: RoadUserModel | None = field(default=None, metadata=ADDED)
+    street: StoredStreet | None = field(default=None, metadata=ADDED)
 
     @property
     def domain(self) -> ModelDomain | None:
@@ -145,7 +150,7 @@ def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> M
     shipped = _shipped("moving_model.json" if moving_ego else "default_model.json")
     # All else of it is read-only.
     figures = dict(shipped.provenance.figures)
-    return replace(shipped, provenance=replace(shipped.provenance, figures=figures))
+    return replace(shipped, provenance=replace(shipped.provenance, figures=figures), street=StreetModel())
 
 
 def _largest(value: Any) -> float:
@@ -154,7 +159,7 @@ def _largest(value: Any) -> float:
         return float(np.max(np.abs(value), initial=0.0))
     parts = value if isinstance(value, tuple) else ()
     if is_dataclass(value):
-        parts = tuple(getattr(value, one.name) for one in fields(value))
+        parts = tuple(getattr(value, one.name) for one in fields(value) if one.init)
     return max(map(_largest, value.values() if isinstance(value, Mapping) else parts), default=0.0)
 
 

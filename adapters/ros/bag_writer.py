@@ -1,6 +1,7 @@
 """Bags of ROS 2 written: a recording as a vehicle would have recorded it, and world-states."""
 
 import heapq
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import itemgetter
@@ -260,16 +261,19 @@ def risk_advisories(state: WorldState) -> dict[str, Any]:
 
 def _advisory(cue: RiskCue) -> dict[str, Any]:
     out = cue.advisory
-    within = cue.within or {}
+    within, unknown = cue.within or {}, math.nan
+    causes = cue.hypotheses
     return {
-        "direction": cue.direction,
+        "direction": cue.direction or "",
+        "usable": cue.usable,
+        "why_not": list(cue.why_not),
         "azimuth": cue.azimuth_rad,
         "azimuth_std": cue.azimuth_std_rad,
-        "risk": cue.risk,
-        "confidence": cue.confidence,
-        "hidden": cue.hypotheses.hidden,
-        "visible": cue.hypotheses.visible,
-        "none": cue.hypotheses.none,
+        "risk": unknown if cue.risk is None else cue.risk,
+        "confidence": unknown if cue.confidence is None else cue.confidence,
+        "hidden": unknown if causes is None else causes.hidden,
+        "visible": unknown if causes is None else causes.visible,
+        "none": unknown if causes is None else causes.none,
         "raised": out is not None,
         "since": time_of(0 if out is None else out.since_ns),
         "valid_until": time_of(0 if out is None else out.valid_until_ns),

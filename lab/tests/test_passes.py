@@ -100,8 +100,10 @@ def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
     said = np.full((*groups.shape, len(GROUPS)), 0.2 / (len(GROUPS) - 1))
     np.put_along_axis(said, groups[..., None], 0.8, -1)
     said = np.concatenate([np.repeat(said[:1], round(lag_s * 10), axis=0), said])[: len(groups)]
+    # As often in view as vehicles that come at that rate are for three seconds each.
     share = np.full(len(GROUPS), 0.02)
-    share[GROUPS.index("none")] = 1.0 - 0.02 * (len(GROUPS) - 1)
+    share[GROUPS.index("seen")] = 0.24
+    share[GROUPS.index("none")] = 1.0 - 0.24 - 0.02 * (len(GROUPS) - 2)
     detections = stream_detections(made_up, np.random.default_rng(1))
     vision = VisionQuery(PinholeCamera.ovad(), detections, keep=EVERYBODY)
     silent, unasked = NotUsable("not scripted"), Unqueried("no camera")

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
 
-from worldstate.commissioning.stream_outcomes import visible_errors
+from worldstate.commissioning.stream_exam import visible_errors
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import wrap_angle
 

@@ -17,6 +17,8 @@ from worldstate.adapters.files.model_file import (
     read_model,
     save_model,
 )
+from worldstate.belief.street_model import Number, StreetModel, StreetNumbers
+from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, SchemaVersionError, WorldstateError
 from worldstate.ground.serialisation import decode, encode
 
@@ -69,6 +71,18 @@ def replaced(path, value):
 PATHS = [path for path in paths(DEFAULT) if path]
 
 
+def test_a_tree_that_asks_nothing_is_read_from_a_file(tmp_path):
+    trees = read_model().sequence.trees
+    alone = {name: np.array(getattr(trees, name)[:3]) for name in ("yes", "no", "split", "threshold")}
+    alone["yes"][0] = alone["no"][0] = np.arange(alone["yes"].shape[1])
+    few = {name: getattr(trees, name)[:3] for name in ("value", "tree_class")}
+    model = published()
+    sequence = replace(model.sequence, trees=replace(trees, **alone, **few))
+    save_model(tmp_path / "model.json", replace(model, sequence=sequence))
+    read = read_model(tmp_path / "model.json").sequence.trees
+    np.testing.assert_array_equal(read.yes, alone["yes"])
+
+
 def test_the_default_model_ships_and_says_where_it_comes_from():
     model = read_model()
     assert isinstance(model.signature, EnsembleModel)
@@ -106,6 +120,36 @@ def test_written_and_read_back_to_the_bit(tmp_path):
     assert encode(again) == DEFAULT
     X = np.random.default_rng(0).random((5, 60))
     np.testing.assert_array_equal(again.signature.predict_proba(X), published().signature.predict_proba(X))
+
+
+def test_the_numbers_of_the_belief_come_back_with_their_sources(tmp_path):
+    fitted = Number(0.4, "T_l", "s", "fitted", "likelihood of ten streams")
+    street = StreetModel.of(StreetNumbers({"look_s": fitted}))
+    save_model(tmp_path / "street.json", replace(read_model(), street=replace(street, works=0.9)))
+    back = read_model(tmp_path / "street.json").street
+    assert back == replace(StreetModel(), look_s=0.4, works=0.9)
+    assert back.described["look_s"] == fitted and back.described["works"].origin == "given"
+    assert back.described["fails_s"] == StreetModel().described["fails_s"]
+    with pytest.raises(InputFileError, match="look_s: expected a number in 's'"):
+        read(DEFAULT | {"street": encode(StreetNumbers({"look_s": replace(fitted, unit="ms")}))})
+
+
+def test_a_file_of_an_earlier_version_has_no_street_model_and_is_listened_to_with_the_one_that_ships():
+    data = {key: value for key, value in DEFAULT.items() if key != "street"}
+    assert read(data).street is None
+    assert WorldFilter().settings.street == StreetModel() == read_model().street
+
+
+@given(st.dictionaries(st.sampled_from(sorted(StreetModel().described)), st.floats(0.01, 0.9), min_size=1))
+@settings(max_examples=20, deadline=None)
+def test_a_checkpoint_holds_the_numbers_of_its_street(values):
+    now = WorldFilter()
+    now = replace(now, settings=replace(now.settings, street=StreetModel(**values)))
+    back = WorldFilter.from_dict(json.loads(json.dumps(now.to_dict())))
+    assert back.settings.street == now.settings.street
+    assert {name for name, one in back.settings.street.described.items() if one.origin == "given"} <= {
+        *values
+    }
 
 
 def test_unknown_keys_are_ignored_and_another_major_version_is_not():

@@ -86,7 +86,10 @@ def rates() -> dict[str, float]:
         ({"arm": [LEFT, RIGHT]}, "expected keys among"),
         ({"arms": [LEFT, {**RIGHT, "speed": 12.0}]}, r"context.arms\[1\]: expected keys among .*\['speed'\]"),
         ({"rates": {**rates(), "arrivals_hz": 0.01}}, r"context.rates: expected keys among .*'arrivals_hz'"),
-        ({"arms": [LEFT]}, "priors for"),
+        (
+            {"arms": [{**LEFT, "direction": one} for one in "abcd"]},
+            "expected at most 3 approach sides, got 4",
+        ),
         ({"arms": [LEFT, LEFT]}, r"context\.arms: expected different directions, got \['left', 'left'\]"),
         ({"arms": []}, r"context\.arms: expected different"),
         (

@@ -21,6 +21,7 @@ from worldstate.adapters.acoustic import AcousticAdapter, asked_again
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks, heard_as
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -109,7 +110,7 @@ def test_what_is_heard_is_what_the_camera_is_asked_for_and_the_entity_is(
     assert world.memory is not None
     (track,) = world.memory.tracks.rows()
     seen = Tracks.of([replace(track, last_seen_ns=1, labels=(("car", 0.9),))])
-    assert heard_as(seen, 0, measured[-1].kinds) == (("car", 0.9),)
+    assert heard_as(seen, 0, measured[-1].kinds, StreetModel()) == (("car", 0.9),)
 
 
 def test_a_foreign_sound_is_of_no_kind_and_a_siren_is_of_its_own() -> None:

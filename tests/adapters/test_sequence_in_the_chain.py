@@ -1,5 +1,6 @@
 """A model file with a sequence, from sound to snapshot: as streams on disk say it, across a checkpoint."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sequence import sequence_model
 
-from worldstate import Context, MicrophoneArray
+from worldstate import Context, MicrophoneArray, WorldState
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
 from worldstate.abduction.road_users import neutral
 from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
-from worldstate.abduction.sequence.sequence_model import SequenceAlarm
+from worldstate.abduction.sequence.sequence_model import AlarmCurve, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.ensemble import EnsembleModel, Expert, SiteReference
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
@@ -28,6 +29,8 @@ from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.commissioning.commission import stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.frontend.approach.looming import Looming
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.odometry import Odometry
 from worldstate.operations.recordings.hop_table import HopTable
@@ -221,3 +224,81 @@ def test_a_model_that_states_no_times_says_so(folder: Path) -> None:
     state = next(listen_steps(open_source(folder / "sound.wav", model=plain))).state
     assert state.no_sequence is not None and "model make" in state.no_sequence.reason
     assert {cue.within for cue in state.cues} == {None}
+
+
+def curved(folder: Path) -> Model:
+    """Return the model with a curve of budgets whose thresholds lie among the log-odds of its sound."""
+    model = read_model(folder / "model.json")
+    silent = replace(model.sequence, alarm=SequenceAlarm(1e6, 15.0))
+    heard = [
+        step.state
+        for step in listen_steps(open_source(folder / "sound.wav", model=replace(model, sequence=silent)))
+    ]
+    nats = np.array([[cue.evidence.compared_nats for cue in state.cues] for state in heard[9:]]).max(axis=1)
+    rates = np.array([[0.0, 6.0, 30.0], [0.0, 3.0, 20.0], [3.0, 12.0, 45.0]])
+    points = [np.array([nats.max() + 1.0, nats.max(), nats.min()]), *rates, *(rates / 600.0)]
+    curve = AlarmCurve(*points, hours=2.0, least_onsets=3.0)
+    return replace(model, sequence=replace(model.sequence, alarm=curve.default(6.0), curve=curve))
+
+
+def advised(folder: Path, model: Model, **asked: float) -> tuple[int, WorldState]:
+    """Return the number of advisories of all hops and sides, and the last snapshot."""
+    source = open_source(folder / "sound.wav", model=model, **asked)  # type: ignore[arg-type]
+    states = [step.state for step in listen_steps(source)]
+    return sum(cue.advisory is not None for state in states for cue in state.cues), states[-1]
+
+
+def test_what_is_asked_sets_the_threshold_and_the_snapshot_states_what_the_curve_promises(
+    folder: Path,
+) -> None:
+    model = curved(folder)
+    few, quiet = advised(folder, model, budget=6.0)
+    many, loud = advised(folder, model, budget=30.0)
+    shares = [advised(folder, model, alpha=alpha)[0] for alpha in (0.01, 0.05)]
+    assert shares == [few, many] and few < many
+    assert advised(folder, model)[0] == few, "the file's own budget"
+    for state, budget, alpha in ((quiet, 6.0, 0.01), (loud, 30.0, 0.05)):
+        told = state.budget
+        assert told is not None and told.promise is not None
+        assert (told.onsets_per_hour, told.asked_alpha, told.promise.alpha) == (budget, None, alpha)
+        assert [cue.alpha for cue in state.cues] == [alpha, alpha]
+        assert WorldState.from_json(state.to_json()) == state
+    told = advised(folder, model, alpha=0.02)[1].budget
+    assert told is not None and (told.asked_alpha, told.onsets_per_hour) == (0.02, 6.0)
+    listener = Listener(ARRAY, RATE_HZ, model=model, budget=30.0)
+    sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
+    assert sum(cue.advisory is not None for state in listener.push(sound) for cue in state.cues) == many
+
+
+def test_what_no_curve_supports_is_refused_with_what_is_known(folder: Path) -> None:
+    model, only = curved(folder), read_model(folder / "model.json")
+    plain = replace(only, sequence=None)
+    assert advised(folder, only, budget=15.0)[1].budget.onsets_per_hour == 15.0  # type: ignore[union-attr]
+    for refused, asked, words in (
+        (model, {"budget": 1.4}, "budget: expected 1.5 to 30 onsets an hour"),
+        (model, {"alpha": 0.06}, "alpha: expected 0.01 to 0.05 of the hops"),
+        (model, {"alpha": 0.02, "budget": 6.0}, "budget, alpha: expected one of them"),
+        (only, {"budget": 6.0}, "budget: expected a model file with a curve .* only 15 onsets an hour"),
+        (only, {"alpha": 0.02}, "alpha: expected a model file with a curve .* `worldstate model make`"),
+        (plain, {"budget": 6.0}, "budget: expected a model with a sequence .*model make"),
+        (plain, {"alpha": 0.03}, "alpha: expected a calibrated budget"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=words):
+            open_source(folder / "sound.wav", model=refused, **asked)  # type: ignore[arg-type]
+    assert open_source(folder / "sound.wav", model=plain, alpha=0.05).policy.alpha == 0.05
+
+
+def test_a_model_file_keeps_its_curve_and_one_without_is_read_with_its_single_alarm(
+    folder: Path, tmp_path: Path
+) -> None:
+    model = curved(folder)
+    save_model(tmp_path / "curve.json", model)
+    kept = read_model(tmp_path / "curve.json")
+    assert kept.sequence is not None and model.sequence is not None
+    assert encode(kept.sequence) == encode(model.sequence)
+    former = json.loads((tmp_path / "curve.json").read_text())
+    del former["sequence"]["curve"]
+    former["sequence"]["alarm"] = {"threshold_nats": -0.5, "onsets_per_hour": 40.0}
+    (tmp_path / "former.json").write_text(json.dumps(former))
+    read = read_model(tmp_path / "former.json").sequence
+    assert read is not None and read.curve is None and read.alarm == SequenceAlarm(-0.5, 40.0)

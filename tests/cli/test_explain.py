@@ -2,18 +2,22 @@
 
 import json
 import logging
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from worldstate import Measurement, NotUsable, SignatureEvidence, WorldFilter
+from worldstate import Measurement, NotUsable, SignatureEvidence, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.road_users import Foreign
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_model import GROUPS, AlarmPromise, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.cli.main import main
 from worldstate.measurement import Look
+from worldstate.operations.recordings.evidence_report import common_lines
 
 SILENT, FLAT = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
@@ -33,7 +37,7 @@ def states(tmp_path_factory) -> Path:
     world, lines = WorldFilter(), []
     for hop in range(1, 16):
         coming = 0.9 if 6 <= hop <= 10 else 0.01
-        said = SequenceReading(np.stack([heard(coming), heard(0.01)]), SHARE, 0.2, SequenceAlarm(1.0, 20.0))
+        said = SequenceReading(np.stack([heard(coming), heard(0.01)]), SHARE, 0.2, SequenceAlarm(1.5, 20.0))
         look = Look("camera", hop * 10**8, Absent(0.1, 0.01))
         domain = Foreign("sounds like speech", 1.5) if hop > 10 else None
         hop_ns = hop * 10**8
@@ -45,60 +49,101 @@ def states(tmp_path_factory) -> Path:
     return path
 
 
-RAISED = """\
-time  1.00 s
-left: advisory raised
-  since 0.70 s, valid until 2.00 s, rests on acoustic (working), camera (working)
+@pytest.fixture(scope="module")
+def onset(states: Path) -> int:
+    """Return the number of the first hop with an advisory."""
+    log = [WorldState.from_json(line) for line in states.read_text().splitlines()]
+    return next(hop for hop, state in enumerate(log, 1) if state.cues[0].advisory)
+
+
+def test_what_was_asked_of_the_alarm_stands_beside_what_its_curve_promises() -> None:
+    world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02))
+    promise = AlarmPromise(24.7, 9.1, 53.6, 0.0094, 0.0034, 0.0203)
+    for alarm, words in (
+        (SequenceAlarm(1.0, 20.0), "20 onsets an hour; the model file has no curve"),
+        (
+            SequenceAlarm(1.0, 25.0, None, promise),
+            "25 onsets an hour asked; promised are 24.7 an hour (9.1 to 53.6 at other junctions) and 0.9%",
+        ),
+        (
+            SequenceAlarm(1.0, 24.7, 0.01, promise),
+            "1.00% of the time without hazards asked; promised are 24.7",
+        ),
+    ):
+        said = SequenceReading(np.stack([heard(0.1), heard(0.01)]), SHARE, 0.2, alarm)
+        state = world.update(Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, sequence=said)).state
+        line = next(one for one in common_lines(state) if one.startswith("budget: "))
+        assert words in line
+        stated = None if alarm.promise is None else 0.0094
+        assert [cue.alpha for cue in state.cues] == [stated, stated]
+
+
+PRINTED = """\
+time  {now[time_s]:.2f} s
+left: advisory {standing}
+  usable: no, uncalibrated: no budget of false alarms was measured for what decides
+{foreign}  since {since_s:.2f} s, valid until {until_s:.2f} s, rests on acoustic ({ear}), camera (working)
   log-odds that a vehicle comes into view within 3 s, nats:
-    at, s                     0.70          1.00
-    prior                    -0.41         -0.41
-    sequence                 +2.79         +2.79
-    look camera              +0.59         +0.59
-    together                 +2.97         +2.97
-    mean of .3 s             +1.63         +2.97
-  side: 0.70 of what is hidden; risk 0.96
-  comes into view: 0.00 in 0.5 s, 0.01 in 1 s, 0.94 in 2 s, 0.95 in 3 s; 1.8 s from now (1.3 to 2.2)
-  entity: f8eadf57 hidden at +56 deg (std 7), exists with 0.97, by acoustic; the last look did not find it
-uncalibrated: no false-alarm budget stands behind the advisories
-sensor acoustic: working
-sensor camera: working
-look of camera at 1.00 s: nothing from -34 to 34 deg, misses 0.10
+    at, s                     {since_s:.2f}          {now[time_s]:.2f}
+    prior                    {onset[prior]:+.2f}         {now[prior]:+.2f}
+    sequence                 {onset[sequence]:+.2f}         {now[sequence]:+.2f}
+    looks                    {onset[looks]:+.2f}         {now[looks]:+.2f}
+    together                 {onset[together]:+.2f}         {now[together]:+.2f}
+    mean of .3 s             {onset[compared]:+.2f}         {now[compared]:+.2f}
+  side: {cue.confidence:.2f} of what is hidden; risk {cue.risk:.2f}
+  comes into view: {within}; {interval_s[1]:.1f} s from now ({interval_s[0]:.1f} to {interval_s[2]:.1f})
+  entity: {id:.8} hidden at {azimuth_deg:+.0f} deg (std {std_deg:.0f}), exists with {exists:.2f}, \
+by acoustic; the last look did not find it
+{sound}sensor camera: working
+look of camera at {now[time_s]:.2f} s: nothing from -34 to 34 deg, misses 0.10
 """
-HELD = """\
-time  1.40 s
-left: advisory held
-  since 0.70 s, valid until 2.10 s, rests on acoustic (impaired), camera (working)
-  log-odds that a vehicle comes into view within 3 s, nats:
-    at, s                     0.70          1.40
-    prior                    -0.41         -0.41
-    sequence                 +2.79         -1.24
-    look camera              +0.59         +0.59
-    together                 +2.97         -1.05
-    mean of .3 s             +1.63         -1.05
-  side: 0.50 of what is hidden; risk 0.40
-  comes into view: 0.05 in 0.5 s, 0.10 in 1 s, 0.16 in 2 s, 0.26 in 3 s; 2.2 s from now (0.0 to 4.8)
-  entity: f8eadf57 hidden at -59 deg (std 9), exists with 0.54, by acoustic; the last look did not find it
-uncalibrated: no false-alarm budget stands behind the advisories
-sound: sounds like speech: the evidence of this hop counts little
-sensor acoustic: impaired (sounds like speech)
-sensor camera: working
-look of camera at 1.40 s: nothing from -34 to 34 deg, misses 0.10
-"""
+RAISED = {"standing": "raised", "ear": "working", "foreign": "", "sound": "sensor acoustic: working\n"}
+HELD = {
+    "standing": "held",
+    "ear": "impaired",
+    "foreign": "  usable: no, unknown sound: the model was not made for this sound\n",
+    "sound": "sound: sounds like speech: the evidence of this hop counts little\n"
+    "sensor acoustic: impaired (sounds like speech)\n",
+}
 
 
-@pytest.mark.parametrize(("time", "said"), [("1.0", RAISED), ("1.4", HELD)], ids=["raised", "held"])
-def test_it_says_what_raised_and_what_holds_an_advisory(time, said, states, capsys):
-    assert main(["explain", str(states), "--time", time, "--side", "left"]) == 0
-    assert capsys.readouterr().out == said
+def figures(state: WorldState) -> dict[str, float]:
+    """Return the log-odds of the left side, piece by piece."""
+    terms = state.cues[0].evidence
+    together = {"together": sum(terms.terms_nats.values()), "compared": terms.compared_nats}
+    return {**terms.terms_nats, **together, "time_s": state.stamp_ns / 1e9}
 
 
-def test_without_a_time_all_are_listed_and_the_first_is_explained(states, capsys):
+@pytest.mark.parametrize(("hop", "said"), [(10, RAISED), (14, HELD)], ids=["raised", "held"])
+def test_it_prints_what_raised_and_what_holds_an_advisory(hop, said, states, capsys):
+    assert main(["explain", str(states), "--time", f"{hop / 10}", "--side", "left"]) == 0
+    log = [WorldState.from_json(line) for line in states.read_text().splitlines()]
+    cue = log[hop - 1].cues[0]
+    (entity,) = (one for one in log[hop - 1].entities if one.id == cue.entity_id)
+    assert capsys.readouterr().out == PRINTED.format(
+        cue=cue,
+        onset=figures(next(one for one in log if one.stamp_ns == cue.advisory.since_ns)),
+        now=figures(log[hop - 1]),
+        since_s=cue.advisory.since_ns / 1e9,
+        until_s=cue.advisory.valid_until_ns / 1e9,
+        within=", ".join(f"{cue.within[one]:.2f} in {one} s" for one in ("0.5", "1", "2", "3")),
+        interval_s=cue.time_to_visible_s,
+        id=entity.id,
+        azimuth_deg=math.degrees(entity.azimuth_rad),
+        std_deg=math.degrees(entity.azimuth_std_rad),
+        exists=entity.existence_probability,
+        **said,
+    )
+
+
+def test_without_a_time_all_are_listed_and_the_first_is_explained(states, onset, capsys):
+    assert 7 <= onset <= 10  # While it is heard, and not in the first hop
     assert main(["explain", str(states)]) == 0
     listed, explained = capsys.readouterr().out.split("\n\n")
     assert listed.splitlines() == [
-        "advisories", "  left   0.70 to 1.50 s", "  at the first onset, another by --time",
+        "advisories", f"  left   {onset / 10:.2f} to 1.50 s", "  at the first onset, another by --time",
     ]  # fmt: skip
-    assert explained.startswith("time  0.70 s\nleft: advisory raised")
+    assert explained.startswith(f"time  {onset / 10:.2f} s\nleft: advisory raised")
     assert main(["explain", str(states), "--side", "right", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["advisories"] == []
@@ -107,17 +152,17 @@ def test_without_a_time_all_are_listed_and_the_first_is_explained(states, capsys
     assert told["time_s"] == riskiest["stamp_ns"] / 1e9
 
 
-def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, capsys):
-    assert main(["explain", str(states), "--time", "0.58", "--json"]) == 0
+def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, onset, capsys):
+    assert main(["explain", str(states), "--time", f"{onset / 10 - 0.12:.2f}", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["time_s"] == 0.6
+    assert told["time_s"] == pytest.approx(onset / 10 - 0.1)
     assert {side: one["standing"] for side, one in told["sides"].items()} == {
         "left": "below",
         "right": "below",
     }
     terms = told["sides"]["left"]["cue"]["evidence"]["terms_nats"]
     assert terms["prior"] == pytest.approx(np.log(0.4 / 0.6))  # Six of fifteen groups come within 3 s
-    assert terms["sequence"] > 2.0 > 0.0 > told["sides"]["right"]["cue"]["evidence"]["compared_nats"]
+    assert terms["sequence"] > 1.0 > 0.0 > told["sides"]["right"]["cue"]["evidence"]["compared_nats"]
 
 
 @pytest.mark.parametrize(
@@ -136,16 +181,16 @@ def test_a_time_outside_and_a_side_that_is_none_are_named(words, said, states, c
 
 def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, tmp_path, capsys):
     file = tmp_path / "old.jsonl"
-    file.write_text(states.read_text().replace('"version":"3.0.0"', '"version":"2.1.0"'))
+    file.write_text(states.read_text().replace('"version":"4.0.0"', '"version":"2.1.0"'))
     assert main(["explain", str(file), "--time", "1"]) == 2
-    assert "old.jsonl: expected schema worldstate.Snapshot 3.x, got" in (said := capsys.readouterr().err)
+    assert "old.jsonl: expected schema worldstate.Snapshot 4.x, got" in (said := capsys.readouterr().err)
     assert "write it anew" in said
     file.write_text("")
     assert main(["explain", str(file), "--time", "1"]) == 2
     assert "worldstate run --out" in capsys.readouterr().err
 
 
-def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, tmp_path, capsys):
+def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, onset, tmp_path, capsys):
     """What was rotated, or cut at a line or within one, at its beginning or its end."""
     whole, log = states.read_bytes(), tmp_path / "rotated.jsonl"
     lines = whole.splitlines(keepends=True)
@@ -155,13 +200,13 @@ def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, tmp_path, 
             assert main(["explain", str(log), "--json"]) == 0
             told = json.loads(capsys.readouterr().out)
             advised = told["advisories"]
-            assert [one["since_ns"] for one in advised] == [700_000_000]
-            assert told["time_s"] == pytest.approx(max(0.7, 0.1 * (first + 1)))
+            assert [one["since_ns"] for one in advised] == [onset * 10**8]
+            assert told["time_s"] == pytest.approx(max(onset, first + 1) / 10)
             at_onset = told["sides"]["left"]["evidence_at_onset"]
-            assert (at_onset is None) == (first > 6)
+            assert (at_onset is None) == (first >= onset)
             assert main(["log", "replay", str(log), "--json"]) == 0
             replayed = json.loads(capsys.readouterr().out)
-            assert replayed["states"] == 15 - first and replayed["advisory_onsets_s"] == [0.7]
+            assert replayed["states"] == 15 - first and replayed["advisory_onsets_s"] == [onset / 10]
 
 
 # What a crash, an editor or a disk leaves between the lines, and how many lines it costs.

@@ -68,10 +68,6 @@ SILENT: dict[str, tuple[Mapping[str, object], str]] = {
         "rear: no image was looked at",
     ),
     "an empty context": ({"--context x.json": {}}, "nothing in it"),
-    "a context of one side": (
-        {"--context x.json": {"arms": [{"direction": "left", "open": True}]}},
-        "context.arms: expected 2 sides",
-    ),
     "odometry, empty": ({"--odometry o.csv": odometry()}, "at least one line"),
     "odometry of another day": (
         {"--odometry o.csv": odometry(86_400.0, 86_400.1)},

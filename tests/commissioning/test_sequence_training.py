@@ -7,7 +7,7 @@ import pytest
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from worldstate.abduction.sequence.sequence_inputs import sequence_inputs
-from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
+from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S, smoothed_log_odds
 from worldstate.commissioning import commission
 from worldstate.commissioning.sequence_training import (
     Growth,
@@ -78,6 +78,9 @@ def test_what_is_learned_does_not_depend_on_how_many_processes_learn(monkeypatch
     monkeypatch.setattr(commission, "stream_evidence", lambda windows, street: made_up[id(street)][0])
     monkeypatch.setattr(commission, "stream_truth", lambda street: made_up[id(street)][1])
     monkeypatch.setattr(commission, "STANDING", Growth(4, 6))
+    # Without sound there are no windows: the alarm goes by the readings alone.
+    monkeypatch.setattr(commission, "stream_states", lambda _, __, model, found: model.posterior(found))
+    monkeypatch.setattr(commission, "alarm_levels", smoothed_log_odds)
     one, two = (
         commission.learn_sequence(streets, lambda some: None, 30.0, np.random.default_rng(1), jobs)
         for jobs in (1, 2)

@@ -1,11 +1,28 @@
 """An exam of made-up streams, counted by hand: who is detected, when, on which side, and what alarms cost."""
 
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
+import watched_street as street
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior
+from worldstate import WorldFilter, WorldState
+from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.cueing.thresholds import risk_controlling
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior, held
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.commissioning.alarm_curve import (
+    LOUDEST,
+    UNREACHED,
+    advised,
+    alarm_levels,
+    measured_curve,
+    raised_at,
+)
 from worldstate.commissioning.heard_stream import (
     CommissionSettings,
     HeardStream,
@@ -14,10 +31,7 @@ from worldstate.commissioning.heard_stream import (
 )
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import (
-    LOUDEST,
     ExaminedStream,
-    alarm_elsewhere,
-    alarm_for,
     alarm_outcomes,
     approaches,
     auroc_before,
@@ -25,6 +39,7 @@ from worldstate.commissioning.stream_exam import (
     warned_before,
 )
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_table import HopTable
 
 Vehicle = tuple[str, str, str, float]  # flow, kind, arm, T0
@@ -56,7 +71,7 @@ def heard(vehicles: list[Vehicle], duration_s: float = 60.0, site: str = "SB1") 
 
 
 def examined(stream: HeardStream, spans: list[tuple[float, float, int]]) -> ExaminedStream:
-    """Return a stream with a posterior that is sure of a side in some spans of time and of nobody else."""
+    """Return a stream with a posterior that is sure of a side in some spans, and the advisories of these."""
     time_s = stream.hops.time_s
     groups = np.full((len(time_s), 2, len(GROUPS)), 1e-4)
     groups[..., FREE] = 1.0
@@ -64,8 +79,8 @@ def examined(stream: HeardStream, spans: list[tuple[float, float, int]]) -> Exam
         inside = (time_s >= begin - 1e-6) & (time_s <= end + 1e-6)
         groups[inside, side, FREE], groups[inside, side, SOON] = 1e-4, 1.0
     groups /= groups.sum(axis=-1, keepdims=True)
-    posterior = SequencePosterior(groups, margin_s=0.0)
-    return ExaminedStream(stream, stream_truth(stream), posterior, SequenceAlarm(-0.1, 20.0))
+    told = np.stack([held(one) for one in groups[..., SOON].T > 0.5], axis=1)
+    return ExaminedStream(stream, stream_truth(stream), SequencePosterior(groups, margin_s=0.0), told)
 
 
 VEHICLES: list[Vehicle] = [
@@ -140,7 +155,6 @@ def test_figures_are_those_counted_by_hand() -> None:
     assert figures["onsets_after"] == 0.25
     hours = 590 * 0.1 / 3600.0
     assert figures["onsets_per_hour"] == pytest.approx(2.0 / hours)
-    # The .3 s mean of log-odds passes the threshold two hops in.
     assert figures["lead_s"] == pytest.approx(np.mean([1.7, 2.9, 0.9]), abs=0.11)
     assert (figures["approaches_light"], figures["detected_light"]) == (1, 1.0)
     assert (figures["approaches_heavy"], figures["detected_heavy"]) == (1, 1.0)
@@ -170,35 +184,157 @@ def test_curves_say_who_is_warned_by_then() -> None:
     np.testing.assert_allclose(auroc_before(streams, before_s), [1.0, 1.0, 0.75, 0.5], atol=0.01)
 
 
-def _made_up(rng: np.random.Generator, streams: int) -> list[SequencePosterior]:
-    """Return hazard-free streams of half a minute, at some junctions louder ones."""
-    peaks = rng.uniform(0.05, 0.5, streams)
-    return [SequencePosterior(rng.dirichlet(np.full(len(GROUPS), peak), (300, 2)), 0.0) for peak in peaks]
+def levels(seed: int, junctions: int, streams: int = 2) -> dict[str, list[FloatArray]]:
+    """Return hazard-free streams of half a minute that wander, at some junctions louder, or denied."""
+    rng, found = np.random.default_rng(seed), dict[str, list[FloatArray]]()
+    for junction in range(junctions):
+        louder = rng.normal(0.0, 2.0)
+        wander = rng.normal(0.0, 0.5, (streams, 300)).cumsum(axis=1) + louder
+        found[f"J{junction}"] = list(np.where(rng.random((streams, 300)) < 0.1, -np.inf, wander))
+    return found
 
 
-def _onsets_per_hour(alarm: SequenceAlarm, stream: SequencePosterior) -> float:
-    raised = alarm.raised(stream).any(axis=1)
-    return int((raised & ~np.concatenate([[False], raised[:-1]])).sum()) * 120.0
+def counted(streams: list[FloatArray], threshold_nats: float) -> tuple[float, float]:
+    """Return onsets an hour and the share of hops in alarm, hop by hop."""
+    onsets = alarmed = 0
+    for one in streams:
+        left = 0
+        for level in one.tolist():
+            before, left = left, 11 if level >= threshold_nats else max(left - 1, 0)
+            left = 0 if level == -np.inf else left
+            onsets += left > 0 and before == 0
+            alarmed += left > 0
+    hops = sum(map(len, streams))
+    return onsets / (hops * 0.1 / 3600.0), alarmed / hops
 
 
-@settings(max_examples=8, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(3, 6), st.floats(60.0, 1200.0))
-def test_an_alarm_set_at_other_junctions_keeps_the_onsets_it_was_set_for(
+CURVES = settings(max_examples=15, deadline=None)
+
+
+@CURVES
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+def test_the_points_of_a_curve_are_counts_and_no_rate_falls(seed: int, junctions: int) -> None:
+    quiet = levels(seed, junctions)
+    streams = [one for there in quiet.values() for one in there]
+    curve = measured_curve(quiet)
+    direct = np.array([counted(streams, one) for one in curve.threshold_nats.tolist()])
+    # Alarms that grow together are one onset: the most so far counts.
+    assert curve.onsets_per_hour == pytest.approx(np.maximum.accumulate(direct[:, 0]))
+    assert curve.alpha == pytest.approx(direct[:, 1])
+    for rates in ("onsets", "alpha"):
+        value = curve.alpha if rates == "alpha" else curve.onsets_per_hour
+        low, high = getattr(curve, f"{rates}_low"), getattr(curve, f"{rates}_high")
+        assert (low <= value + 1e-9).all() and (value <= high + 1e-9).all()
+
+
+@CURVES
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_an_alarm_keeps_what_was_asked_on_its_own_streams_and_no_lower_point_does(
+    seed: int, budget: float, share: float
+) -> None:
+    quiet = levels(seed, 4)
+    streams = [one for there in quiet.values() for one in there]
+    curve = measured_curve(quiet)
+    least, most = 3.0 / curve.hours, float(curve.onsets_per_hour[-1])
+    assume(most > least)
+    asked = least + budget * (most - least)
+    alarm = curve.for_budget(asked)
+    assert counted(streams, alarm.threshold_nats)[0] <= asked * (1.0 + 1e-9)
+    assert (curve.onsets_per_hour[curve.threshold_nats < alarm.threshold_nats] > asked).all()
+    assert alarm.promise is not None and alarm.onsets_per_hour == asked and alarm.asked_alpha is None
+    known = curve.alpha[curve.onsets_per_hour * curve.hours >= 3.0 - 1e-9]
+    asked = float(known[0] + share * (known[-1] - known[0]))
+    alarm = curve.for_alpha(asked)
+    assert counted(streams, alarm.threshold_nats)[1] <= asked * (1.0 + 1e-9)
+    assert (curve.alpha[curve.threshold_nats < alarm.threshold_nats] > asked).all()
+    assert alarm.asked_alpha == asked and alarm.promise == curve.for_alpha(alarm.promise.alpha).promise
+    for wrong in (0.99 * least, 1.01 * most, -1.0, math.nan):
+        with pytest.raises(InvalidArgumentError, match=r"budget: expected .* onsets an hour"):
+            curve.for_budget(wrong)
+    for wrong in (0.99 * float(known[0]), 1.01 * float(known[-1]), math.nan):
+        with pytest.raises(InvalidArgumentError, match=r"alpha: expected .* of the hops"):
+            curve.for_alpha(wrong)
+
+
+@CURVES
+@given(st.integers(0, 2**32 - 1), st.integers(3, 7), st.floats(60.0, 1200.0))
+def test_a_budget_for_other_junctions_is_kept_by_those_left_out_and_is_that_of_risk_control(
     seed: int, junctions: int, rate: float
 ) -> None:
     # Whatever the streams, over all ways to leave one out, which is what exchangeable junctions are.
-    # Two drives each, or a stream in two parts.
-    parts = _made_up(np.random.default_rng(seed), 2 * junctions)
-    there = list(zip(parts[::2], parts[1::2], strict=True))
-    left_out = [(alarm_elsewhere(there[:i] + there[i + 1 :], rate), there[i]) for i in range(junctions)]
-    rates = [np.mean([_onsets_per_hour(alarm, one) for one in two]) for alarm, two in left_out]
-    onsets = np.minimum(rates, LOUDEST * rate)
-    assert np.mean(onsets) <= rate * (1.0 + 1e-9)
+    quiet, rates = levels(seed, junctions), list[float]()
+    for name in quiet:
+        others = {other: streams for other, streams in quiet.items() if other != name}
+        alarm = measured_curve(others, elsewhere=True).default(rate)
+        rates.append(min(counted(quiet[name], alarm.threshold_nats)[0], LOUDEST * rate))
+    assert np.mean(rates) <= rate * (1.0 + 1e-9)
+    curve = measured_curve(quiet, elsewhere=True)
+    losses = [[counted(one, level)[0] for level in curve.threshold_nats.tolist()] for one in quiet.values()]
+    assert (np.maximum(curve.onsets_low, curve.onsets_per_hour) <= curve.onsets_high).all()
+    kept = risk_controlling(np.array(losses), rate, LOUDEST * rate)
+    assert curve.default(rate).threshold_nats == curve.threshold_nats[kept - 1]
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-2.0, 1.0))
+def test_the_levels_of_a_stream_raise_what_the_filter_advises_of_at_any_threshold(
+    seed: int, threshold_nats: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    groups = np.exp(rng.normal(0.0, 0.4, (150, 2, len(GROUPS))).cumsum(axis=0))
+    share = np.full(len(GROUPS), 1.0 / len(GROUPS))
+
+    def states(alarm: SequenceAlarm) -> Iterator[WorldState]:
+        world = WorldFilter()
+        for hop, one in enumerate(groups / groups.sum(axis=-1, keepdims=True), 1):
+            reading = SequenceReading(one, share, 0.1, alarm)
+            world = world.update(replace(street.heard(hop, None, Unqueried("no camera")), sequence=reading))
+            yield world.state
+
+    told = advised(states(SequenceAlarm(threshold_nats, 20.0))).any(axis=1)
+    np.testing.assert_array_equal(raised_at(alarm_levels(states(UNREACHED)), threshold_nats), told)
+
+
+def test_a_curve_that_no_count_has_is_refused() -> None:
+    good = measured_curve(levels(1, 3))
+    for wrong in (
+        {"hours": 0.0},
+        {"threshold_nats": good.threshold_nats[::-1]},
+        {"onsets_per_hour": good.onsets_per_hour[:-1]},
+        {"onsets_per_hour": good.onsets_per_hour[::-1]},
+        {"alpha_high": good.alpha_high + 1.0},
+    ):
+        with pytest.raises(InvalidArgumentError, match=next(iter(wrong))):
+            replace(good, **wrong)
+
+
+def test_two_junctions_keep_for_another_what_neither_of_them_has() -> None:
+    quiet = levels(7, 2)
+    curve = measured_curve(quiet, elsewhere=True)
+    streams = [one for there in quiet.values() for one in there]
+    assert curve.onsets_per_hour.max() == 0.0
+    assert counted(streams, curve.default(20.0).threshold_nats) == (0.0, 0.0)
 
 
 def test_one_junction_sets_no_alarm_for_others() -> None:
     with pytest.raises(InvalidArgumentError, match="2 junctions at least, got 1"):
-        alarm_elsewhere([_made_up(np.random.default_rng(0), 3)], 20.0)
+        measured_curve(levels(0, 1, 3), elsewhere=True)
+
+
+def test_the_interval_of_a_curve_holds_the_rate_of_four_other_junctions_as_often_as_it_states() -> None:
+    rng, inside = np.random.default_rng(6), list[bool]()
+    for _ in range(100):
+        # Peaks as often as a gamma distribution gives each of sixteen junctions, half as wide as its mean.
+        often, hops = rng.gamma(4.0, 0.001, 16), [1500] * 12 + [8000] * 4
+        streams = [
+            np.where(rng.random(n) < p, rng.exponential(1.0, n), -50.0)
+            for n, p in zip(hops, often.tolist(), strict=True)
+        ]
+        curve = measured_curve({str(j): [row] for j, row in enumerate(streams[:12])})
+        at = int(np.sum(curve.threshold_nats > 0.0)) - 1
+        rate, _ = counted(streams[12:], float(curve.threshold_nats[at]))
+        inside.append(bool(curve.onsets_low[at] <= rate <= curve.onsets_high[at]))
+    assert 0.88 <= np.mean(inside) <= 0.99
 
 
 def test_who_is_missed_throughout_the_last_second_ranks_with_nobody() -> None:
@@ -208,15 +344,6 @@ def test_who_is_missed_throughout_the_last_second_ranks_with_nobody() -> None:
     assert figures["auroc_1s_before"] == pytest.approx(0.75, abs=0.01)
     assert figures["auroc_3s_before"] == pytest.approx(0.5, abs=0.01)
     assert examine(streams[:1])["auroc_last_second"] is None
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(5.0, 200.0))
-def test_an_alarm_keeps_the_onsets_it_was_set_for_on_the_streams_it_was_set_on(
-    seed: int, rate: float
-) -> None:
-    quiet = _made_up(np.random.default_rng(seed), 3)
-    alarm = alarm_for(quiet, rate)
-    assert np.mean([_onsets_per_hour(alarm, one) for one in quiet]) <= rate
 
 
 def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_with_it() -> None:

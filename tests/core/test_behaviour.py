@@ -12,7 +12,6 @@ from worldstate import (
     Approach,
     Bearing,
     Context,
-    FilterSettings,
     Measurement,
     NotUsable,
     Present,
@@ -21,7 +20,6 @@ from worldstate import (
     Unqueried,
     WorldFilter,
     WorldstateError,
-    uncalibrated_policy,
 )
 from worldstate.abduction import log_lambda
 from worldstate.measurement import Look
@@ -89,32 +87,18 @@ def test_a_vehicle_may_be_heard_on_the_wrong_side_before_it_comes_into_view():
 
 def test_of_two_hidden_vehicles_the_likelier_one_comes_into_view():
     both = SignatureEvidence(("left", "right"), (6.0, 6.0), 0.0, 0.0)
-    chances = FilterSettings(birth_probability=0.3)
-    world = after(WorldFilter(settings=chances), *[measured(t, both) for t in (1.0, 2.0, 3.0)])
+    busy = Context(hidden_by_side={"left": 0.8, "right": 0.8})  # Heard on both sides, there are two
+    world = after(WorldFilter(busy), *[measured(t, both) for t in (1.0, 2.0, 3.0)])
     heard = {entity.direction: entity.id for entity in world.state.entities}
     assert set(heard) == {"left", "right"}
     assert entities(after(world, measured(3.1, both, car(0.5))))["visible"].id == heard["left"]
 
 
-def test_what_came_into_view_before_a_birth_is_another_vehicle_for_the_whole_window():
-    """The belief of one window ago, which the next windows build on, forgets it as well."""
-    weak = SignatureEvidence(("left", "right"), (2.0, 0.0), 0.0, 0.0)
-    patient = FilterSettings(birth_probability=0.97, death_probability=0.001)
-    world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=1.1), settings=patient)
-    world = after(world, *[measured(1.0 + t / 10, weak) for t in range(15)])
-    world = after(world, *[measured(2.5 + t / 10, FRONT) for t in range(10)])
-    assert world.state.entities == ()
-    assert world.state.cues[0].hypotheses.visible > 0.7
-    loud = SignatureEvidence(("left", "right"), (20.0, 0.0), 0.0, 0.0)
-    (born,) = after(world, measured(3.5, loud)).state.entities
-    (later,) = after(world, measured(3.5, loud), measured(3.6, FRONT)).state.entities
-    assert born.id == later.id
-    assert later.existence_probability < 0.05 < 0.99 < born.existence_probability
-
-
 def test_a_vehicle_seen_a_moment_ago_has_not_gone_into_hiding():
     """One missed image is no occlusion: what is heard hidden beside it is another vehicle."""
-    world = after(WorldFilter(), measured(1.0, FRONT, car(-0.5)), measured(1.1, RIGHT))
+    first = [measured(1.0 + hop / 10, FRONT, car(-0.5)) for hop in range(15)]
+    beside = [measured(2.5 + hop / 10, RIGHT, car(-0.5)) for hop in range(20)]
+    world = after(WorldFilter(), *first, *beside, measured(4.5, RIGHT, answer=Absent(0.1)))
     assert set(entities(world)) == {"visible", "hidden"}
 
 
@@ -141,14 +125,14 @@ def test_a_range_that_was_only_assumed_is_not_published():
 
 @pytest.mark.parametrize("step_s", [1.0, 0.5, 0.1])
 def test_an_approach_rate_sharpens_the_belief_as_data_association_says(step_s):
-    r"""P = w P^+ + (1 - w) P^- + w (1 - w) K^2 nu^2, with w = P(the sound is this entity's).
+    r"""P = w P^+ + (1 - w) P^- + w (1 - w) K^2 nu^2, with w = P(the sound is this entity's) before it.
 
     Of a window that overlaps the last one, only the new share counts: R / share.
     """
     world = after(WorldFilter(), *[measured(t, LEFT, approach=Approach(0.3, 0.3)) for t in (1.0, 2.0)])
     (before,) = world.predict_to(round((2.0 + step_s) * 1e9)).state.entities
     (later,) = after(world, measured(2.0 + step_s, LEFT, approach=Approach(0.6, 0.2))).state.entities
-    prior, w = before.inverse_tta_std_hz**2, later.existence_probability
+    prior, w = before.inverse_tta_std_hz**2, before.existence_probability
     gain = prior / (prior + 0.2**2 / step_s)
     news = 0.6 - before.inverse_tta_hz
     expected = w * (1 - gain) * prior + (1 - w) * prior + w * (1 - w) * (gain * news) ** 2

@@ -1,4 +1,4 @@
-"""Windows that overlap are one piece of evidence; windows that do not are two."""
+"""Windows of one source that overlap are one piece of evidence; those of two sources are two."""
 
 from dataclasses import replace
 
@@ -8,78 +8,101 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.evidence import SignatureEvidence, abduce
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.street_model import StreetModel
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.values import NotUsable
-from worldstate.measurement.measurement import Measurement
-from worldstate.state import Context, Priors, Rates
+from worldstate.measurement.measurement import Heard, Measurement
+from worldstate.state import Context, Priors
 
-STILL = Context(rates=Rates(*[1e-12] * 6), priors=Priors(0.3, 0.3, 0.4))
+PRIORS = Priors(0.3, 0.3, 0.4)
 NOTHING, UNASKED = NotUsable("-"), Unqueried("-")
+# So short that the vehicles of the street do not move meanwhile: what evidence makes of the prior is left.
+MEMORY_NS = 10_000
+SETTINGS = FilterSettings(window_s=MEMORY_NS / 1e9, street=StreetModel(window_s=MEMORY_NS / 1e9))
 nats = st.floats(-4.0, 4.0)
+FLAT = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 signatures = st.builds(
     lambda left, right, visible, none: SignatureEvidence(("left", "right"), (left, right), visible, none),
     nats, nats, nats, nats,
 )  # fmt: skip
+steps_ns = st.integers(0, 3 * MEMORY_NS)
+windows = st.lists(st.tuples(st.just(FLAT) | signatures, steps_ns, st.booleans()), min_size=1, max_size=8)
 
 
-def heard(time_s, signature, source="acoustic"):
-    return Measurement(round(time_s * 1e9), signature, UNASKED, NOTHING, NOTHING, source=source)
+def heard(stamp_ns, signature, source="acoustic", usable=True):
+    hears = Heard() if usable else Heard(0.0, "wind")
+    return Measurement(stamp_ns, signature, UNASKED, NOTHING, NOTHING, source=source, heard=hears)
 
 
-def hidden(measurements):
-    world = WorldFilter(context=STILL)
+def believed(measurements, settings=SETTINGS):
+    world = WorldFilter(context=Context(priors=PRIORS), settings=settings)
     for measurement in measurements:
         world = world.update(measurement)
-    return np.array([*world.belief.hidden, world.belief.hypotheses[1], world.belief.hypotheses[2]])
+    return np.array([*world.belief.hidden, *world.belief.hypotheses])
 
 
-def counted(times, signature):
-    """The posterior by hand: the prior times the likelihood, so many times."""
-    start = WorldFilter(context=STILL).belief
-    log = np.log([*start.hidden, *start.hypotheses[1:]])
-    for _ in range(times):
-        log = np.array(abduce(log, signature, UNASKED).log_probabilities)
-    return np.exp(log)
+def by_hand(weighted):
+    """Eq. (6) with likelihoods raised to weights; two hidden vehicles sound as each does, half of it.
+
+    A window that denies a vehicle in view denies it beside a hidden one as well.
+    """
+    chance, seen = 1.0 - np.sqrt(1.0 - PRIORS.hidden), PRIORS.visible / (1.0 - PRIORS.hidden)
+    one = chance * (1.0 - chance)
+    sides = np.array([one, one, chance**2])
+    explanations = np.log([*((1.0 - seen) * sides), *(seen * sides), PRIORS.visible, PRIORS.none])
+    for signature, weight in weighted:
+        left, right = signature.hidden
+        denied = min(signature.visible - signature.none, 0.0)
+        hidden = np.array([left, right, np.logaddexp(left, right) - np.log(2.0)])
+        hidden -= np.log(1.0 - seen + seen * np.exp(denied))
+        explanations += weight * np.array([*hidden, *(hidden + denied), signature.visible, signature.none])
+    chances = np.exp(explanations - np.logaddexp.reduce(explanations))
+    left, right, both = chances[:3] + chances[3:6]
+    return np.array([left + both, right + both, left + right + both, *chances[6:]])
+
+
+@given(windows)
+def test_of_a_window_so_much_counts_as_is_new_since_the_last_one(told):
+    """Log-likelihoods are averaged over the memory.
+
+    What is alike for all explanations, or could not be heard, is no window.
+    """
+    stamp_ns, since_ns, measurements, weighted = 10**9, None, [], []
+    for signature, step_ns, usable in told:
+        stamp_ns += step_ns
+        measurements.append(heard(stamp_ns, signature, usable=usable))
+        if usable and np.ptp(signature.log_likelihoods):
+            new = 1.0 if since_ns is None else -np.expm1(-(stamp_ns - since_ns) / MEMORY_NS)
+            weighted = [(one, (1.0 - new) * weight) for one, weight in weighted] + [(signature, new)]
+            since_ns = stamp_ns
+    assert believed(measurements) == pytest.approx(by_hand(weighted), abs=1e-4)
 
 
 @given(signatures, st.integers(1, 10))
-def test_windows_that_overlap_count_once(signature, hops):
-    got = hidden([heard(1.0 + hop / 10, signature) for hop in range(hops)])
-    assert got == pytest.approx(counted(1, signature), abs=1e-5)
+def test_a_window_counts_once_however_often_it_is_repeated(signature, hops):
+    got = believed([heard(10**9 + hop * MEMORY_NS // 10, signature) for hop in range(hops)])
+    assert got == pytest.approx(by_hand([(signature, 1.0)]), abs=1e-4)
+    again = believed([heard(10**9, signature)] * hops)
+    assert again == pytest.approx(by_hand([(signature, 1.0)]), abs=1e-4)
 
 
-@given(signatures, st.integers(1, 3))
-def test_windows_end_to_end_count_each(signature, windows):
-    got = hidden([heard(1.0 + hop / 10, signature) for hop in range(10 * windows)])
-    assert got == pytest.approx(counted(windows, signature), abs=1e-5)
+@given(signatures, signatures, st.integers(1, 10))
+def test_another_modality_is_news(sound, radar, hops):
+    told = [
+        heard(10**9 + hop * MEMORY_NS // 20, *one)
+        for hop in range(hops)
+        for one in ((sound, "acoustic"), (radar, "radar"))
+    ]
+    assert believed(told) == pytest.approx(by_hand([(sound, 1.0), (radar, 1.0)]), abs=1e-4)
 
 
-@given(signatures)
-def test_the_same_window_again_changes_nothing(signature):
-    once = [heard(1.0, signature)]
-    assert hidden(once * 3) == pytest.approx(hidden(once), abs=1e-12)
-
-
-@given(signatures)
-def test_another_modality_is_news(signature):
-    both = [heard(1.0, signature), heard(1.0, signature, "radar")]
-    interleaved = [heard(1.0 + hop / 20, signature, ("acoustic", "radar")[hop % 2]) for hop in range(20)]
-    assert hidden(both) == pytest.approx(counted(2, signature), abs=1e-5)
-    assert hidden(interleaved) == pytest.approx(counted(2, signature), abs=1e-5)
-
-
-def test_it_keeps_one_window_and_no_more():
-    signature = SignatureEvidence(("left", "right"), (1.0, 0.0), 0.0, 0.0)
-    world = WorldFilter(context=STILL)
-    for hop in range(200):
-        world = world.update(heard(1.0 + hop / 10, signature))
-    assert len(world._memory.belief.past) == 11
-
-
-def test_a_loud_second_is_believed_at_once():
-    loud = SignatureEvidence(("left", "right"), (4.0, 0.0), 0.0, 0.0)
-    quiet = replace(loud, hidden=(-4.0, -4.0))
-    first = WorldFilter().update(heard(1.0, quiet))
-    assert first.belief.hypotheses[0] < 0.05
-    assert first.update(heard(1.1, loud)).belief.hypotheses[0] > 0.7
+@given(signatures, st.integers(1, 20), st.integers(1, 3 * MEMORY_NS))
+def test_multiplied_as_likelihoods_windows_end_to_end_count_each(signature, hops, step_ns):
+    times, settings = (
+        1.0 + (hops - 1) * min(step_ns / MEMORY_NS, 1.0),
+        replace(SETTINGS, windows="likelihood"),
+    )
+    got = believed([heard(10**9 + hop * step_ns, signature) for hop in range(hops)], settings)
+    assert got == pytest.approx(by_hand([(signature, times)]), abs=1e-4)

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldstate import FilterSettings, SignatureEvidence, WorldFilter
+from worldstate import FilterSettings, WorldFilter
 from worldstate.abduction.co_evidence import Absent
-from worldstate.belief.window_belief import ExplanationBelief
+from worldstate.belief.joint_belief import FIRST_BIN, NONE, STATES, JointBelief
+from worldstate.belief.street_model import StreetModel
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 
 STEP_S, STEPS, GONE, FOUND, CLUTTER, STD_M = 0.5, 60, 40, 0.5, 0.3, 0.5
@@ -32,7 +33,7 @@ def ours(places):
     """Return the existence that the filter publishes after every scan."""
     radar = SearchedSector(Sector(0.0, 1.2), range_m=1e3, detection_probability=FOUND, clutter_rate=CLUTTER)
     # Gone means gone: below the usual .05 an entity would be dropped while Stone Soup's still counts down.
-    world, exists = WorldFilter(settings=FilterSettings(delete_existence=1e-3)), []
+    world, exists = WorldFilter(settings=FilterSettings(street=StreetModel(death=1e-3))), []
     noise = tuple(map(tuple, np.diag([STD_M**2] * 4).tolist()))
     for step, place in enumerate(places):
         stated = () if place is None else (Position(place, noise, SPEED_MPS),)
@@ -163,12 +164,14 @@ def test_ten_empty_scans_of_a_lane_half_hidden_leave_what_the_hidden_half_may_ho
         pd = FOUND * in_view
         r, in_view = r * (1.0 - pd) / (1.0 - r * pd), in_view * (1.0 - FOUND) / (1.0 - pd)
         law.append(r)
-    belief, mine = ExplanationBelief.from_priors(2, hidden=0.25, visible=0.25, none=0.5), []
-    hidden, visible, none = Absent(miss_rate=1.0 - FOUND).log_likelihoods()
-    even = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
-    for _ in range(10):
-        belief = belief.update(even, np.array([hidden, hidden, visible, none]))
-        mine.append(sum(belief.sides.hypotheses[:2]))
+    # One side: in view, or hidden and two seconds from coming into view, or none; the radar works.
+    weights, mine = np.zeros((STATES, 2)), []
+    weights[2 * NONE, 1], weights[2 * (FIRST_BIN + 3), 0], weights[2 * NONE, 0] = 0.25, 0.25, 0.5
+    belief, street = JointBelief(weights), StreetModel(works=1.0)
+    for scan in range(10):
+        stamp_ns = round(scan * 1e9 * street.look_s)
+        belief = belief.looked("radar", Absent(miss_rate=1.0 - FOUND), stamp_ns, street)
+        mine.append(sum(belief.explanations[:2]))
     np.testing.assert_allclose(mine, law, atol=1e-9)
     np.testing.assert_allclose(half_hidden(corrected(Stock)), law, atol=0.01)
     # Stock, ten scans that find nothing change nothing.

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from watched_street import START_NS, arrival, false_alarms
+from watched_street import ALARM, START_NS, arrival, false_alarms
 
 from worldstate import Measurement, WorldFilter
+from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
+from worldstate.abduction.sequence.sequence_model import AlarmPromise
 from worldstate.core.budget_watch import (
     CLUSTER,
     RATES,
@@ -143,6 +145,18 @@ def test_false_alarms_break_the_budget_and_move_no_threshold() -> None:
         for cue in state.cues:
             assert cue.evidence.threshold_nats == 0.0
     assert world.predict(3.0).state.budget.verdict == "unwatched"
+
+
+def test_what_was_asked_and_what_the_curve_promises_are_stated_if_a_budget_is() -> None:
+    promise = AlarmPromise(4.0, 1.0, 9.0, 0.01, 0.002, 0.03)
+    for asked_alpha, stated in ((None, 0.02), (0.015, 0.02), (None, 0.0)):
+        alarm = replace(ALARM, asked_alpha=asked_alpha, promise=promise)
+        world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=stated), start_ns=START_NS)
+        for one in false_alarms(hops=20):
+            world = world.update(replace(one, sequence=replace(one.sequence, alarm=alarm)))
+        budget = world.state.budget
+        assert (budget.asked_alpha, budget.promise) == (asked_alpha, promise)
+        assert {cue.alpha for cue in world.state.cues} == {promise.alpha if stated else None}
 
 
 def test_without_a_camera_nothing_watches_and_nothing_moves() -> None:

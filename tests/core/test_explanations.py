@@ -1,144 +1,132 @@
-"""The explanation filter: laws over random inputs, and two oracles that are not our code."""
+"""The explanations by windows in the joint belief: laws over random inputs, and oracles beside our code."""
 
-import gtsam
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm
+from scipy.linalg import null_space
 
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.window_belief import ExplanationBelief, equilibrium, generator, transition
-from worldstate.core.side_update import log_co_evidence
+from worldstate import Context, FilterSettings, Measurement, NotUsable, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.belief.street_model import StreetModel
+from worldstate.measurement import Look
+from worldstate.state import Priors, Rates, blind_corner
 
-DIRECTIONS = ("left", "right")
-rates = st.tuples(*[st.floats(0.0, 3.0)] * 6)
-positive_rates = st.tuples(*[st.floats(0.01, 3.0)] * 6)
-logs = st.floats(-30.0, 30.0)
-steps_ns = st.integers(1_000_000, 5_000_000_000)
+SIDES = ("left", "right", "rear")
+CORNERS = (blind_corner("left", 1), blind_corner("right", -1), replace(blind_corner("rear", 1), id="rear"))
+UNASKED = Unqueried("-")
+# The camera works, and a window is believed as it is: the memory is far shorter than any step.
+AT_ONCE = FilterSettings(street=StreetModel(works=1.0, fails_s=1e6, window_s=1e-3))
+nats = st.floats(-5.0, 5.0)
+steps_ns = st.integers(5 * 10**7, 2 * 10**9)
+chances = st.tuples(*[st.floats(0.05, 1.0)] * 3).map(lambda one: tuple(np.array(one) / sum(one)))
 answers = st.one_of(
     st.builds(Absent, st.floats(0.0, 1.0), st.floats(0.0, 0.5)),
     st.builds(Present, st.floats(0.0, 1.0), st.floats(0.001, 0.5)),
-    st.just(Unqueried("none")),
+    st.just(UNASKED),
 )
 
 
-def co_terms(answer):
-    return log_co_evidence(answer, 2)
+def window(stamp_ns: int, values: tuple[float, ...], answer: CoEvidence = UNASKED) -> Measurement:
+    """Return a window with log-likelihoods of hidden by side, visible and none, and a look."""
+    *hidden, visible, none = values
+    heard = SignatureEvidence(SIDES[: len(hidden)], tuple(hidden), visible, none)
+    look = None if isinstance(answer, Unqueried) else Look("camera", stamp_ns, answer)
+    return Measurement(stamp_ns, heard, answer, NotUsable("-"), NotUsable("-"), look=look)
 
 
-def evidence(left, right, visible, none):
-    return SignatureEvidence(DIRECTIONS, (left, right), visible, none)
+def street(k: int, **options: Priors | Rates | None) -> WorldFilter:
+    return WorldFilter(Context(occluders=CORNERS[:k], **options), settings=AT_ONCE)
 
 
-@given(rates, st.integers(1, 4), steps_ns, steps_ns)
-def test_transitions_are_stochastic_and_compose(rate, k, first, second):
-    one, two = transition(rate, k, first), transition(rate, k, second)
-    assert (one >= 0).all()
-    assert one.sum(axis=1) == pytest.approx(1.0)
-    assert one @ two == pytest.approx(transition(rate, k, first + second), abs=1e-9)
+def eq_6(priors: tuple[float, ...], values: tuple[float, ...]) -> np.ndarray:
+    """Return the posteriors of eq. (6) by sums over who comes: sides are independent, any is heard."""
+    *hidden, visible, none = np.exp(np.array(values) - max(values))
+    k, (p_hidden, p_visible, p_none) = len(hidden), priors
+    each, total = 1.0 - (1.0 - p_hidden) ** (1.0 / k), 0.0
+    for subset in range(1, 2**k):
+        comes = [one for j, one in enumerate(hidden) if subset >> j & 1]
+        total += each ** len(comes) * (1.0 - each) ** (k - len(comes)) * float(np.mean(comes))
+    weights = np.array([total, p_visible * visible, p_none * none])
+    return weights / weights.sum()
 
 
-@settings(max_examples=20)
-@given(positive_rates, st.floats(0.05, 3.0))
-def test_transition_solves_the_forward_equation(rate, time_s):
-    start = np.full(6, 1 / 6)
-    flow = generator(rate, 2)
-    solved = solve_ivp(lambda t, p: p @ flow, (0, time_s), start, rtol=1e-9, atol=1e-12).y[:, -1]
-    assert start @ transition(rate, 2, round(time_s * 1e9)) == pytest.approx(solved, abs=1e-7)
+@pytest.mark.parametrize("k", [1, 2, 3])
+@given(chances, st.data())
+@settings(max_examples=8, deadline=None)
+def test_a_window_alone_is_believed_as_eq_6_says_whatever_was_heard_before(
+    k: int, priors: tuple[float, float, float], data: st.DataObject
+) -> None:
+    world, stamp_ns = street(k, priors=Priors(*priors)), 0
+    for _ in range(3):
+        stamp_ns += data.draw(steps_ns)
+        values = data.draw(st.tuples(*[st.floats(-4.0, 4.0)] * (k + 2)).filter(lambda one: np.ptp(one) > 0.0))
+        world = world.update(window(stamp_ns, values))
+        assert world.belief.hypotheses == pytest.approx(tuple(eq_6(priors, values)), abs=1e-6)
+        if k == 1:
+            assert world.belief.hidden[0] == pytest.approx(world.belief.hypotheses[0])
 
 
-@given(positive_rates)
-def test_equilibrium_is_left_alone(rate):
-    settled = equilibrium(rate, 2)
-    assert settled @ generator(rate, 2) == pytest.approx(0.0, abs=1e-6)
+@pytest.mark.parametrize("k", [1, 2, 3])
+@given(st.data())
+@settings(max_examples=6, deadline=None)
+def test_it_sums_to_one_and_stays_finite(k: int, data: st.DataObject) -> None:
+    world, stamp_ns = street(k), 0
+    for _ in range(4):
+        stamp_ns += data.draw(steps_ns)
+        values = data.draw(st.tuples(*[st.floats(-1000.0, 1000.0)] * (k + 2)))
+        world = world.update(window(stamp_ns, values, data.draw(answers)))
+        belief = world.belief
+        every = np.array([*belief.hypotheses, *belief.hidden, *belief.emerged, belief.both])
+        assert np.isfinite(every).all() and (every >= 0.0).all() and (every <= 1.0 + 1e-9).all()
+        assert sum(belief.hypotheses) == pytest.approx(1.0, abs=1e-9)
+        assert max(belief.hidden) - 1e-9 <= belief.hypotheses[0] <= sum(belief.hidden) + 1e-9
 
 
-looks_of_any_kind = st.lists(st.tuples(logs, logs, logs, logs, answers), min_size=1, max_size=8)
+@given(st.tuples(nats, nats, nats, nats))
+@settings(max_examples=20, deadline=None)
+def test_a_blind_camera_moves_nothing_and_a_perfect_one_removes_what_is_in_view(
+    values: tuple[float, float, float, float],
+) -> None:
+    """Law 2, between nothing that is asked and nothing that is missed."""
+    unasked, blind, perfect = (
+        street(2).update(window(10**9, values, answer)).belief
+        for answer in (UNASKED, Absent(1.0), Absent(0.0))
+    )
+    assert blind.hypotheses == pytest.approx(unasked.hypotheses, abs=1e-9)
+    assert blind.hidden == pytest.approx(unasked.hidden, abs=1e-9)
+    assert perfect.hypotheses[1] < 1e-6
 
 
-@given(rates, looks_of_any_kind)
-def test_it_sums_to_one_and_stays_finite(rate, looks):
-    belief = ExplanationBelief.settled(len(DIRECTIONS), rate)
-    for left, right, visible, none, answer in looks:
-        belief = belief.predict(rate, 100_000_000)
-        belief = belief.update(evidence(left, right, visible, none), co_terms(answer))
-        assert np.isfinite(belief.log_probabilities).all()
-        assert belief.probabilities.sum() == pytest.approx(1.0, abs=1e-9)
-
-
-@given(positive_rates, st.lists(st.tuples(logs, logs, logs, answers), min_size=1, max_size=20))
-def test_it_lumps_onto_the_three_explanations(rate, looks):
-    """With both directions alike, P(hidden) is that of a three-state filter written down on its own."""
-    arrival, emergence, departure, reocclusion, visible_arrival, visible_departure = rate
+@given(st.tuples(*[st.floats(0.01, 3.0)] * 6), st.sampled_from([1, 2, 3]))
+@settings(deadline=None)
+def test_the_prior_of_rates_is_their_equilibrium(rates: tuple[float, ...], k: int) -> None:
+    """Oracle: the null space of the generator of hidden, visible, none."""
+    arrival, emergence, departure, reocclusion, visible_arrival, visible_departure = rates
     flow = np.array(
         [
             [-(emergence + departure), emergence, departure],
             [reocclusion, -(reocclusion + visible_departure), visible_departure],
-            [2 * arrival, visible_arrival, -(2 * arrival + visible_arrival)],
+            [k * arrival, visible_arrival, -(k * arrival + visible_arrival)],
         ]
     )
-    step = expm(flow * 0.1)
-    belief = ExplanationBelief.from_priors(len(DIRECTIONS), 0.2, 0.3, 0.5)
-    three = np.array([0.2, 0.3, 0.5])
-    for hidden, visible, none, answer in looks:
-        belief = belief.predict(rate, 100_000_000)
-        belief = belief.update(evidence(hidden, hidden, visible, none), co_terms(answer))
-        log_three = np.log(np.maximum(three @ step, 1e-300))
-        log_three = log_three + np.array([hidden, visible, none]) + answer.log_likelihoods()
-        three = np.exp(log_three - np.logaddexp.reduce(log_three))
-        assert belief.sides.hypotheses == pytest.approx(tuple(three), abs=1e-9)
+    settled = null_space(flow.T)[:, 0]
+    priors = Rates(*rates).priors(k)
+    np.testing.assert_allclose(
+        [priors.hidden, priors.visible, priors.none], settled / settled.sum(), atol=1e-9
+    )
+    assert street(k, rates=Rates(*rates)).belief.hypotheses == pytest.approx(
+        settled / settled.sum(), abs=1e-6
+    )
 
 
-def test_it_agrees_with_a_factor_graph():
-    """gtsam's discrete factor graph over 30 steps of the lumped chain."""
-    rng, rate, steps = np.random.default_rng(5), (0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 30
-    lump = np.zeros((6, 4))
-    lump[[0, 1, 2, 3, 4, 5], [0, 1, 2, 2, 2, 3]] = 1.0
-    step = (transition(rate, 2, 100_000_000) @ lump)[[0, 1, 4, 5]]
-    prior, belief = [0.1, 0.1, 0.3, 0.5], ExplanationBelief.from_priors(len(DIRECTIONS), 0.2, 0.3, 0.5)
-    graph = gtsam.DiscreteFactorGraph()
-    graph.add([(0, 4)], " ".join(map(str, prior)))
-    for i in range(1, steps + 1):
-        heard, answer = rng.normal(0, 2, 4), Absent(0.2) if i % 3 else Present(0.1, 0.05)
-        likelihood = np.exp(heard + co_terms(answer))
-        graph.add([(i - 1, 4), (i, 4)], " ".join(f"{p:.17g}" for p in step.ravel()))
-        graph.add([(i, 4)], " ".join(f"{p:.17g}" for p in likelihood))
-        belief = belief.predict(rate, 100_000_000).update(evidence(*heard), co_terms(answer))
-    expected = gtsam.DiscreteMarginals(graph).marginalProbabilities((steps, 4))
-    got = [*belief.sides.hidden, *belief.sides.hypotheses[1:]]
-    assert got == pytest.approx(np.asarray(expected).ravel(), abs=1e-8)
-
-
-@given(logs, logs, logs, logs)
-def test_blind_vision_is_neutral_and_perfect_vision_removes_the_visible(left, right, visible, none):
-    start = ExplanationBelief.from_priors(len(DIRECTIONS), 0.2, 0.3, 0.5)
-    heard = evidence(left, right, visible, none)
-    blind = start.update(heard, co_terms(Absent(1.0)))
-    unasked = start.update(heard, co_terms(Unqueried("-")))
-    assert blind.probabilities == pytest.approx(unasked.probabilities)
-    assert start.update(heard, co_terms(Absent(0.0))).sides.hypotheses[1] < 1e-200
-
-
-@given(st.floats(0.01, 0.99), st.floats(0.0, 0.2))
-def test_hand_over_moves_mass_into_view_and_keeps_the_sum(hidden, residual):
-    start = ExplanationBelief.from_priors(len(DIRECTIONS), hidden, (1 - hidden) / 2, (1 - hidden) / 2)
-    start = start.predict((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 10**9)
-    before, emerged = start.sides, start.emerge(0, residual)
-    after = emerged.sides
-    assert after.hidden == pytest.approx(tuple(residual * one for one in before.hidden), abs=1e-12)
-    assert after.emerged[0] == pytest.approx(0.0, abs=1e-12)
-    assert emerged.probabilities.sum() == pytest.approx(1.0)
-
-
-def test_what_came_into_view_is_remembered_by_side():
+def test_what_came_into_view_is_remembered_by_side() -> None:
     """A hidden source that merely stops being hidden is still the one that was heard before."""
-    rate = (0.05, 0.3, 0.1, 0.05, 0.05, 0.3)
-    belief = ExplanationBelief.from_priors(len(DIRECTIONS), 0.0, 0.0, 1.0)
-    heard_hidden, heard_in_view = evidence(2.0, 0.0, 0.0, 0.0), evidence(0.0, 0.0, 2.0, 0.0)
-    for heard in [heard_hidden] * 30 + [heard_in_view] * 30:
-        belief = belief.predict(rate, 10**8).update(heard, co_terms(Unqueried("-")))
-    assert belief.sides.hypotheses[1] > 0.8
-    assert belief.sides.emerged[0] > 0.7 > 0.1 > belief.sides.emerged[1]
+    world = WorldFilter()
+    for hop in range(1, 61):
+        heard = (5.0, 0.0, 0.0, 0.0) if hop <= 30 else (0.0, 0.0, 5.0, 0.0)
+        world = world.update(window(hop * 10**8, heard))
+    assert world.belief.hypotheses[1] > 0.8
+    assert world.belief.emerged[0] > 5.0 * world.belief.emerged[1]

@@ -167,8 +167,9 @@ def numbers(state: WorldState, names: dict[str, str]) -> dict[str, object]:
 
     def note(place: str, value: object) -> None:
         if isinstance(value, dict):
-            for number, (key, part) in enumerate(value.items()):
-                note(f"{place}.{number if key[:5] == 'look ' else key}", part)
+            for key, part in value.items():
+                kind, _, source = key.partition(" ")
+                note(f"{place}.{kind}{source and names.get(source, source)}", part)
         elif isinstance(value, list):
             parts = [(one.get("sensor"), one) if isinstance(one, dict) else (one, one) for one in value]
             is_named = place.endswith(("sensors", "searched", "heard", "sources"))
@@ -277,7 +278,7 @@ def test_the_128_likeliest_are_kept_and_what_is_only_heard() -> None:
 def test_sources_and_sensors_unheard_for_an_hour_are_forgotten() -> None:
     def told(hop: int, name: str, world: WorldFilter) -> WorldFilter:
         look = Look(f"camera {name}", hop * 10**8, Absent(0.04, 0.01))
-        world = world.update(replace(crowded(hop, ()), source=f"sound {name}", look=look))
+        world = world.update(replace(crowded(hop, (), hidden=-4.0), source=f"sound {name}", look=look))
         world = world.update(PositionScan(f"radar {name}", hop * 10**8))
         return world.update(Odometry(f"wheels {name}", hop * 10**8, 5.0))
 

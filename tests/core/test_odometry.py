@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter
-from worldstate.abduction.co_evidence import Absent
+from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.camera.detections import read_any_detections
 from worldstate.adapters.files.odometry_file import OdometryRecord, read_odometry
 from worldstate.belief.association import reached_edge
@@ -125,20 +127,31 @@ def test_a_turned_ego_vehicle_has_the_same_place_turned(yaw_rad: float) -> None:
         assert miss[1].miss_rate == pytest.approx(miss[0].miss_rate, abs=1e-9)
 
 
+@pytest.mark.parametrize("sequence", [False, True])
 @pytest.mark.parametrize("context", [CORNERS, OPEN])
-def test_nobody_is_hidden_where_nothing_hides_anybody(context: Context) -> None:
-    # Past both corners, or on an open road: the same sound that raises an advisory behind a corner.
-    world = WorldFilter(context)
+def test_nobody_is_hidden_where_nothing_hides_anybody(context: Context, sequence: bool) -> None:
+    """Past both corners, or on an open road, whatever is heard, seen or usual elsewhere."""
+    groups, even = np.full((2, len(GROUPS)), 1e-3), np.full(len(GROUPS), 1.0 / len(GROUPS))
+    groups[[0, 1], [GROUPS.index("coming_1s"), GROUPS.index("other")]] = 1.0
+    told = SequenceReading(groups / groups.sum(axis=1, keepdims=True), even, 0.1, SequenceAlarm(0.0, 20.0))
+
+    def hop(number: int, *boxes: Sighting) -> Measurement:
+        one = replace(heard(0.1 * number, 8.0), sequence=told if sequence else None, sightings=boxes)
+        return replace(one, co_evidence=Present(0.04)) if boxes else one
+
+    behind, world = WorldFilter(CORNERS), WorldFilter(context)
+    for number in range(1, 15):
+        behind = behind.update(hop(number))
+    assert behind.state.entities and behind.state.cues[0].advisory is not None
+    assert (world.belief.risk < 1e-6) == (context is OPEN)
     if context is CORNERS:
-        behind = world
-        for hop in range(1, 15):
-            behind = behind.update(heard(0.1 * hop))
-        assert behind.state.entities and behind.state.cues[0].advisory is not None
-        world = world.update(odometry(0.0, 0.0, pose=EgoPose((9.0, 0.0))))
-    for hop in range(1, 15):
-        world = world.update(heard(0.1 * hop))
-    assert not world.state.entities
-    assert all(cue.advisory is None and cue.risk < 1e-6 for cue in world.state.cues)
+        world = behind.update(odometry(1.5, 0.0, pose=EgoPose((9.0, 0.0))))
+    edge_rad = world.state.context.occluders[0].edge_azimuth_rad
+    for number in range(16, 36):
+        boxes = [Sighting(edge_rad - 0.02 * (number - 20), 0.02, "car", 0.9)] * (20 <= number < 24)
+        world = world.update(hop(number, *boxes))
+        assert world.belief.risk < 1e-6 and not any(cue.advisory for cue in world.state.cues)
+        assert not any(one.status == "hidden" for one in world.state.entities)
     assert not any(one.hides for one in world.state.context.occluders)
 
 

@@ -28,6 +28,7 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.hidden_bearing import time_to_visible
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, update_bearing
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
+from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Odometry, Position, PositionScan, SearchedSector, Sector
@@ -82,6 +83,7 @@ def test_what_is_published_is_a_kalman_filters_mean_and_covariance(seed: int) ->
     """One car, positions with and without velocity, at uneven times; filterpy is the oracle."""
     rng, now_ns, world = np.random.default_rng(seed), 10**9, WorldFilter()
     truth, kalman = np.array([30.0, 5.0, -4.0, 1.0]), KalmanFilter(dim_x=4, dim_z=2)
+    unknown = StreetModel().speed_mps ** 2
     for step in range(12):
         step_ns = int(rng.integers(3 * 10**7, 3 * 10**8)) if step else 0
         now_ns, dt_s = now_ns + step_ns, step_ns * 1e-9
@@ -95,7 +97,7 @@ def test_what_is_published_is_a_kalman_filters_mean_and_covariance(seed: int) ->
             PositionScan("radar", now_ns, (found,), replace(RADAR, detection_probability=0.9))
         )
         if step == 0:
-            kalman.x, kalman.P = np.zeros(4), np.diag([0.0, 0.0, 100.0, 100.0])
+            kalman.x, kalman.P = np.zeros(4), np.diag([0.0, 0.0, unknown, unknown])
             kalman.x[:known], kalman.P[:known, :known] = z, R
             continue
         kalman.F = np.eye(4) + dt_s * np.eye(4, k=2)
@@ -159,7 +161,7 @@ def test_polar_motion_is_where_a_vehicle_driving_on_is_seen(seed: int) -> None:
 def test_empty_scans_take_existence_down_by_the_bernoulli_rule(detection: float) -> None:
     searched = replace(RADAR, detection_probability=detection)
     there = Position((20.0, 2.0), diagonal(0.3, 0.3, 0.3, 0.3), (0.0, 0.0))
-    patient = WorldFilter(settings=FilterSettings(delete_existence=1e-6))
+    patient = WorldFilter(settings=FilterSettings(street=StreetModel(death=1e-6)))
     world = after(*[replace(radar(t, there), searched=searched) for t in (0.5, 1.0)], world=patient)
     (car,) = world.state.entities
     r = car.existence_probability
@@ -217,6 +219,7 @@ def test_a_hidden_vehicle_announced_by_radio_alone_is_an_entity_with_a_place() -
     left, right = world.state.cues
     assert left.advisory and not right.advisory and left.risk > 0.9 > 0.1 > right.risk
     assert left.entity_id == car.id and left.time_to_visible_s == car.time_to_visible_s
+    assert (left.statistic, left.log_lambda) == (None, None)  # Of a window, and there was none
     assert WorldState.from_json(world.state.to_json()) == world.state
 
 
@@ -234,9 +237,9 @@ def test_who_stands_or_drives_away_behind_a_corner_is_an_entity_without_an_advis
 
 
 def test_vehicles_announced_on_both_sides_are_advised_of_whatever_the_sound_says() -> None:
-    """With a sequence model that hears nothing, and without one."""
+    """With a sequence model whose reading does not reach its threshold, and without one."""
     quiet = np.full(len(GROUPS), 1.0 / len(GROUPS))
-    reading = SequenceReading(np.stack([quiet, quiet]), quiet, 0.0, SequenceAlarm(50.0, 20.0))
+    reading = SequenceReading(np.stack([quiet, quiet]), quiet, 0.0, SequenceAlarm(1.0, 20.0))
     for said in (None, reading):
         world = WorldFilter()
         for hop in range(1, 8):
@@ -244,7 +247,9 @@ def test_vehicles_announced_on_both_sides_are_advised_of_whatever_the_sound_says
             right = replace(left, position_m=(10.0, -left.position_m[1]), velocity_mps=(0.0, 8.0))
             sound = replace(heard(hop / 10), sequence=said)
             world = after(sound, radio(hop / 10 + 0.05, left, right), world=world)
-        assert [bool(cue.advisory) for cue in world.state.cues] == [True, True]
+        cues = world.state.cues
+        assert [bool(cue.advisory) for cue in cues] == [True, True]
+        assert {cue.evidence.hypothesis for cue in cues} == {"announced"}
         assert sorted(one.direction for one in world.state.entities) == ["left", "right"]
         assert not any(cue.advisory for cue in world.predict(1.2).state.cues)
 

@@ -23,7 +23,7 @@ from worldstate import (
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.road_users import Familiar, Foreign, WarningSignal
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_model import GROUPS, AlarmPromise, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.measurement import Approach, Heard, Look, Position, PositionScan, SearchedSector, Sector
 from worldstate.measurement.odometry import EgoPose, Odometry
@@ -40,7 +40,9 @@ def reading(rng: np.random.Generator, comes: tuple[str | None, str | None], alon
     for side, name in enumerate(comes):
         groups[side, GROUPS.index(name or ("other" if any(comes) else "none"))] += rng.uniform(1.0, 1.2)
     groups[:, GROUPS.index("other")] += alone * any(comes)
-    return SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, SequenceAlarm(1.0, 20.0))
+    rates = np.sort(groups[0, :6]).tolist()
+    alarm = SequenceAlarm(1.0, 20.0, rates[0] if any(comes) else None, AlarmPromise(*rates))
+    return SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, alarm)
 
 
 def street(
@@ -129,6 +131,7 @@ def states() -> Iterator[WorldState]:
         rates=Rates(*rng.uniform(0.01, 0.1, 6).tolist()),
         occluders=(corner_at("left", (8.0, 4.0), 12.0), open_side("right", -1)),
         priors=Priors(0.1, 0.3, 0.6),
+        hidden_by_side={"left": 0.2},
         ego_speed_mps=1.0,
         degradation=0.2,
         site="there",

@@ -17,6 +17,7 @@ from worldstate import (
     WorldFilter,
     nanoseconds,
 )
+from worldstate.belief.street_model import StreetModel
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "v2x_beacon.py"
 
@@ -41,7 +42,9 @@ def test_hidden_by_radio_then_visible_with_the_same_id(v2x):
     (seen,) = at[nanoseconds(4.5)].entities
     assert (hidden.status, hidden.direction, seen.status) == ("hidden", "left", "visible")
     assert hidden.id == seen.id
-    assert at[nanoseconds(3.0)].risk > 0.9 > 0.1 > at[nanoseconds(4.5)].risk
+    assert at[nanoseconds(3.0)].risk > 0.9
+    # One in six is followed by another one, until beacons are heard beside the vehicle again.
+    assert at[nanoseconds(4.5)].risk < 0.2 and at[nanoseconds(5.5)].risk < 0.05
     assert hidden.tta_s == pytest.approx(15.0**2 / 8.0 / 15.0 * (1 + 100 / 225), rel=0.3)
     advisory = [s.stamp_ns for s in states if any(cue.advisory for cue in s.cues)]
     assert advisory
@@ -49,14 +52,20 @@ def test_hidden_by_radio_then_visible_with_the_same_id(v2x):
 
 
 def test_a_forged_beacon_in_plain_view_is_refuted_by_what_the_camera_does_not_see(v2x):
-    """A claim to stand in the open, with the power of the open: only the missing car tells."""
+    """A claim to stand in the open, with the power of the open: only the missing car tells.
+
+    It tells as far as the camera is known to work: the longer claims go on, the likelier it is broken.
+    """
     signature = v2x.RadioSignature()
     plain = v2x.Beacon(0, 20.0, 0.0, -5.0, 0.0, signature.transmit_dbm - signature.loss_at_1_m_db - 26.0)
-    forged = [replace(plain, stamp_ns=nanoseconds(i / 10)) for i in range(1, 81)]
-    refuted = last(v2x.run(forged, v2x.ScriptedCamera([], t0_s=0.0)))
+    forged = [replace(plain, stamp_ns=nanoseconds(i / 10)) for i in range(1, 11)]
+    camera, works = v2x.ScriptedCamera([], t0_s=0.0), StreetModel(works=1.0, fails_s=1e6)
+    refuted = last(v2x.run(forged, camera, replace(v2x.SETTINGS, street=works)))
     believed = last(v2x.run(forged, None))
+    doubted = last(v2x.run(forged, camera))
     assert refuted.cues[0].hypotheses.none > 0.9
     assert believed.cues[0].hypotheses.visible > 0.9
+    assert refuted.cues[0].hypotheses.none > doubted.cues[0].hypotheses.none > 0.1
     # A camera that misses almost everything refutes nothing.
     blind = last(v2x.run(forged, v2x.ScriptedCamera([], t0_s=0.0, miss_rate=0.99)))
     assert blind.cues[0].hypotheses.visible > 0.9
@@ -102,7 +111,7 @@ def test_beacons_and_sound_share_one_filter(v2x):
     sound = [Measurement(m.stamp_ns, faint, Unqueried("-"), NotUsable("-"), NotUsable("-")) for m in radio]
 
     def heard(measurements):
-        world = WorldFilter()
+        world = WorldFilter(settings=v2x.SETTINGS)
         for m in sorted(measurements, key=lambda m: (m.stamp_ns, m.source)):
             world = world.predict_to(m.stamp_ns).update(m)
         return world
@@ -111,7 +120,7 @@ def test_beacons_and_sound_share_one_filter(v2x):
     assert both.belief.hidden[0] > max(heard(w).belief.hidden[0] for w in (radio, sound))
     (entity,) = both.state.entities
     assert set(entity.sources) <= {"acoustic", "v2x"}
-    assert set(both.memory.rules) == {"acoustic", "v2x"}
+    assert set(both.memory.sources) == {"acoustic", "v2x"}
 
 
 @pytest.mark.parametrize("example", ["v2x_beacon.py", "own_loop.py"])

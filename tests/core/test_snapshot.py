@@ -4,24 +4,38 @@ import copy
 import json
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from importlib.resources import files
 from pathlib import Path
+from typing import get_args
 
 import jsonschema
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from snapshot_laws import broken_laws
+from watched_street import START_NS, false_alarms, heard
 
+from worldstate import Sighting, WorldFilter
+from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
+from worldstate.abduction.road_users import Familiar, Foreign
+from worldstate.abduction.sequence.sequence_reader import TOO_FEW
+from worldstate.ground import NotUsable
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
+from worldstate.measurement import Heard
 from worldstate.state import (
     Advisory,
+    Budget,
     Classification,
     Context,
     Delivery,
     Entity,
     Event,
     EvidenceTerms,
+    Hearing,
     Occluder,
     Priors,
     Rates,
@@ -29,10 +43,14 @@ from worldstate.state import (
     RiskCue,
     SearchedView,
     SensorHealth,
+    Tally,
     Visibility,
     WorldState,
     snapshot_schema,
 )
+from worldstate.state.cue import WhyNot
+from worldstate.state.sensor import MASKED
+from worldstate.state.world_state import judged
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "docs" / "_ext"))
 import json_schema
@@ -62,14 +80,14 @@ def priors(draw):
 entities = st.builds(
     Entity,
     id=st.uuids().map(str),
-    status=st.sampled_from(["hidden", "emerged", "visible"]),
+    status=st.sampled_from(["hidden", "emerged", "visible", None]),
     existence_probability=unit,
-    hidden_probability=unit,
+    hidden_probability=maybe(unit),
     azimuth_rad=azimuth,
     azimuth_std_rad=number,
     created_ns=stamp,
     updated_ns=stamp,
-    classification=st.lists(st.builds(Classification, name, unit), max_size=3).map(tuple),
+    classification=maybe(st.lists(st.builds(Classification, name, unit), max_size=3).map(tuple)),
     moving=st.booleans(),
     direction=maybe(name),
     azimuth_rate_rad_s=maybe(number),
@@ -90,16 +108,18 @@ relations = st.builds(Relation, name, name, name, unit, stamp)
 sensors = st.builds(
     SensorHealth, name, st.sampled_from(["working", "impaired", "silent"]), stamp, maybe(name)
 )
+REASONS = get_args(WhyNot)
 cues = st.builds(
-    RiskCue,
-    direction=name,
+    lambda why_not, **fields: RiskCue(**fields, usable=not why_not, why_not=tuple(why_not)),
+    why_not=st.lists(st.sampled_from(REASONS), unique=True),
+    direction=maybe(name),
     azimuth_rad=azimuth,
     azimuth_std_rad=number,
-    risk=unit,
-    confidence=unit,
-    statistic=unit,
+    risk=maybe(unit),
+    confidence=maybe(unit),
+    statistic=maybe(unit),
     log_lambda=maybe(number),
-    hypotheses=priors(),
+    hypotheses=maybe(priors()),
     advisory=maybe(st.builds(Advisory, stamp, stamp, st.lists(sensors, max_size=2).map(tuple))),
     alpha=maybe(unit),
     entity_id=maybe(name),
@@ -116,6 +136,11 @@ cues = st.builds(
             number,
         )
     ),
+)
+hearings = st.builds(Hearing, name, unit, stamp, st.sampled_from([None, "wind", MASKED]))
+verdicts = st.sampled_from(["kept", "in doubt", "broken", "unwatched"])
+budgets = st.builds(
+    Budget, verdicts, maybe(name), st.dictionaries(name, number, max_size=2), number, st.just(Tally())
 )
 kinds = ["born", "handed_over", "coasting", "hidden_again", "died", "merged"]
 events = st.builds(Event, stamp, st.sampled_from(kinds), name)
@@ -140,8 +165,13 @@ states = st.builds(
     entities=st.lists(entities, max_size=4, unique_by=lambda e: e.id).map(tuple),
     relations=st.lists(relations, max_size=4, unique_by=lambda r: (r.src, r.dst, r.kind)).map(tuple),
     context=contexts,
-    cues=st.lists(cues, max_size=3, unique_by=lambda c: c.direction).map(tuple),
+    cues=st.lists(cues, max_size=3, unique_by=lambda c: (c.direction, c.azimuth_rad)).map(tuple),
     clock=name,
+    calibrated=st.booleans(),
+    domain=st.sampled_from([None, Familiar(-2.0), Foreign("sounds like speech", 2.0)]),
+    no_sequence=st.sampled_from([None, TOO_FEW, NotUsable("the model has none")]),
+    heard=maybe(st.lists(hearings, max_size=2, unique_by=lambda h: h.sensor).map(tuple)),
+    budget=maybe(budgets),
     valid_until_ns=maybe(stamp),
     sensors=st.lists(sensors, max_size=2, unique_by=lambda s: s.sensor).map(tuple),
     searched=st.lists(views, max_size=2, unique_by=lambda v: v.sensor).map(tuple),
@@ -265,7 +295,7 @@ def test_no_json_is_refused(text):
 
 def test_unknown_keys_are_ignored_and_minor_versions_read():
     value = full_state().to_dict()
-    value |= {"mood": "fine", "schema": {"name": "worldstate.Snapshot", "version": "3.9.3"}}
+    value |= {"mood": "fine", "schema": {"name": "worldstate.Snapshot", "version": "4.9.3"}}
     value["entities"][0]["colour"] = "red"
     assert WorldState.from_dict(value) == full_state()
     VALIDATOR.validate(value)
@@ -277,7 +307,7 @@ def test_unknown_keys_are_ignored_and_minor_versions_read():
 )
 def test_another_major_version_is_refused_with_what_to_do(version, advice):
     value = full_state().to_dict() | {"schema": {"name": "worldstate.Snapshot", "version": version}}
-    with pytest.raises(SchemaVersionError, match=rf"expected schema worldstate\.Snapshot 3\.x.*{advice}"):
+    with pytest.raises(SchemaVersionError, match=rf"expected schema worldstate\.Snapshot 4\.x.*{advice}"):
         WorldState.from_dict(value)
     assert not VALIDATOR.is_valid(value)
 
@@ -292,6 +322,98 @@ def test_unknown_is_null():
     written = json.loads(full_state().to_json())["entities"][0]
     unknown = ("range_m", "position_m", "velocity_mps", "tta_s", "last_seen_ns")
     assert [written[key] for key in unknown] == [None] * 5
+
+
+STREET = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02), start_ns=START_NS)
+ABSENT, PRESENT = Absent(0.04, 0.01), Present(0.04, 0.01)
+QUIET = heard(1, None, ABSENT)
+BOX, LOUD = Sighting(0.3, 0.02, "car", 0.9), Heard(excess_db=20.0)
+IN_VIEW = [replace(heard(k, None, PRESENT), sightings=(BOX,), heard=LOUD) for k in range(1, 9)]
+
+
+@pytest.mark.parametrize(
+    ("world", "expected"),
+    [
+        (STREET.update(QUIET), ()),
+        (replace(STREET, policy=uncalibrated_policy()).update(QUIET), ("uncalibrated",)),
+        (STREET.update(replace(QUIET, heard=Heard(0.0, "lost samples"))), ("unheard",)),
+        (STREET.update(replace(QUIET, domain=Foreign("sounds like speech", 2.0))), ("unknown sound",)),
+        (STREET.update(replace(QUIET, sequence=TOO_FEW)), ("too little sound",)),
+        (reduce(WorldFilter.update, false_alarms(), STREET), ("budget broken",)),
+        (STREET.update(QUIET).predict(2.0), ("unheard", "expired")),
+        (reduce(WorldFilter.update, IN_VIEW, STREET), ("masked",)),
+    ],
+    ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
+)  # fmt: skip
+def test_a_cue_with_a_fault_is_not_usable_and_never_absent(world, expected):
+    state = world.state
+    assert [(cue.direction, cue.why_not, cue.usable) for cue in state.cues] == [
+        (side, expected, not expected) for side in ("left", "right")
+    ]
+    assert broken_laws(state) == []
+
+
+def hears(*pairs: tuple[float, str | None]) -> tuple[Hearing, ...]:
+    return tuple(Hearing(f"array {k}", share, 0, reason) for k, (share, reason) in enumerate(pairs))
+
+
+# What is wrong with a snapshot whose cues may be acted on, and the reason that follows from it.
+FAULTS: dict[str, tuple[Callable[[WorldState], WorldState], ...]] = {
+    "uncalibrated": (lambda one: replace(one, calibrated=False),),
+    "masked": (
+        lambda one: replace(one, heard=hears((0.5, MASKED))),
+        lambda one: replace(one, heard=hears((0.5, MASKED), (0.1, "wind"))),
+    ),
+    "unheard": (
+        lambda one: replace(one, heard=()),
+        lambda one: replace(one, heard=hears((0.0, "lost samples"), (0.1, "wind"))),
+    ),
+    "unknown sound": (lambda one: replace(one, domain=Foreign("sounds like speech", 2.0)),),
+    "too little sound": (lambda one: replace(one, no_sequence=TOO_FEW),),
+    "budget broken": (
+        lambda one: replace(one, budget=Budget("broken", "more false onsets", {}, 25.0, Tally())),
+    ),
+    "expired": (lambda one: replace(one, stamp_ns=one.valid_until_ns + 1),),
+}
+
+
+@given(states, st.sets(st.sampled_from(REASONS)), st.integers(0, 1))
+def test_a_cue_is_usable_unless_a_reason_applies_and_all_that_apply_are_given(state, wrong, variant):
+    # Nothing wrong, in every way in which nothing is: the budget may be in doubt, one of two arrays masked.
+    fine = replace(
+        state, calibrated=True, heard=hears((0.3, MASKED), (0.9, "wind")) if variant else None,
+        domain=Familiar(-2.0) if variant else None, valid_until_ns=state.stamp_ns if variant else None,
+        no_sequence=NotUsable("the model has none") if variant else None,
+        budget=Budget("in doubt", None, {}, 25.0, Tally()) if variant else None,
+    )  # fmt: skip
+    told = judged(fine)
+    # A side that no source distinguishes has no evidence, and nothing vouches for its cue.
+    alone = [() if cue.evidence else ("uncalibrated",) for cue in state.cues]
+    assert told.calibrated and [cue.why_not for cue in told.cues] == alone
+    faulty = replace(fine, valid_until_ns=fine.stamp_ns)
+    for reason, changes in FAULTS.items():  # What is unheard is not masked: it comes later here
+        faulty = changes[variant % len(changes)](faulty) if reason in wrong else faulty
+    told = judged(faulty)
+    expected = tuple(one for one in REASONS if one in wrong - ({"masked"} if "unheard" in wrong else set()))
+    assert [cue.why_not for cue in told.cues] == [expected or one for one in alone]
+    assert told.calibrated == wrong.isdisjoint({"uncalibrated", "unheard", "budget broken"})
+
+
+@given(states)
+def test_judging_changes_nothing_but_what_may_be_acted_on(state):
+    told = judged(state)
+    for cue, before in zip(told.cues, state.cues, strict=True):
+        assert replace(cue, usable=before.usable, why_not=before.why_not) == before
+        assert cue.usable == (cue.why_not == ())
+    assert replace(told, cues=state.cues, calibrated=state.calibrated) == state
+
+
+@pytest.mark.parametrize(("usable", "why_not"), [(True, ["masked"]), (False, []), (True, ["rain"])])
+def test_a_cue_that_contradicts_its_reasons_is_refused(usable, why_not):
+    value = full_state().to_dict()
+    value["cues"][0] |= {"usable": usable, "why_not": why_not}
+    with pytest.raises(InvalidArgumentError, match=r"snapshot\.cues\[0\].*expected"):
+        WorldState.from_dict(value)
 
 
 def test_the_graph_holds_every_relation():

@@ -23,7 +23,7 @@ from worldstate.adapters.listener import Listener
 from worldstate.adapters.live.live_sensors import DetectionSocket, Trust, signed
 from worldstate.adapters.source import open_source
 from worldstate.adapters.state_log import read_log
-from worldstate.core.filter import MOST_BOXES
+from worldstate.core.memory import MOST_BOXES
 from worldstate.frontend.array.microphone_array import ovad_array
 
 RATE, SECRET = 8_000, b"sixteen bytes or more"

@@ -87,7 +87,7 @@ def test_the_view_shows_bearing_risk_and_losses(street):
     assert "2.0 s   latency" in shown
     assert "3 overruns, 0.07 s lost" in shown or "3 overruns, 0.08 s lost" in shown
     assert [line.split()[0] for line in shown.splitlines() if "risk" in line] == ["left", "right"]
-    assert "not calibrated" in shown
+    assert "not usable: uncalibrated" in shown
 
 
 @pytest.mark.long

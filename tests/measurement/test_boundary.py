@@ -216,7 +216,7 @@ def test_what_is_no_measurement_is_refused():
         with pytest.raises(InvalidArgumentError, match="measurement: expected"):
             world.update(wrong)
     other = SignatureEvidence(("one", "two"), (0.0, 0.0), 0.0, 0.0)
-    with pytest.raises(InvalidArgumentError, match="signature: expected the directions"):
+    with pytest.raises(InvalidArgumentError, match="signature: expected one of the directions"):
         world.update(measured(2, signature=other))
 
 

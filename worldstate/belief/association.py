@@ -7,51 +7,28 @@ from functools import lru_cache
 
 import numpy as np
 
+from worldstate.abduction.evidence import MOST_NATS
 from worldstate.abduction.road_users import SEEN_AS, ClassShares
 from worldstate.belief.kinematics.cartesian import full_measurement
-from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
-from worldstate.ground import BoolArray, FloatArray, wrap_angle
+from worldstate.belief.kinematics.motion import AZIMUTH, LARGEST_STD, LOG_RANGE
+from worldstate.ground import CERTAIN_NATS, TINY, BoolArray, FloatArray, wrap_angle
 
 from .detection import Detections
-from .site_geometry import HIDDEN_BIAS_STD, SiteGeometry, normal_share
+from .site_geometry import SiteGeometry, normal_share
+from .street_model import StreetModel
 from .track import Track, Tracks, side_weights
 
 # Of a pair outside the gate; below any sum of scores within it.
-FORBIDDEN = -1e6
-# Of pairing a parked with a moving object, nats: below the gate's 4 deviations, so that any free partner is
-# preferred, and finite, so that a parked car that drives off keeps its id.
-_PARKED_MISMATCH = -10.0
-_UNFORESEEN = 0.05  # Of a vehicle that comes into view, whatever the sound had said of the time
-_LEAST = 1e-300  # Keeps logarithms finite
+FORBIDDEN = -MOST_NATS
 # Of a table of events and pairs: all of five tracks and five measurements, or of three and twelve.
 _MOST_ENTRIES = 100_000
 _ROUNDS = 30  # After these messages of twenty tracks that stand abreast change by less than 1e-3
-_SETTLED = 1e-9  # Existence is stated in nine digits
-_MOST_NATS = 25.0  # Sums that leave one term out keep their digits
-# Deviations and radians of a sighting of an entity in view. The second bounds the first: four deviations of
-# an entity unseen for a second are most of the view.
-_GATE_SIGMA, GATE_RAD = 4.0, 0.35
-# Of the leading ends of first sightings about the edge that they come past: corners of real junctions stand
-# within 6 degrees of the default; missed once or twice, a vehicle moves on by 3 to 6 degrees an image. By its
-# middle, what turns in ahead or pulls out from the kerb, wholly in view at once, would seem to come past it.
-EDGE_STD_RAD = 0.15
-# P(the signature names the wrong side): rarely on junctions that its model was trained on, often on others.
-_SIDE_CONFUSION = 0.2
-# No statement is certain, and a refuted claim that is repeated can still turn out to be true: what was taken
-# to be in view stood behind something that the context does not name.
-MOST_EXISTENCE, LEAST_EXISTENCE = 0.999, 1e-3
-# m/s, of a velocity that was not measured: wide, so that it decides nothing.
-_ANY_SPEED_STD = 100.0
-# m/s, of vehicles in a street: twice the speed limit in town covers nearly all.
-_SPEED_STD = 15.0
-# Of the squared Mahalanobis distance of a position: .9997 of chi-square with four degrees of freedom, as four
-# deviations of a bearing are.
-_GATE = 21.0
-# Of P(hidden), left by a hand-over: at zero, a second vehicle behind the corner would have to be found anew.
-HANDOVER_RESIDUAL = 0.02
+# Of the squared Mahalanobis distance of a bearing or a position: 0.9997 of chi-square with four degrees of
+# freedom.
+GATE = 21.0
 # As detectors call them. What was heard drives: a detector has misread its label, or the ear the kind.
 _VEHICLES = frozenset().union(*SEEN_AS.values())
-_ON_FOOT, _MISREAD = frozenset({"person", "pedestrian"}), 0.1
+_ON_FOOT = frozenset({"person", "pedestrian"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +67,7 @@ def associated(tracks: Tracks, detections: Detections, site: SiteGeometry) -> As
     """
     detected = tracks.detected
     # A radar also finds some of what is hidden.
-    unseen = 1.0 - (site.settings.hidden_return if detections.positions else 0.0)
+    unseen = 1.0 - (site.street.hidden_return if detections.positions else 0.0)
     in_sight = detected * (1.0 - tracks.behind * (unseen if detections.in_sight else 0.0))
     if not len(tracks) or not len(detections):
         return joint_association(np.empty((len(detections), len(tracks))), in_sight)
@@ -106,7 +83,7 @@ def joint_association(log_ratios: FloatArray, in_sight: FloatArray | BoolArray) 
     # Within its gate an entity in view takes a measurement before that counts as a new one; a maximum of
     # the two would be a tie of all poor pairs, which the order of measurements would settle.
     gated = log_ratios > FORBIDDEN
-    scores = np.where(gated, np.logaddexp(log_ratios, np.log(np.maximum(in_sight, _LEAST))), log_ratios)
+    scores = np.where(gated, np.logaddexp(log_ratios, np.log(np.maximum(in_sight, TINY))), log_ratios)
     found = _likeliest(scores)
     taken = set(found.values())
     new = [j for j in range(len(log_ratios)) if j not in taken]
@@ -159,14 +136,14 @@ def propagated(log_ratios: FloatArray) -> FloatArray:
     >>> propagated(np.log([[3.0, 1.0]])).round(3)
     array([[0.6, 0.2]])
     """
-    weight = np.exp(np.minimum(log_ratios, _MOST_NATS))
+    weight = np.exp(np.minimum(log_ratios, CERTAIN_NATS))
     free = np.ones_like(weight)
     for _ in range(_ROUNDS):
         given = weight * free
         wanted = weight / (1.0 + given.sum(axis=0) - given)
         before, free = free, 1.0 / (1.0 + wanted.sum(axis=1, keepdims=True) - wanted)
         # Of tracks that stand apart four rounds are enough.
-        if np.abs(free - before).max() < _SETTLED:
+        if np.abs(free - before).max() < TINY:
             break
     given = weight * free
     return np.asarray(given / (1.0 + given.sum(axis=0)))
@@ -186,7 +163,7 @@ def _groups(gated: BoolArray) -> list[tuple[list[int], list[int]]]:
     return [([row for row in every if rows >> row & 1], columns) for rows, columns in groups if rows]
 
 
-@lru_cache(maxsize=64)
+@lru_cache
 def _joint_events(rows: int, columns: int) -> FloatArray | None:
     """Return whether a joint event has a pair, shape (rows * columns, events); None of too many."""
     events: list[tuple[int, ...]] = [()]
@@ -219,62 +196,70 @@ def _log_ratios(
 ) -> FloatArray:
     """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
     boxes, found = not detections.positions, detections.found[:, None]
-    existence = np.minimum(np.maximum(tracks.existence, LEAST_EXISTENCE), MOST_EXISTENCE)
+    existence = np.minimum(np.maximum(tracks.existence, site.street.doubt), 1.0 - site.street.doubt)
     if detections.in_sight:
-        found = np.maximum(found * np.where(detected, in_sight, 1.0), _LEAST)
+        found = np.maximum(found * np.where(detected, in_sight, 1.0), TINY)
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
-    density = _azimuth_density(tracks, detected, detections)
+    density = _azimuth_density(tracks, detected, detections, site)
     if detections.in_sight and not detected.all():
         # What was only heard is found where it comes into view.
         heard = np.flatnonzero(~detected)
         hidden = tracks.taken(heard).rows()
-        density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), _LEAST))
+        density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), TINY))
         reached = np.array([reached_edge(one, site) for one in hidden])
         likely[:, heard] = np.log(existence[heard] * reached)
-        density[:, heard] += np.log(np.maximum(detections.line_of_sight(site), _LEAST))[:, None]
+        density[:, heard] += np.log(np.maximum(detections.line_of_sight(site), TINY))[:, None]
     if boxes:
         density += _alike(tracks, detected, detections, site)
     else:
-        density = _density_m2(tracks, detections, density)
+        density = _density_m2(tracks, detections, density, site.street)
     return np.where(density > 0.5 * FORBIDDEN, density + likely - detections.log_new[:, None], FORBIDDEN)
 
 
-def _azimuth_density(tracks: Tracks, detected: BoolArray, detections: Detections) -> FloatArray:
+def _azimuth_density(
+    tracks: Tracks, detected: BoolArray, detections: Detections, site: SiteGeometry
+) -> FloatArray:
     """Return the log density of every detection's azimuth, 1/rad, FORBIDDEN outside the gate of a box."""
     residual = wrap_angle(detections.azimuth_rad[:, None] - tracks.mean[:, AZIMUTH])
     # The sound of a hidden one may come from the edge instead.
-    own = tracks.covariance[:, AZIMUTH, AZIMUTH] + ~detected * HIDDEN_BIAS_STD**2
+    own = tracks.covariance[:, AZIMUTH, AZIMUTH] + ~detected * site.bias_std_rad[tracks.side] ** 2
     variance = own + detections.std_rad[:, None] ** 2
     squares = residual**2 / variance
     density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
-    most, farthest_rad = (_GATE, math.pi) if detections.positions else (_GATE_SIGMA**2, GATE_RAD)
-    return np.where((squares > most) | (np.abs(residual) > farthest_rad), FORBIDDEN, density)
+    farthest_rad = math.pi if detections.positions else site.street.gate_rad
+    return np.where((squares > GATE) | (np.abs(residual) > farthest_rad), FORBIDDEN, density)
 
 
 def _alike(tracks: Tracks, detected: BoolArray, detections: Detections, site: SiteGeometry) -> FloatArray:
     """Return what motion, width and class say of every pair of a box and a track, nats."""
     moving = detections.moving[:, None] > 0.0
-    alike = np.where(moving == tracks.moving, 0.0, _PARKED_MISMATCH)
+    # A parked car that drives off keeps its identity, unless a moving object is as near.
+    alike = np.where(moving == tracks.moving, 0.0, math.log(site.street.doubt))
     known = (detections.width_rad[:, None] > 0.0) & (tracks.width_rad > 0.0) & detected
     logs = [np.log(np.where(one > 0.0, one, 1.0)) for one in (detections.width_rad, tracks.width_rad)]
-    own = site.settings.width_change**2
-    others = own + 2.0 * site.settings.size_spread**2
+    own = site.street.width_change**2
+    others = own + 2.0 * site.street.size_spread**2
     squares = (logs[0][:, None] - logs[1]) ** 2
     alike += np.where(known, 0.5 * (math.log(others / own) - squares * (1.0 / own - 1.0 / others)), 0.0)
     for i in np.flatnonzero(~detected).tolist():
         labels = tracks.labels[i]
-        classes = [math.log(_shared_class(labels, shares[0][0])) for shares in detections.classes]
+        classes = [
+            math.log(_shared_class(labels, shares[0][0], site.street.misread))
+            for shares in detections.classes
+        ]
         alike[:, i] = np.where(moving[:, 0], classes, FORBIDDEN)
     return alike
 
 
-def _density_m2(tracks: Tracks, detections: Detections, azimuth: FloatArray) -> FloatArray:
+def _density_m2(
+    tracks: Tracks, detections: Detections, azimuth: FloatArray, street: StreetModel
+) -> FloatArray:
     """Return the log density of every position, 1/m^2, FORBIDDEN outside the gate.
 
     The velocity enters by how much likelier it is than that of another, so that an entity without a place is
     scored in the same units, by its azimuth and log range.
     """
-    measured = [full_measurement(one, _ANY_SPEED_STD) for one in detections.positions]
+    measured = [full_measurement(one, LARGEST_STD) for one in detections.positions]
     z, noise = np.array([one[0] for one in measured]), np.array([one[1] for one in measured])
     range_m = np.maximum(np.hypot(z[:, 0], z[:, 1]), 1.0)
     along = z[:, :2] / range_m[:, None]
@@ -284,13 +269,13 @@ def _density_m2(tracks: Tracks, detections: Detections, azimuth: FloatArray) -> 
     squares = farther**2 / variance
     # From 1 / (rad log m) to 1 / m^2.
     log_range = -0.5 * (squares + np.log(2.0 * math.pi * variance)) - 2.0 * np.log(range_m)[:, None]
-    density = np.where(squares > _GATE, FORBIDDEN, azimuth + log_range)
+    density = np.where(squares > GATE, FORBIDDEN, azimuth + log_range)
     placed = tracks.placed
     if placed.any():
         mean, covariance = tracks.place_mean[placed], tracks.place_covariance[placed]
         distance, log_density = _log_normal(z[:, None] - mean, noise[:, None] + covariance)
-        _, usual = _log_normal(z[:, 2:], noise[:, 2:, 2:] + _SPEED_STD**2 * np.eye(2))
-        density[:, placed] = np.where(distance > _GATE, FORBIDDEN, log_density - usual[:, None])
+        _, usual = _log_normal(z[:, 2:], noise[:, 2:, 2:] + street.speed_mps**2 * np.eye(2))
+        density[:, placed] = np.where(distance > GATE, FORBIDDEN, log_density - usual[:, None])
     return density
 
 
@@ -300,12 +285,12 @@ def _log_normal(residual: FloatArray, spread: FloatArray) -> tuple[FloatArray, F
     return distance, -0.5 * (distance + np.linalg.slogdet(2.0 * math.pi * spread)[1])
 
 
-def _shared_class(labels: ClassShares, label: str) -> float:
+def _shared_class(labels: ClassShares, label: str, misread: float) -> float:
     """Return P(a detector calls what sounds like some classes by this label)."""
     if label not in _VEHICLES:
-        return _MISREAD if label in _ON_FOOT else 1.0
+        return misread if label in _ON_FOOT else 1.0
     kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in labels)
-    return max(sum(share for matches, share in kinds if matches), _MISREAD)
+    return max(sum(share for matches, share in kinds if matches), misread)
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:
@@ -313,14 +298,14 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
 
     A vehicle believed seconds away from the edge is not the one that appears now.
     """
-    side, near_rad = site.sides[track.side], EDGE_STD_RAD
+    side, near_rad = site.sides[track.side], site.street.edge_std_rad
 
     def near(azimuth_rad: float, std_rad: float) -> float:
         far_rad = side.outwards * wrap_angle(azimuth_rad - side.edge_azimuth_rad)
         return normal_share((2.0 * near_rad - far_rad) / math.hypot(std_rad, near_rad))
 
     by_time = near(track.motion.azimuth_rad, track.motion.azimuth_std_rad)
-    return min(max(by_time / near(side.azimuth_rad, side.std_rad), _UNFORESEEN), 1.0)
+    return min(max(by_time / near(side.azimuth_rad, side.std_rad), site.street.unheard), 1.0)
 
 
 def emergence_density(tracks: Sequence[Track], detections: Detections, site: SiteGeometry) -> FloatArray:
@@ -328,11 +313,12 @@ def emergence_density(tracks: Sequence[Track], detections: Detections, site: Sit
     widths_rad = np.nan_to_num(detections.width_rad).tolist()
     ends = list(zip(detections.azimuth_rad.tolist(), widths_rad, strict=True))
     from_edge_rad = [[side.distance_rad(*end) for side in site.sides] for end in ends]
-    deviations = np.array(from_edge_rad) / EDGE_STD_RAD
+    spread_rad, confused = site.street.edge_std_rad, site.street.side_confusion
+    deviations = np.array(from_edge_rad) / spread_rad
     # Of first sightings about the edge that they come past, 1/rad.
-    near = np.exp(-0.5 * deviations**2) / (EDGE_STD_RAD * math.sqrt(2.0 * math.pi))
+    near = np.exp(-0.5 * deviations**2) / (spread_rad * math.sqrt(2.0 * math.pi))
     heard = np.empty_like(near)
     for side in range(len(site.sides)):
         others = np.delete(near, side, axis=1).max(axis=1) if len(site.sides) > 1 else near[:, side]
-        heard[:, side] = (1.0 - _SIDE_CONFUSION) * near[:, side] + _SIDE_CONFUSION * others
+        heard[:, side] = (1.0 - confused) * near[:, side] + confused * others
     return np.asarray(heard @ np.array([side_weights(track, len(site.sides)) for track in tracks]).T)

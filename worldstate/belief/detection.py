@@ -9,17 +9,14 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
-from worldstate.belief.kinematics.motion import LEAST_STD
+from worldstate.belief.kinematics.motion import FARTHEST_M, LEAST_STD
 from worldstate.ground import FloatArray, wrap_angle
 from worldstate.measurement import CameraLook, Sector
 from worldstate.measurement.position import Position, PositionScan
 
-from .site_geometry import CLUTTER_RATE, SiteGeometry
+from .site_geometry import SiteGeometry
+from .street_model import StreetModel
 
-# A look said to miss everything would carry no information; its miss rate is capped here.
-_MOST_MISSES = 0.99
-# m^2: messages tell of half a disc of 100 m.
-_RADIO_AREA_M2 = 0.5 * math.pi * 100.0**2
 # m/s: slower is parked, as far as a radar or a positioning receiver can tell.
 _PARKED_MPS = 0.5
 # Boxes of two cameras nearer to each other than so many deviations are of one object: both cameras would
@@ -55,7 +52,9 @@ class Detections:
         in_sight: bool = True,
     ) -> "Detections":
         """Return detections by their numbers, a row each, and what else is told of them."""
-        azimuth, std, width, moving, existence, log_new, found = np.array(rows, float).reshape(-1, 7).T
+        azimuth, std, width, moving, existence, log_new, found = (
+            np.array(rows, float).reshape(-1, len(_NUMBERS)).T
+        )
         return cls(azimuth, std, width, moving, existence, log_new, found, classes, positions, in_sight)
 
     def line_of_sight(self, site: SiteGeometry) -> FloatArray:
@@ -122,32 +121,36 @@ def birth(births: float, clutter_rate: float, score: float, size: float) -> tupl
     return births / (births + clutter), math.log((births + clutter) / size)
 
 
-def camera_scan(seen: CameraLook, view: Sector, weight: float, births: float) -> Scan:
+def camera_scan(seen: CameraLook, view: Sector, weight: float, street: StreetModel) -> Scan:
     """Return the scan that a camera has made of a view."""
-    answer, miss_rate, clutter_rate = seen.look.answer, None, CLUTTER_RATE
+    answer, miss_rate, clutter_rate = seen.look.answer, None, street.clutter
     if not isinstance(answer, Unqueried):
-        miss_rate = min(answer.miss_rate, _MOST_MISSES)
-        clutter_rate = min(answer.clutter_rate, _MOST_MISSES) or CLUTTER_RATE
+        # A look that misses everything would carry no information.
+        miss_rate = min(answer.miss_rate, 1.0 - street.doubt)
+        clutter_rate = min(answer.clutter_rate, 1.0 - street.doubt) or street.clutter
     # Boxes that come without an answer were found without a stated miss rate.
     found, width_rad = 1.0 - (miss_rate or 0.0), 2.0 * max(view.half_width_rad, LEAST_STD)
     boxes = sorted(seen.sightings, key=BY_ALL)
-    rows = [(*_MEASURED(one), *birth(births, clutter_rate, one.score, width_rad), found) for one in boxes]
+    rows = [
+        (*_MEASURED(one), *birth(street.births, clutter_rate, one.score, width_rad), found) for one in boxes
+    ]
     detections = Detections.of(rows, tuple(((one.label, one.score),) for one in boxes))
     np.maximum(detections.std_rad, LEAST_STD, out=detections.std_rad)
     named = seen.look.sector_rad is not None
     return Scan("vision", detections, view, miss_rate, weight, names_sector=named)
 
 
-def position_scan(scan: PositionScan, weight: float, births: float) -> Scan:
+def position_scan(scan: PositionScan, weight: float, street: StreetModel) -> Scan:
     """Return the scan of a radar or a lidar, or what messages tell."""
     searched, places = scan.searched, tuple(sorted(scan.positions, key=_BY_PLACE))
     if searched is None:
-        log_new = math.log(births / _RADIO_AREA_M2)
+        # Messages report of half a disc.
+        log_new = math.log(street.births / (0.5 * math.pi * FARTHEST_M**2))
         new = [(one.existence_probability, log_new) for one in places]
         return Scan(scan.source, _of_positions(places, new, None), None, None, weight)
     sector, found = searched.sector, searched.detection_probability
     area_m2 = max(sector.half_width_rad * searched.range_m**2, 1.0)
-    new = [birth(births, searched.clutter_rate, one.existence_probability, area_m2) for one in places]
+    new = [birth(street.births, searched.clutter_rate, one.existence_probability, area_m2) for one in places]
     return Scan(scan.source, _of_positions(places, new, found), sector, 1.0 - found, weight, searched.range_m)
 
 
@@ -198,13 +201,14 @@ def _in_order(every: Sequence[Detections]) -> tuple[Detections, list[int]]:
             *map(_values, _COLUMNS(one)), one.classes, strict=True
         )
     ]
-    boxes.sort(key=lambda box: (*box[:3], *box[4]))
+    boxes.sort(key=lambda box: (box[0], box[1], box[2], *box[-1]))
     rows = [(azimuth_rad, std_rad, *rest) for azimuth_rad, std_rad, _, _, rest in boxes]
-    return Detections.of(rows, tuple(box[2] for box in boxes)), [box[3] for box in boxes]
+    return Detections.of(rows, tuple(box[2] for box in boxes)), [box[-2] for box in boxes]
 
 
 _values = methodcaller("tolist")
-_COLUMNS = attrgetter(*[one.name for one in fields(Detections)][:7])
+_NUMBERS = [one.name for one in fields(Detections) if one.type is FloatArray]
+_COLUMNS = attrgetter(*_NUMBERS)
 
 
 def _near_pairs(boxes: Detections) -> list[tuple[int, int]]:

@@ -24,30 +24,19 @@ import math
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.abduction.sequence.sequence_model import COMING_S, TAIL
 from worldstate.belief.kinematics.cartesian import CartesianBelief, arc
 from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, MotionBelief
-from worldstate.ground import FloatArray, wrap_angle
+from worldstate.ground import TINY, FloatArray, wrap_angle
 
-from .site_geometry import SideGeometry, SiteGeometry
+from .site_geometry import USUAL_EDGE_STD, SideGeometry, SiteGeometry
 from .track import Tracks
 
-# What is not known of v / d: within a factor of 1.2 (three points of a lognormal distribution with the
-# weights of Gauss and Hermite).
-_SPREAD = 0.2
-_PACES = np.exp(_SPREAD * math.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]))
-_PACE_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
-# Of the variance of the time: exam seed 1, sequence alone, three seconds before T0: errors of 6.6 degrees
-# where all of it states 9.4. A vehicle's length and lane leave the rest, however well its edge is known.
-_PLACE_SHARE, _EXTENT_STD, _USUAL_EDGE_STD = 0.2, math.radians(4.2), math.radians(5.0)
-# v t / d in the middle of every group where v / d is 1/s, shape (groups, paces).
-_PASSED = (0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1]))))[:, None] * _PACES
+# What is not known of v / d: two points of a normal distribution, by Gauss and Hermite.
+_POINTS = np.array([-1.0, 1.0])
+_MIDDLE_S = (0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1]))))[:, None]
 # Beyond, the street ahead ends or bends.
 _FARTHEST_RAD = math.radians(80.0)
-_SMALLEST = 1e-12
-# Of the azimuth rate, relative: drivers brake and turn.
-_RATE_SPREAD = 0.5
-_IN_VIEW_STD = math.radians(20.0)
 _STEPS = 51  # Of the times until which a line of sight is passed: between them it is interpolated
 
 
@@ -66,16 +55,22 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     """
     along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
     sign, edge_rad = math.copysign(1.0, along_rad), abs(along_rad)
-    slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * _PASSED
+    slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * (
+        _MIDDLE_S * np.exp(side.street.pace_spread * _POINTS)
+    )
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
-    weight = coming[:, None] * _PACE_WEIGHTS + _SMALLEST
+    weight = np.repeat(coming[:, None], len(_POINTS), axis=1) + TINY
     weight = weight / weight.sum()
     mean = float((weight * azimuth).sum())
     # The five degrees of the usual edge hold more than the edge, from which five junctions deviate by 2.6:
     # errors of the time, which a known edge does not end. Half of their variance stays: likeliest on exam
     # seed 1 with learned edges; without it squared errors are 1.42 of the variance.
-    edge = 0.5 * (side.edge_std_rad**2 + max(side.edge_std_rad, _USUAL_EDGE_STD) ** 2)
-    variance = _PLACE_SHARE * float((weight * (azimuth - mean) ** 2).sum()) + (edge + _EXTENT_STD**2)
+    edge = 0.5 * (side.edge_std_rad**2 + max(side.edge_std_rad, USUAL_EDGE_STD) ** 2)
+    variance = (
+        edge
+        + side.street.extent_rad**2
+        + side.street.place_share * float((weight * (azimuth - mean) ** 2).sum())
+    )
     return wrap_angle(sign * mean - side.yaw_rad), math.sqrt(variance)
 
 
@@ -93,13 +88,13 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
     azimuth_rad = share * hidden_rad + (1.0 - share) * in_view_rad
     # Mean and variance of the two together.
     apart = share * (1.0 - share) * (hidden_rad - in_view_rad) ** 2
-    variance = share * hidden_std**2 + (1.0 - share) * _IN_VIEW_STD**2 + apart
+    variance = share * hidden_std**2 + (1.0 - share) * side.street.past_std_rad**2 + apart
     along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
     rate = -math.copysign(side.pace_hz * math.cos(azimuth_rad + side.yaw_rad) ** 2, along_rad)
     mean, covariance = before.mean.copy(), before.covariance.copy()
     mean[[AZIMUTH, AZIMUTH_RATE]] = azimuth_rad, rate
     # Both are read anew from the sequence, whatever else was believed of them.
-    for axis, spread in ((AZIMUTH, variance), (AZIMUTH_RATE, (_RATE_SPREAD * rate) ** 2)):
+    for axis, spread in ((AZIMUTH, variance), (AZIMUTH_RATE, (side.street.turn_share * rate) ** 2)):
         covariance[axis], covariance[:, axis] = 0.0, 0.0
         covariance[axis, axis] = spread
     return MotionBelief(mean, covariance)
@@ -130,7 +125,7 @@ def time_to_visible(
     along = np.array([math.cos(side.edge_azimuth_rad), math.sin(side.edge_azimuth_rad)])
     range_m, speed_mps = (side.corner_m, site.ego_speed_mps) if side.corner_m else (1.0, 0.0)
     # Past its corner nothing is hidden by it.
-    abeam_s = range_m * math.cos(side.edge_azimuth_rad) / (speed_mps or _SMALLEST)
+    abeam_s = range_m * math.cos(side.edge_azimuth_rad) / (speed_mps or TINY)
     times_s = np.linspace(0.0, min(within_s, abeam_s) if abeam_s > 0.0 else within_s, _STEPS)
     ego, _ = arc(speed_mps, site.ego_yaw_rate_rad_s, times_s)
     ray = range_m * along - ego
@@ -144,11 +139,11 @@ def time_to_visible(
     past, correlation = -mean / std, shared / (std[..., 1:] * std[..., :-1])
     # By steps: one that has passed the ego vehicle as well is behind its line again.
     passes = _both_below(-past[..., :-1], past[..., 1:], -correlation).sum(axis=-1)
-    chance = np.clip(passes / np.maximum(ndtr(-past[..., 0]), _SMALLEST), 0.0, 1.0)
-    if chance.ndim or chance < 0.9:
+    chance = np.clip(passes / np.maximum(ndtr(-past[..., 0]), TINY), 0.0, 1.0)
+    if chance.ndim or chance < 1.0 - 2.0 * TAIL:
         return chance, None
     past = np.maximum.accumulate(past)
-    low, high = ndtri(np.interp([0.05, 0.95], [0.0, 1.0], ndtr(past[[0, -1]]))).tolist()
+    low, high = ndtri(np.interp([TAIL, 1.0 - TAIL], [0.0, 1.0], ndtr(past[[0, -1]]))).tolist()
     low_s, best_s, high_s = np.interp([low, 0.0, high], past, times_s).tolist()
     return chance, (low_s, best_s, high_s)
 
@@ -157,8 +152,8 @@ def _both_below(h: FloatArray, k: FloatArray, correlation: FloatArray) -> FloatA
     """Return P(both of two normal numbers of mean 0 and deviation 1 are below h and k), by Owen's T."""
     from scipy.special import ndtr, owens_t
 
-    h, k = (np.where(one, one, _SMALLEST) for one in (h, k))
-    rest = np.sqrt(np.maximum(1.0 - correlation**2, _SMALLEST))
+    h, k = (np.where(one, one, TINY) for one in (h, k))
+    rest = np.sqrt(np.maximum(1.0 - correlation**2, TINY))
     tails = owens_t(h, (k / h - correlation) / rest) + owens_t(k, (h / k - correlation) / rest)
     return np.asarray(0.5 * (ndtr(h) + ndtr(k)) - tails - 0.5 * (h * k < 0.0))
 

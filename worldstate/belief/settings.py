@@ -1,42 +1,32 @@
 """Settings of the filter."""
 
-from dataclasses import dataclass, fields
+import math
+import warnings
+from dataclasses import InitVar, dataclass, field, replace
+from typing import Any, Literal, get_args
 
 from worldstate.ground import InvalidArgumentError, in_range
-from worldstate.ground.serialisation import Probability
+
+from .street_model import StoredStreet, StreetModel
+
+# Names in the street model, in the order of the arguments of 0.3.
+_FORMER = ("look_s", "birth", "death", "delete")
 
 
 @dataclass(frozen=True, slots=True)
 class FilterSettings:
-    """How often evidence counts, and thresholds of birth and death; all else is a constant where it counts.
+    """What a filter is given beside its context and its policy.
 
     Parameters
     ----------
     window_s : float
         Length of the window that a signature is computed on. Windows that overlap repeat most of their
-        samples: explanations build on the belief of one window ago, and a bearing or approach rate
-        weighs kappa = (time since the last one) / window, at most 1.
-    look_interval_s : float
-        Looks of the co-evidence channel closer in time than this repeat each other's misses (same object,
-        same light, same detector), so to the existence of a visible entity a look weighs (time since the
-        last one) / interval, at most 1.
-    birth_probability, death_probability : float
-        A hidden entity is born when P(hidden on its side) reaches the first, or an advisory names its
-        side, and dropped when its existence falls below the second.
-    delete_existence : float
-        A visible entity is dropped below this existence.
-    births_per_look : float
-        New road users that a look finds, on the mean: against the clutter rate of the look and the score of
-        a detection it decides how far a first detection is believed.
-    assumed_certainty : float
-        Probability that an occluder stands where the context only assumes one.
-    hidden_return : float
-        Probability that a radar detects what an occluder hides, over that of what is in line of sight.
-    width_change : float
-        Standard deviation of the logarithm of an entity's width from box to box.
-    size_spread : float
-        Standard deviation of the logarithm of the widths of road users: of two at one azimuth the wider box
-        is the nearer one as far as this allows.
+        samples: a bearing or approach rate weighs kappa = (time since the last one) / window, at most 1.
+    street : StreetModel
+        Numbers of the belief.
+    windows : {"posterior", "likelihood"}
+        How windows enter that no sequence model reads: by what is new in their posterior, or multiplied as
+        likelihoods, each by its share of a window that is new.
     stream : str
         Name that entity ids are derived from: the same stream gives the same ids.
 
@@ -47,28 +37,27 @@ class FilterSettings:
 
     Examples
     --------
-    >>> FilterSettings(birth_probability=0.6).window_s
+    >>> FilterSettings(stream="drive").window_s
     1.0
     """
 
     window_s: float = 1.0  # Of the published feature
-    look_interval_s: float = 0.3  # Three images at 10 Hz: misses of consecutive images repeat each other
-    # Far apart: with one threshold for both, a belief that wavers about it would change ids at every hop.
-    birth_probability: Probability = 0.5
-    death_probability: Probability = 0.1
-    # Three full looks that find nothing take .99 below it, at a miss rate of .04.
-    delete_existence: Probability = 0.05
-    births_per_look: float = 0.05  # Assumed: one new road user in twenty images
-    assumed_certainty: Probability = 0.9  # Assumed
-    hidden_return: Probability = 0.1  # Assumed
-    width_change: float = 0.3  # Assumed: the box of what comes past an edge grows by a third an image
-    size_spread: float = 0.5  # Assumed: from persons of 0.6 m to vans of 4.6 m seen from the side
     stream: str = "worldstate"
+    street: StoredStreet = field(default_factory=StreetModel)
+    windows: Literal["posterior", "likelihood"] = "posterior"
+    # Of 0.3; for one minor version they are taken for the street model's numbers.
+    look_interval_s: InitVar[float | None] = None
+    birth_probability: InitVar[float | None] = None
+    death_probability: InitVar[float | None] = None
+    delete_existence: InitVar[float | None] = None
 
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if field.type is not str:
-                high = 1.0 if field.type is Probability else 1e6
-                in_range(field.name, getattr(self, field.name), 0.0, high, open_low=True)
-        if self.death_probability > self.birth_probability:
-            raise InvalidArgumentError("death_probability: expected at most birth_probability")
+    def __post_init__(self, *former: float | None) -> None:
+        given = {name: one for name, one in zip(_FORMER, former, strict=True) if one is not None}
+        if given:
+            names = ", ".join(given)
+            warnings.warn(f"give {names} to StreetModel, as FilterSettings.street", DeprecationWarning, 3)
+            changed: dict[str, Any] = {**given}
+            object.__setattr__(self, "street", replace(self.street, **changed))
+        in_range("window_s", self.window_s, 0.0, math.inf, open_low=True, open_high=True)
+        if self.windows not in get_args(type(self).__annotations__["windows"]):
+            raise InvalidArgumentError(f"windows: expected posterior or likelihood, got {self.windows!r:.40}")

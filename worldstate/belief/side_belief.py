@@ -6,9 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# Relative: rounding must not choose a side, or the mirrored world would have the other one.
-TIE = 1e-9
-
 
 @dataclass(frozen=True, slots=True)
 class SideBelief:
@@ -26,12 +23,11 @@ class SideBelief:
     risks: tuple[float, ...]  # shape (K,): P(one comes into view there within eight seconds)
     risk: float  # P(one comes into view anywhere)
     hypotheses: tuple[float, float, float]  # P(hidden), P(visible), P(none) of eq. (6)
-    # P(a vehicle is hidden on each of two sides); None by single windows, whose sides exclude each other.
-    both: float | None = None
+    both: float = 0.0  # P(vehicles are hidden on two sides)
 
     def hidden_on(self, side: int | None) -> float:
         """Return P(a vehicle is hidden on a side), on any where None."""
-        return sum(self.hidden) - (self.both or 0.0) if side is None else self.hidden[side]
+        return sum(self.hidden) - self.both if side is None else self.hidden[side]
 
     def existence(self, side: int | None) -> float:
         """Return the probability that there is a vehicle of a side, of any where None."""

@@ -1,33 +1,32 @@
 """Geometry of the site: where hidden vehicles are, where they come into view, and what the camera sees."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.belief.kinematics.motion import LEAST_STD, MotionBelief
 from worldstate.ground import FloatArray, wrap_angle
 from worldstate.measurement import CameraLook, Look, Sector
 
 from .settings import FilterSettings
+from .street_model import StreetModel
 
-# Of hidden vehicles, (theta_dot rad/s, rho 1/s, log r): they close at 5 m/s from 25 m, give or take as much
-# again, the range within a factor of 1.8.
-_HIDDEN_MEAN, _HIDDEN_STD = (0.0, -0.2, math.log(25.0)), (0.15, 0.25, 0.6)
-# Prior of a vehicle in view, of which only the azimuth is measured: neither closing nor receding, within .5
-# 1/s, at exp(3.2) = 25 m within a factor of 1.8.
-IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
-# Of the azimuth that a hidden vehicle is heard at, which averaging does not remove: 10 degrees, half the
-# spread of hidden vehicles behind a default corner.
-HIDDEN_BIAS_STD = 0.17
-# P(a spurious sighting) where the co-evidence states none.
-CLUTTER_RATE = 0.01
-# Of an azimuth that is taken as it is: the side of an edge follows from the mean position.
-_SHARP_RAD = 1e-3
+
+def in_view(street: StreetModel) -> MotionBelief:
+    """Return the prior of a vehicle in view, of which only the azimuth is measured."""
+    spread = (1.0, 1.0, 0.5, street.range_spread)
+    return MotionBelief.around((0.0, 0.0, 0.0, math.log(street.range_m)), spread)
+
+
+IN_VIEW = in_view(StreetModel())
 # A vehicle in a crossing street stands ahead, not abeam: at the default corner, up to 92 degrees.
 _WIDEST_RAD = math.radians(60.0)
+
+
+USUAL_EDGE_STD = math.radians(5.0)  # Of the corner of a usual junction
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,18 +43,24 @@ class SideGeometry:
     edge_azimuth_rad: float  # Edge of the occluder
     azimuth_rad: float  # Where vehicles are while it hides them
     std_rad: float
-    edge_std_rad: float = math.radians(5.0)
+    edge_std_rad: float = USUAL_EDGE_STD
     pace_hz: float = 0.5  # Speed over the distance of the crossing lane
     hides: bool = True
     yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
     corner_m: float | None = None  # Distance of the corner; None if it is not known
     certainty: float = 1.0  # P(the occluder stands there)
     wall_m: float = 0.0  # How far beside the ego its wall runs: what is nearer stands in front; 0 if unknown
+    street: StreetModel = field(default_factory=StreetModel)
 
     @property
     def outwards(self) -> float:
         """The way from the edge to what it hides: 1 to the left, -1 to the right."""
         return math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
+
+    @property
+    def bias_std_rad(self) -> float:
+        """Error of the azimuth of hidden sound that averaging does not remove: half of where vehicles are."""
+        return 0.5 * self.std_rad
 
     def distance_rad(self, azimuth_rad: float, width_rad: float = 0.0) -> float:
         """Return the angle, >= 0, between the occluder's edge and the end of a box that leads past it."""
@@ -63,12 +68,14 @@ class SideGeometry:
 
     def prior(self) -> MotionBelief:
         """Return the prior motion of a vehicle hidden here."""
-        return _hidden_motion(self.azimuth_rad, self.std_rad)
+        return _hidden_motion(self.azimuth_rad, self.std_rad, self.street)
 
 
-@lru_cache(maxsize=64)
-def _hidden_motion(azimuth_rad: float, std_rad: float) -> MotionBelief:
-    return MotionBelief.around((azimuth_rad, *_HIDDEN_MEAN), (std_rad, *_HIDDEN_STD))
+@lru_cache
+def _hidden_motion(azimuth_rad: float, std_rad: float, street: StreetModel) -> MotionBelief:
+    mean = azimuth_rad, 0.0, -street.closing_hz, math.log(street.range_m)
+    spread = std_rad, street.closing_std_hz, street.closing_std_hz, street.range_spread
+    return MotionBelief.around(mean, spread)
 
 
 # No slots: what follows from the sides is computed once, and read in every step.
@@ -82,6 +89,11 @@ class SiteGeometry:
     ego_speed_mps: float = 0.0  # Along the x axis
     ego_yaw_rate_rad_s: float = 0.0
 
+    @property
+    def street(self) -> StreetModel:
+        """The numbers of the belief."""
+        return self.settings.street
+
     def nearest_side(self, azimuth_rad: float) -> int:
         """Return the index of the side whose edge is nearest to an azimuth."""
         return min(range(len(self.sides)), key=lambda k: self.sides[k].distance_rad(azimuth_rad))
@@ -89,7 +101,7 @@ class SiteGeometry:
     def hiding_side(self, position_m: tuple[float, float]) -> int | None:
         """Return the side whose occluder hides what stands at a place, if one does."""
         x, y = position_m
-        (chances,) = self.behind(np.array([math.atan2(y, x)]), _SHARP_RAD, np.array([math.hypot(x, y)]))
+        (chances,) = self.behind(np.array([math.atan2(y, x)]), LEAST_STD, np.array([math.hypot(x, y)]))
         side = int(chances.argmax())
         return side if chances[side] >= 0.5 else None
 
@@ -101,6 +113,11 @@ class SiteGeometry:
         past = outwards * wrap_angle(azimuth_rad[:, None] - edge_rad)
         chances = normal_shares(past / std_rad) - normal_shares((past - _WIDEST_RAD) / std_rad)
         return np.asarray(chances * [one.hides for one in self.sides] * (beside_m > wall_m))
+
+    @cached_property
+    def bias_std_rad(self) -> FloatArray:
+        """Error of the azimuth of hidden sound that averaging does not remove, by side, shape (K,)."""
+        return np.array([one.bias_std_rad for one in self.sides])
 
     @cached_property
     def _edges(self) -> FloatArray:
@@ -118,7 +135,7 @@ class SiteGeometry:
     @cached_property
     def expected(self) -> MotionBelief:
         """What is expected of vehicles that are hidden on each side, and last of those in view."""
-        return MotionBelief.stacked([*(side.prior() for side in self.sides), IN_VIEW])
+        return MotionBelief.stacked([*(side.prior() for side in self.sides), in_view(self.street)])
 
     def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
         """Return the chances that azimuths lie past the edges on their way, shape (n, K).
@@ -159,7 +176,7 @@ class SiteGeometry:
         if not found:
             return replace(look, answer=Absent(miss, answer.clutter_rate))
         # With a clutter rate of zero a box would rule out everything else.
-        return replace(look, answer=Present(miss, answer.clutter_rate or CLUTTER_RATE))
+        return replace(look, answer=Present(miss, answer.clutter_rate or self.street.clutter))
 
 
 def normal_shares(deviations: FloatArray) -> FloatArray:

@@ -13,31 +13,27 @@ from numpy.typing import NDArray
 
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.kinematics.cartesian import CartesianBelief, NumbersT, polar_motion, predict_place
-from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, MotionBelief, predict, relax
+from worldstate.belief.kinematics.motion import (
+    AZIMUTH,
+    AZIMUTH_RATE,
+    LEAST_STD,
+    LOG_RANGE,
+    MotionBelief,
+    predict,
+    relax,
+)
 from worldstate.ground import BoolArray, FloatArray, wrap_angle
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
 from worldstate.ground.typing import IntArray
 from worldstate.ground.values import Answer
 
-from .side_belief import SideBelief
 from .site_geometry import IN_VIEW, SiteGeometry, normal_shares
+from .street_model import StreetModel
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
-# At a score of .9 three sightings in a row outvote a label held with certainty; with a gain of 1 every
-# misread image would rename the entity.
-LABEL_GAIN = 0.3
-# Hops share nineteen twentieths of the two seconds that they are classified by.
-_HEARD_GAIN = 0.2
-# White acceleration, m^2/s^3: 1.4 m/s of speed in a second, as braking and turning in town have. A parked one
-# must not drift with its boxes, but stay updatable.
-_ACCELERATION, _PARKED_ACCELERATION = 2.0, 1e-4
-# To the prior, of components that are not measured: one window; what its sound did not confirm fades.
-_RELAXATION_S = 1.0
-_VISIBLE_LIFE_S = 10.0  # Mean, of a seen entity without looks
-# Of the position, m: five seconds after a sharp one, and twice what is published. Then only the azimuth is
-# tracked, or a hidden one's side.
-_LOST_PLACE_M = 10.0
+# White acceleration, m^2/s^3: a parked one must not drift with its boxes, but stay updatable.
+_PARKED_ACCELERATION = LEAST_STD
 NEVER_NS = np.iinfo(np.int64).min  # Of what was never seen
 
 
@@ -56,7 +52,7 @@ class Track:
     updated_ns: int
     # Index of the approach side that it is hidden on, came from, or first appeared nearest to.
     side: Count = 0
-    seen: bool = False  # Whether vision has it; before that its existence is read from the explanation belief
+    seen: bool = False  # Whether vision has it; before that its existence is a marginal of the belief
     motion: MotionBelief = field(default=IN_VIEW, metadata=FLAT)  # Azimuth, rates, log range
     labels: tuple[Label, ...] = ((UNKNOWN, 1.0),)  # Class probabilities, sorted by label
     moving: bool = True  # False for what vision holds for parked
@@ -68,15 +64,10 @@ class Track:
     # P(it was hidden on its side): of one in view, that of the association at its hand-over.
     came_from: Probability = 0.0
     place: CartesianBelief | None = None  # Then `motion` follows from it
-    behind: Probability = 1.0  # P(no line of sight to it | exists), of one that was detected
+    behind: Probability = 1.0  # P(no line of sight to it | exists)
     width_rad: float = 0.0  # Of its last box
     # P(it is of a side | exists) of one only heard, whose side is not known; empty where it is.
     side_shares: tuple[Probability, ...] = ()
-
-    @property
-    def of_side(self) -> int | None:
-        """The side that its existence is read from: None, of any, where it is not known."""
-        return None if self.side_shares and not self.detected else self.side
 
     @property
     def detected(self) -> bool:
@@ -183,11 +174,6 @@ class Tracks:
         """Whether a sensor or a message has told where they are: they were not only heard."""
         return self.seen | self.placed
 
-    def of_side(self, row: int) -> int | None:
-        """Return the side that its existence is read from: None, of any, where it is not known."""
-        heard_only = not (self.seen[row] or self.placed[row])
-        return None if self.side_shares[row] and heard_only else int(self.side[row])
-
     def place(self, row: int) -> CartesianBelief | None:
         """Return the place of one, None where it has none."""
         return CartesianBelief(self.place_mean[row], self.place_covariance[row]) if self.placed[row] else None
@@ -208,7 +194,7 @@ class Tracks:
 _BELIEFS = ("mean", "covariance", "place_mean", "place_covariance")
 _KINDS: dict[Any, Any] = {Objects: object, BoolArray: bool, IntArray: np.int64, FloatArray: float}
 _COLUMNS = {name: _KINDS[hint] for name, hint in get_type_hints(Tracks).items() if name not in _BELIEFS}
-_NOWHERE = CartesianBelief(np.zeros(4), np.zeros((4, 4)))
+_NOWHERE = CartesianBelief(np.zeros_like(IN_VIEW.mean), np.zeros_like(IN_VIEW.covariance))
 
 
 def entity_id(stream: str, kind: str, number: int) -> str:
@@ -237,16 +223,16 @@ def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
     return missed / (missed + 1.0 - existence)
 
 
-def predict_tracks(tracks: Tracks, sides: SideBelief, step_s: float, site: SiteGeometry) -> None:
+def predict_tracks(tracks: Tracks, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
-    shares, polar = hidden_shares(tracks, sides), np.ones(len(tracks), bool)
-    tracks.existence[tracks.seen] *= math.exp(-step_s / _VISIBLE_LIFE_S)
+    polar = np.ones(len(tracks), bool)
+    tracks.existence[tracks.seen] *= math.exp(-step_s / site.street.unseen_s)
     if tracks.placed.any():
         _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
         polar = ~tracks.placed  # Those that have just lost their place, too
     if polar.any():
         # All of them are read and written where they stand.
-        _relax(tracks, slice(None) if polar.all() else polar, shares, step_s, site)
+        _relax(tracks, slice(None) if polar.all() else polar, step_s, site)
     occlude(tracks, site, step_s)
 
 
@@ -258,36 +244,35 @@ def turn(tracks: Tracks, faster_rad_s: float) -> None:
 def _drive_on(tracks: Tracks, rows: IntArray, step_s: float, site: SiteGeometry) -> None:
     """Move the places of tracks on by a step, and drop those that are lost."""
     before = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
-    accelerations = acceleration_psd(tracks.moving[rows])
+    accelerations = acceleration_psd(tracks.moving[rows], site)
     after = predict_place(before, step_s, accelerations, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
     tracks.place_mean[rows], tracks.place_covariance[rows] = after.mean, after.covariance
     for i, place in zip(rows.tolist(), after.each(), strict=True):
         # No life time here: a sender that keeps sending is there, a silent one is lost within seconds.
-        if place.position_std_m > _LOST_PLACE_M:
+        # Twice as far as is published only the azimuth is tracked, or a hidden one's side.
+        if place.position_std_m > 2.0 * site.street.known_m:
             tracks.placed[i], tracks.behind[i] = False, 1.0
             if not tracks.seen[i]:
                 tracks.put(i, site.sides[tracks.side[i]].prior())
     follow_places(tracks, site)
 
 
-def acceleration_psd(moving: BoolArray) -> FloatArray:
+def acceleration_psd(moving: BoolArray, site: SiteGeometry) -> FloatArray:
     """Return the densities of the white acceleration that entities move by, m^2/s^3."""
-    return np.where(moving, _ACCELERATION, _PARKED_ACCELERATION)
+    return np.where(moving, site.street.acceleration, _PARKED_ACCELERATION)
 
 
-def _relax(
-    tracks: Tracks, rows: BoolArray | slice, hidden: FloatArray, step_s: float, site: SiteGeometry
-) -> None:
+def _relax(tracks: Tracks, rows: BoolArray | slice, step_s: float, site: SiteGeometry) -> None:
     """Move tracks without a place by a step, drawn to what is expected of vehicles in view or hidden."""
     seen = tracks.seen[rows]
     before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
-    motion = predict(before, step_s, acceleration_psd(tracks.moving[rows]))
+    motion = predict(before, step_s, acceleration_psd(tracks.moving[rows], site))
     # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle still hidden has not passed the
     # corner, whatever its last rates said.
-    kept = np.exp(-step_s * np.where(seen, 0.0, hidden[rows]) / _RELAXATION_S)
+    kept = np.exp(-step_s * np.where(seen, 0.0, tracks.behind[rows]) / site.settings.window_s)
     expected, of = site.expected, np.where(seen, -1, tracks.side[rows])
     towards = MotionBelief(expected.mean[of], expected.covariance[of])
-    relaxed = relax(motion, towards, kept, math.exp(-step_s / _RELAXATION_S))
+    relaxed = relax(motion, towards, kept, math.exp(-step_s / site.settings.window_s))
     tracks.mean[rows], tracks.covariance[rows] = relaxed.mean, relaxed.covariance
 
 
@@ -329,12 +314,12 @@ def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatAr
         ends = normal_shares((0.5 * widths[j] * np.array([[1.0], [-1.0]]) - apart_rad) / std_rad)
         at[i, sides + j] = (ends[0] - ends[1]) * tracks.existence[j]
         ranges = variance[i, LOG_RANGE, LOG_RANGE] + variance[j, LOG_RANGE, LOG_RANGE]
-        sizes = np.where(widths[i] > 0.0, 2.0 * site.settings.size_spread**2, np.inf)
+        sizes = np.where(widths[i] > 0.0, 2.0 * site.street.size_spread**2, np.inf)
         wider = np.log(widths[j] / np.where(widths[i] > 0.0, widths[i], 1.0))
         farther = (tracks.mean[i, LOG_RANGE] - tracks.mean[j, LOG_RANGE]) / ranges + wider / sizes
         nearer[i, sides + j] = normal_shares(farther / np.sqrt(1.0 / ranges + 1.0 / sizes))
     before = np.where(tracks.seen, tracks.behind, 0.0)[:, None]
-    changed = np.where(nearer < 1.0, 1.0 - math.exp(-step_s / site.settings.look_interval_s), 1.0)
+    changed = np.where(nearer < 1.0, 1.0 - math.exp(-step_s / site.street.look_s), 1.0)
     return np.asarray(np.minimum(before + np.maximum(at * nearer - before, 0.0) * changed, at))
 
 
@@ -345,40 +330,32 @@ def occlude(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> None:
 
 
 def relabelled(
-    labels: tuple[Label, ...], seen_as: ClassShares, gain: float = LABEL_GAIN
+    labels: tuple[Label, ...], seen_as: ClassShares, gain: float, least: float = 0.0
 ) -> tuple[Label, ...]:
     """Return class probabilities after one detection, an exponential average over detections.
 
     Examples
     --------
-    >>> relabelled((("car", 0.9),), (("truck", 0.8),))
+    >>> relabelled((("car", 0.9),), (("truck", 0.8),), 0.3)
     (('car', 0.63), ('truck', 0.24))
     """
     kept = {label: probability * (1.0 - gain) for label, probability in labels}
     for label, probability in seen_as:
         kept[label] = kept.get(label, 0.0) + gain * probability
-    return tuple([(label, round(kept[label], 12)) for label in sorted(kept) if kept[label] > 1e-3])
-
-
-def hidden_shares(tracks: Tracks, sides: SideBelief) -> FloatArray:
-    """Return P(hidden | exists) of every track."""
-    shares = tracks.behind.copy()
-    for i in np.flatnonzero(~tracks.detected).tolist():
-        shares[i] = sides.hidden_share(tracks.of_side(i))
-    return shares
+    return tuple([(label, round(kept[label], 9)) for label in sorted(kept) if kept[label] > least])
 
 
 def side_weights(track: Track, sides: int) -> tuple[float, ...]:
     """Return P(an entity is of a side | exists), shape (sides,)."""
     known = tuple(float(k == track.side) for k in range(sides))
-    return track.side_shares if track.of_side is None else known
+    return known if track.detected or not track.side_shares else track.side_shares
 
 
-def heard_as(tracks: Tracks, row: int, kinds: ClassShares) -> tuple[Label, ...]:
+def heard_as(tracks: Tracks, row: int, kinds: ClassShares, street: StreetModel) -> tuple[Label, ...]:
     """Return class probabilities after one more hop; what a detector once said, the ear does not change."""
     labels: tuple[Label, ...] = tracks.labels[row]
     is_heard = kinds and tracks.last_seen_ns[row] == NEVER_NS
-    return relabelled(labels, kinds, _HEARD_GAIN) if is_heard else labels
+    return relabelled(labels, kinds, street.label_gain, street.doubt) if is_heard else labels
 
 
 def merged(sources: tuple[str, ...], source: str) -> tuple[str, ...]:

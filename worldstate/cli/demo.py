@@ -25,6 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--out", type=Path, default=Path("out/demo"), help="output folder (default: %(default)s)")
     add("--seed", type=int, default=1, help="another seed, another recording (default: 1)")
+    listening.add_budget_options(parser)
 
 
 def simulate_approach(root: Path, seed: int) -> Path:
@@ -57,7 +58,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
     out = output.output_folder(arguments.out, "timeline.png", "states.jsonl", "log.html", "summary.json")
     folder = simulate_approach(out / "recording", arguments.seed)
-    source = adapters.open_source(folder)
+    source = adapters.open_source(folder, budget=arguments.budget, alpha=arguments.alpha)
     title = f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}"
     with drawn_run(out / "timeline.png", source, title) as draw:
         report = listening.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)

@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         stamp_ns = ground.nanoseconds(ground.in_range("--time", arguments.time, -9e9, 9e9))
     state = read_state_near(arguments.states, stamp_ns)
     if arguments.side is not None:
-        one_of("--side", arguments.side, [cue.direction for cue in state.cues])
+        one_of("--side", arguments.side, [cue.direction for cue in state.cues if cue.direction])
     read = partial(read_state_near, arguments.states, anywhere=True)
     reports = evidence_report.evidence_report(state, read, arguments.side)
     now_s = ground.seconds(state.stamp_ns)

@@ -70,8 +70,8 @@ SAVED_EVERY_NS = 60_000_000_000
 SHORTEST_KEY = 16
 # What a first user needs.
 FIRST_OPTIONS = (
-    *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--device", "--play"),
-    *("--camera-device", "--detections", "--camera", "--odometry", "--out", "--export"),
+    *("--array", "--car", "--model", "--budget", "--alpha", "--uncalibrated", "--context", "--street"),
+    *("--device", "--play", "--camera-device", "--detections", "--camera", "--odometry", "--out", "--export"),
 )
 
 
@@ -335,6 +335,7 @@ def _listen(
         **cost.read(),
         "peak_risk": warnings.peak_risk,
         "calibration": calibration_words(warnings.uncalibrated, warnings.states),
+        "usable": warnings.usable,
         "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
     }
 

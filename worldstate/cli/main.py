@@ -22,7 +22,7 @@ COMMANDS = (
     *("array check", "array bounds", "array bearings", "array align"),
     *("model make", "model fit", "model threshold", "model features", "model detector", "model show"),
     *("street learn", "street label"),
-    *("log plot", "log view", "log replay"),
+    *("log plot", "log view", "log replay", "log upgrade"),
     *("sim make", "sim to-bag"),
     "completion",
 )
@@ -30,7 +30,7 @@ GROUPS = {
     "array": "an array of microphones: its health, what it allows, where it points",
     "model": "a model for an array: made, fitted, set to a budget, shown",
     "street": "a street: learned from the vehicles that pass, labelled",
-    "log": "the snapshots of a run: drawn, viewed, replayed",
+    "log": "the snapshots of a run: drawn, viewed, replayed, upgraded",
     "sim": "simulated streets",
 }
 # Former names of commands and options, read through the next minor version, and what stands in their place;

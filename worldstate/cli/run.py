@@ -34,8 +34,8 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 # What a first user needs.
 FIRST_OPTIONS = (
-    *("--array", "--car", "--model", "--uncalibrated", "--context", "--street", "--detections", "--camera"),
-    *("--odometry", "--out", "--figure", "--export"),
+    *("--array", "--car", "--model", "--budget", "--alpha", "--uncalibrated", "--context", "--street"),
+    *("--detections", "--camera", "--odometry", "--out", "--figure", "--export"),
 )
 
 

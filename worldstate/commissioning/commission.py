@@ -3,14 +3,14 @@
 import hashlib
 import json
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import hop_columns, sequence_inputs
-from worldstate.abduction.sequence.sequence_model import SequenceModel, SequencePosterior
+from worldstate.abduction.sequence.sequence_model import AlarmCurve, SequenceModel
 from worldstate.abduction.signature.ensemble import KINDS, EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.published_signature import ModelDomain
@@ -28,6 +28,7 @@ from worldstate.operations.training.training import TrainingSettings, train_mode
 from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.stream.settings import StreamSettings
 
+from .alarm_curve import LEAST_ONSETS, UNREACHED, advised, alarm_levels, measured_curve, stream_states
 from .guard_training import CHOSEN_FOR_GUARD, CLIPS_EACH, SoundRows, close_rows, train_guard
 from .heard_stream import (
     CommissionSettings,
@@ -58,11 +59,10 @@ from .simulated_windows import (
     posteriors_along,
     window_model,
 )
-from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
+from .stream_exam import ExaminedStream
 
 FOLDS = 4
 LEARNING_STEPS = 2 * FOLDS + 5  # Windows, trees and close sounds, guard, road users
-LEAST_ONSETS = 3.0
 SIMULATED = "simulated streets"
 # Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
 HAZARD_FREE_SHARE = 120.0 / 192.0
@@ -126,11 +126,10 @@ def learn_sequence(
     `fit_windows` makes a window model of some of the streams. Evidence of a stream always comes from one that
     did not learn its junction: trained on evidence that is too good, trees trust it too much elsewhere.
     """
-    evidence = dict[int, FloatArray]()
-    folds = _folds(streams)
+    evidence, folds, fitted = dict[int, FloatArray](), _folds(streams), list[EnsembleModel]()
     for outside in folds:
-        windows = fit_windows([one for i, one in enumerate(streams) if i not in outside])
-        evidence |= {i: stream_evidence(windows, streams[i]) for i in outside}
+        fitted.append(fit_windows([one for i, one in enumerate(streams) if i not in outside]))
+        evidence |= {i: stream_evidence(fitted[-1], streams[i]) for i in outside}
         on_step()
     inputs = list(in_processes(sequence_inputs, [evidence[i] for i in range(len(streams))], jobs))
     truths, weights = list(map(stream_truth, streams)), stream_weights(streams).tolist()
@@ -138,36 +137,26 @@ def learn_sequence(
     lessons = []
     for outside in folds:
         inside = [one for i, one in enumerate(labelled) if i not in outside]
-        lessons.append(Lesson(inside, [inputs[i] for i in outside], int(rng.integers(2**31))))
+        lessons.append((inside, int(rng.integers(2**31))))
     growth, threads = MOVING if streams[0].ego_moves else STANDING, None if jobs == 1 else 1
-    learned = in_processes(partial(_said_outside, growth=growth, threads=threads), lessons, jobs)
-    margins, quiet = [], dict[str, list[SequencePosterior]]()
-    for outside, said in zip(folds, learned, strict=True):
-        margins.append(calibrated_margin_s([(one, truths[i]) for i, one in zip(outside, said, strict=True)]))
-        for i, posterior in zip(outside, said, strict=True):
-            if streams[i].hazard_free:
-                quiet.setdefault(streams[i].site, []).append(posterior)
+    learned = in_processes(partial(_learned, growth, threads), lessons, jobs)
+    margins, quiet = list[float](), dict[str, list[FloatArray]]()
+    for outside, windows, one in zip(folds, fitted, learned, strict=True):
+        margins.append(calibrated_margin_s([(one.of_inputs(inputs[i]), truths[i]) for i in outside]))
+        for i in (i for i in outside if streams[i].hazard_free):
+            states = stream_states(streams[i], windows, replace(one, alarm=UNREACHED), evidence[i])
+            quiet.setdefault(streams[i].site, []).append(alarm_levels(states))
         on_step()
-    alarm, margin_s = alarm_elsewhere(list(quiet.values()), onsets_per_hour), float(np.mean(margins))
+    curve, margin_s = measured_curve(quiet, elsewhere=True), float(np.mean(margins))
     every = [labelled[i] for outside in folds for i in outside]
     final = train_sequence(every, int(rng.integers(2**31)), growth)
     on_step()
-    return replace(final, margin_s=margin_s, alarm=alarm)
+    return replace(final, margin_s=margin_s, alarm=curve.default(onsets_per_hour), curve=curve)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Lesson:
-    """Streams to learn from, and the inputs of those that are left out, each of shape (n, 2, inputs)."""
-
-    streams: Sequence[LabelledStream]
-    outside: Sequence[FloatArray]
-    seed: int
-
-
-def _said_outside(lesson: Lesson, growth: Growth, threads: int | None) -> list[SequencePosterior]:
-    """Train on some streams; return what is said of the others."""
-    model = train_sequence(lesson.streams, lesson.seed, growth, threads)
-    return list(map(model.of_inputs, lesson.outside))
+def _learned(growth: Growth, threads: int | None, lesson: tuple[list[LabelledStream], int]) -> SequenceModel:
+    streams, seed = lesson
+    return train_sequence(streams, seed, growth, threads)
 
 
 def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:
@@ -244,9 +233,10 @@ def commission(
     made = replace(model, provenance=provenance, sequence=sequence)
     if not calm:
         return made
-    final, _ = parts_of(made)
-    said = [sequence.posterior(stream_evidence(final, one)) for one in calm]
-    return replace(made, sequence=replace(sequence, alarm=alarm_for(said, settings.onsets_per_hour)))
+    quiet_levels = dict[str, list[FloatArray]]()
+    for one in calm:
+        quiet_levels.setdefault(one.site, []).append(levels_of(made, one))
+    return with_curve(made, measured_curve(quiet_levels), settings.onsets_per_hour)
 
 
 def _with_ears(
@@ -287,6 +277,19 @@ def quiet_streams(quiet: Sequence[Path], array: MicrophoneArray, onsets_per_hour
             f"hour, got {hours:.2f}: more sound, or more onsets allowed"
         )
     return heard
+
+
+def levels_of(model: Model, heard: HeardStream) -> FloatArray:
+    """Return the `alarm_levels` of a stream by the model as it would be used, shape (hops, 2)."""
+    windows, sequence = parts_of(model)
+    evidence, silent = stream_evidence(windows, heard), replace(sequence, alarm=UNREACHED)
+    return alarm_levels(stream_states(heard, windows, silent, evidence, model.guard))
+
+
+def with_curve(model: Model, curve: AlarmCurve, onsets_per_hour: float) -> Model:
+    """Return a model with a curve and the budget that is taken if none is asked for."""
+    _, sequence = parts_of(model)
+    return replace(model, sequence=replace(sequence, alarm=curve.default(onsets_per_hour), curve=curve))
 
 
 def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
@@ -356,8 +359,9 @@ def _examined(model: Model, heard: HeardStream) -> ExaminedStream:
     windows, sequence = parts_of(model)
     if sequence.alarm is None:
         raise InvalidArgumentError("model: expected one with an alarm, as `commission` makes")
-    posterior = sequence.posterior(stream_evidence(windows, heard))
-    return ExaminedStream(heard, stream_truth(heard), posterior, sequence.alarm)
+    evidence = stream_evidence(windows, heard)
+    told = advised(stream_states(heard, windows, sequence, evidence, model.guard))
+    return ExaminedStream(heard, stream_truth(heard), sequence.posterior(evidence), told)
 
 
 def exam_of_mountings(

@@ -4,6 +4,7 @@ An approach is one vehicle, two that come from both sides at once, or one with a
 lies farther away than an alarm is counted for, so that the first hop in alarm counts.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,42 +12,36 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
-from worldstate.abduction.cueing.thresholds import risk_controlling
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (
     HORIZONS_S,
     LONGEST_S,
-    SequenceAlarm,
     SequencePosterior,
-    held,
     smoothed_log_odds,
 )
-from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, wrap_angle
-from worldstate.ground.values import SECONDS_PER_HOUR
+from worldstate.ground import BoolArray, FloatArray, wrap_angle
+from worldstate.ground.checks import check_shape
 from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate.operations.metrics.approach_table import (
     AFTER_S,
+    HORIZON_S,
     SLACK_S,
     ApproachOutcome,
     ApproachTable,
     Figures,
     StreamApproach,
     auroc,
+    hop_outcome,
     mean_of,
-    rising_edges,
 )
 from worldstate.operations.recordings.hop_table import HOP_S
 
 from .heard_stream import ROW_S, HeardStream
 from .sequence_training import QUIET_KINDS, StreamTruth
-from .stream_outcomes import HORIZON_S, hop_outcome, visible_errors
 
 # A second vehicle arrives up to six seconds after the first; drivers differ by half a second more.
 TOGETHER_S = 7.0
 _SECOND = {"both": "both", "queue": "follows"}  # Flow of the second vehicle by that of the first
-# A junction counts for no more than so many times the onsets that are asked for. Up to 2, 3, 4 and 6 times at
-# 20 an hour leave .22, .17, .13 and .08 of other junctions above that, and detect .888, .881, .870 and .849.
-LOUDEST = 3.0
 _CALIBRATED_S = (1.0, 2.0, 3.0)
 # The ten hops before T0, without T0 itself: there the vehicle is as good as in view.
 _LAST_SECOND_S = np.arange(1, 11) * HOP_S
@@ -54,12 +49,12 @@ _LAST_SECOND_S = np.arange(1, 11) * HOP_S
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExaminedStream:
-    """A stream, what a model believed of it, and the alarm that was set without it."""
+    """A stream, the readings of a model, and the advisories of the filter with an alarm set without it."""
 
     heard: HeardStream
     truth: StreamTruth
     posterior: SequencePosterior
-    alarm: SequenceAlarm
+    advised: BoolArray  # shape (n, 2)
 
 
 def approaches(heard: HeardStream) -> list[StreamApproach]:
@@ -92,47 +87,8 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
     return found
 
 
-def alarm_for(quiet: Sequence[SequencePosterior], onsets_per_hour: float) -> SequenceAlarm:
-    """Return the lowest threshold at which hazard-free streams have no more onsets an hour."""
-    return SequenceAlarm(threshold_for(list(map(_louder, quiet)), onsets_per_hour), onsets_per_hour)
-
-
-def threshold_for(quiet: Sequence[FloatArray], onsets_per_hour: float) -> float:
-    """Return the lowest threshold with no more onsets an hour of what alarms are read from, shapes (n,)."""
-    thresholds, onsets, hours = _onsets(quiet)
-    rates = np.maximum.accumulate(onsets.sum(axis=0)) / hours.sum()
-    return float(thresholds[np.sum(rates <= onsets_per_hour) - 1])
-
-
 def _louder(posterior: SequencePosterior) -> FloatArray:
     return np.asarray(smoothed_log_odds(posterior).max(axis=1))
-
-
-def alarm_elsewhere(quiet: Sequence[Sequence[SequencePosterior]], onsets_per_hour: float) -> SequenceAlarm:
-    """Return the lowest threshold that a junction not among these may be expected to have no more onsets at.
-
-    Takes the hazard-free streams of each junction, of two at least.
-    """
-    thresholds, *counted = _onsets([_louder(one) for there in quiet for one in there])
-    first = np.cumsum([0, *map(len, quiet[:-1])])
-    onsets, hours = (np.add.reduceat(one, first) for one in counted)
-    kept = risk_controlling(onsets / hours[:, None], onsets_per_hour, LOUDEST * onsets_per_hour)
-    if not kept:
-        raise InvalidArgumentError(f"quiet: expected {LOUDEST - 1:g} junctions at least, got {len(quiet)}")
-    return SequenceAlarm(float(thresholds[kept - 1]), onsets_per_hour)
-
-
-def _onsets(louder: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return thresholds from one that nothing reaches downwards, onsets of each stream at each, and hours."""
-    if not louder:
-        raise InvalidArgumentError("quiet: expected at least one hazard-free stream, got none")
-    pooled = np.sort(np.concatenate(louder))
-    # In steps of a share of the hops: onsets rise with every step but for hops that join alarms.
-    ranks = np.unique(np.geomspace(1, 0.3 * pooled.size, 200).astype(np.intp))
-    thresholds = np.concatenate([pooled[-1:] + 1e-6, pooled[-ranks]])
-    onsets = [[rising_edges(held(one >= level)).size for level in thresholds.tolist()] for one in louder]
-    hours = np.array([one.size for one in louder]) * HOP_S / SECONDS_PER_HOUR
-    return thresholds, np.array(onsets, np.float64), hours
 
 
 def examine(streams: Sequence[ExaminedStream]) -> Figures:
@@ -163,7 +119,7 @@ def alarm_outcomes(
 
 
 def _table(streams: Sequence[ExaminedStream]) -> ApproachTable:
-    return approach_table([(one.heard, np.asarray(one.alarm.raised(one.posterior))) for one in streams])
+    return approach_table([(one.heard, one.advised) for one in streams])
 
 
 def approach_table(
@@ -225,6 +181,60 @@ def chance_figures(within: FloatArray, coming_s: FloatArray) -> Figures:
         found[f"skill_{horizon_s:g}s"] = brier_skill(said, true)
         found[f"ece_{horizon_s:g}s"] = expected_calibration_error(said, true)
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class VisibleErrors:
+    """Errors of stated times, and what the constants that fit these very truths best would reach.
+
+    Examples
+    --------
+    >>> stated = np.array([[0.5, 1.0, 1.5], [1.0, 2.0, 3.0], [2.0, 3.0, 4.0]])
+    >>> errors = visible_errors(stated, np.array([1.1, 2.5, 5.0]))
+    >>> errors.count, round(errors.rmse_s, 2), round(errors.coverage, 2), round(errors.constant_rmse_s, 2)
+    (3, 1.19, 0.67, 1.61)
+    >>> stated[:, [0, 2]] = np.nan
+    >>> without = visible_errors(stated, np.array([1.1, 2.5, 5.0]))
+    >>> round(without.rmse_s, 2), without.coverage
+    (1.19, nan)
+    """
+
+    count: int  # Times that were stated and can be checked
+    intervals: int  # Of these, with an interval
+    rmse_s: float  # Of the best value
+    coverage: float  # Share of truths within the stated interval
+    width_s: float  # Mean width of the stated interval
+    # Fitted to the truths themselves, so that no constant known beforehand does better.
+    constant_rmse_s: float
+
+
+def visible_errors(stated: FloatArray, true_s: FloatArray) -> VisibleErrors:
+    """Compare stated times to visible, low, best and high (n, 3), with the true seconds (n,).
+
+    Rows without a best value, or that never come into view, are left out. Coverage and width are those of
+    the rows that have an interval, NaN where none has: a method may state a time alone.
+
+    Examples
+    --------
+    >>> visible_errors(np.full((2, 3), np.nan), np.ones(2)).count
+    0
+    """
+    check_shape("stated", np.shape(stated), (len(true_s), 3))
+    known = np.isfinite(stated[:, 1]) & np.isfinite(true_s)
+    if not known.any():
+        return VisibleErrors(0, 0, *[math.nan] * 4)
+    best, true = stated[known, 1], true_s[known]
+    bounded = known & np.isfinite(stated).all(axis=1)
+    low, high = stated[bounded][:, [0, 2]].T
+    inside = (low <= true_s[bounded]) & (true_s[bounded] <= high)
+    return VisibleErrors(
+        count=true.size,
+        intervals=inside.size,
+        rmse_s=float(np.sqrt(np.mean((best - true) ** 2))),
+        coverage=float(inside.mean()) if inside.size else math.nan,
+        width_s=float(np.mean(high - low)) if inside.size else math.nan,
+        constant_rmse_s=float(true.std()),
+    )
 
 
 def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:

@@ -9,26 +9,24 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import MOSTLY_MISSED
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
-from worldstate.belief.association import EDGE_STD_RAD, GATE_RAD, HANDOVER_RESIDUAL
-from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side_belief import TIE, SideBelief
+from worldstate.belief.hidden_bearing import hidden_motion
+from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, MotionBelief
+from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import NEVER_NS, Tracks, born, heard_as
-from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
-from worldstate.ground import BoolArray
+from worldstate.ground import TINY, BoolArray
 from worldstate.ground.values import nanoseconds, wrap_angle
 from worldstate.measurement import Measurement
 from worldstate.state import Event
 from worldstate.state.entity import EventKind
 
-from .memory import Memory
+from .memory import MOST_BOXES, Memory
 
 # After a hand-over no birth on its side: the window still holds the sound from before it.
 _REARM_NS = nanoseconds(1.0)
 _MASKED = 0.5  # Of the existence below which a hidden entity ends, beside a vehicle just come into view
 HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
-_LOST_RAD = 0.8  # Standard deviation; beyond, the azimuth is known to no more than half of the view
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
 
@@ -36,108 +34,104 @@ _ALONE_NS = nanoseconds(1.0)
 def birth_death(
     memory: Memory, alarmed: Sequence[bool], measurement: Measurement, site: SiteGeometry
 ) -> None:
-    """Let hidden entities be born, go on or end.
+    """Let entities that are only heard be born or end.
 
     Shapes: alarmed (K,).
     """
     tracks = memory.tracks
-    heard = {hidden_on(tracks, k) for k in _sides(site)} - {None} if hidden_rows(tracks) else set()
-    gone = [i for i in heard if i is not None and not _goes_on(memory, i, alarmed, measurement, site)]
-    memory.tracks = tracks = tracks.without(gone)
-    # Before births: another one is born on the side that it leaves.
-    for i in _of_unknown_side(tracks):
-        _put_on_its_side(tracks, i, memory.sides, site)
-    for k in _sides_of_births(memory, alarmed, site) if measurement.heard.usable else ():
-        _give_birth(memory, k, measurement, site)
-    tracks = memory.tracks
-    if len(hidden_rows(tracks)) != 1 or memory.sides.hidden_share(None) < HIDDEN:
-        for i in _of_unknown_side(tracks):
-            if tracks.of_side(i) is None:
-                tracks.side_shares[i], tracks.existence[i] = (), memory.sides.existence(tracks.side[i])
+    for i in _heard_rows(tracks):
+        tracks.labels[i] = heard_as(tracks, i, measurement.kinds, site.street)
+    memory.tracks = tracks.without([i for i in _heard_rows(tracks) if _ends(memory, i, alarmed, site)])
+    side = _side_of_birth(memory, alarmed, site) if measurement.heard.usable else None
+    if side is not None:
+        _give_birth(memory, side, measurement, site)
+    view_heard(memory, site)
+
+
+def view_heard(memory: Memory, site: SiteGeometry) -> None:
+    """Give the entities that are only heard what the belief of the sides has of them.
+
+    Their existence, their chance to be hidden, their side and azimuth are marginals; their own are an
+    identity, classes and the approach rate. One alone may be on any side, two are on one each.
+    """
+    tracks, sides, belief = memory.tracks, _unseen(memory, site), memory.belief
+    rows = _heard_rows(tracks)
+    for i in rows:
+        shares = sides.side_shares(site.street.death) if len(rows) == 1 else ()
+        is_open = sum(share > 0.0 for share in shares) > 1
+        # In a tie it stays, which rounding must not undo.
+        if shares and shares[tracks.side[i]] < max(shares) * (1.0 - TINY):
+            tracks.side[i] = shares.index(max(shares))
+            tracks.put(i, site.sides[tracks.side[i]].prior())
+        of_side = None if is_open else int(tracks.side[i])
+        tracks.side_shares[i] = shares if is_open else ()
+        tracks.existence[i], tracks.behind[i] = sides.existence(of_side), sides.hidden_share(of_side)
+        if belief.has_times and tracks.behind[i] >= HIDDEN:
+            side, before = int(tracks.side[i]), MotionBelief(tracks.mean[i], tracks.covariance[i])
+            motion = hidden_motion(belief.coming[side], float(tracks.behind[i]), site.sides[side], before)
+            tracks.put(i, motion)
+
+
+def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
+    """Return the belief of the sides without a vehicle that has just come into view: it has a track."""
+    sides, since_ns = memory.sides, memory.belief.since_emerged_ns(memory.stamp_ns)
+    found = [ns <= nanoseconds(site.street.beside_s) for ns in since_ns]
+    emerged = tuple(0.0 if own else one for own, one in zip(found, sides.emerged, strict=True))
+    return replace(sides, emerged=emerged)
+
+
+def _heard_rows(tracks: Tracks) -> list[int]:
+    rows: list[int] = np.flatnonzero(~tracks.detected).tolist()
+    return rows
 
 
 def hidden_rows(tracks: Tracks) -> list[int]:
     """Return the rows of the hidden entities."""
     if tracks.seen.all():
         return []
-    rows: list[int] = np.flatnonzero(~tracks.seen & (tracks.behind >= HIDDEN)).tolist()
+    rows: list[int] = np.flatnonzero(~tracks.seen & (~tracks.detected | (tracks.behind >= HIDDEN))).tolist()
     return rows
 
 
-def _of_unknown_side(tracks: Tracks) -> list[int]:
-    return [i for i, shares in enumerate(tracks.side_shares) if shares]
-
-
-def _goes_on(
-    memory: Memory, row: int, alarmed: Sequence[bool], measurement: Measurement, site: SiteGeometry
-) -> bool:
-    """Update a hidden entity by one more hop; tell whether it is still believed."""
-    tracks = memory.tracks
-    tracks.labels[row] = heard_as(tracks, row, measurement.kinds)
-    if tracks.placed[row]:
-        return True  # It was announced, and is there until its place is lost
-    of_side = tracks.of_side(row)
-    tracks.existence[row] = existence = memory.sides.existence(of_side)
-    named = any(alarmed[k] for k in _sides(site) if of_side in (k, None))
-    least = site.settings.death_probability
+def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry) -> bool:
+    """Tell whether an entity that is only heard is believed no more."""
+    least, of_side = site.street.death, int(memory.tracks.side[row])
+    several = len(_heard_rows(memory.tracks)) > 1
     # One that has just come into view on the other side masks it: that its chance is low by then is less
     # evidence against it.
-    if of_side is not None and memory.sequence is not None and memory.sequence.just_emerged(but=of_side):
+    if memory.belief.just_emerged(site.street, but=of_side):
         least *= _MASKED
-    return existence >= least or named
+    existence = _unseen(memory, site).existence(of_side if several else None)
+    return existence < least and not (alarmed[of_side] if several else any(alarmed))
 
 
-def _sides_of_births(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> list[int]:
-    """Return the sides on which a hidden entity is born: of one vehicle the likelier one."""
-    tracks, sides, least = memory.tracks, memory.sides, site.settings.birth_probability
-    hidden, rearmed = hidden_rows(tracks), _rearmed(memory)
-    if sides.both is not None and not hidden and all(rearmed):
-        some = sides.hidden_on(None) >= least or any(alarmed)
-        return [max(_sides(site), key=sides.hidden_on)] if some else []
-    if sides.both is not None and sides.both < least and any(tracks.of_side(i) is None for i in hidden):
-        return []
-    taken = set(tracks.side[hidden].tolist())
-    likely = [sides.hidden[k] >= least or alarmed[k] for k in _sides(site)]
-    return [k for k in _sides(site) if likely[k] and rearmed[k] and k not in taken]
+def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> int | None:
+    """Return the side on which a hidden entity is born, if one is: of one vehicle the likelier one."""
+    tracks, sides, least = memory.tracks, memory.sides, site.street.birth
+    heard, rearmed, every = _heard_rows(tracks), _rearmed(memory), range(len(site.sides))
+    taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
+    if heard and (len(heard) > 1 or sides.both < least):
+        return None
+    if not taken and all(rearmed) and (sides.hidden_on(None) >= least or any(alarmed)):
+        return max(every, key=sides.hidden_on)
+    free = [k for k in every if rearmed[k] and k not in taken and (sides.hidden[k] >= least or alarmed[k])]
+    return max(free, key=sides.hidden_on, default=None)
 
 
 def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> None:
-    """Add one more hidden entity on a side, of unknown side where it is the only one."""
-    tracks, sides, shares = memory.tracks, memory.sides, tuple[float, ...]()
-    # After a hand-over it is another one, of the other side.
-    if sides.both is not None and not hidden_rows(tracks) and all(_rearmed(memory)):
-        shares = sides.side_shares(site.settings.death_probability)
+    """Add one more hidden entity on a side."""
     one = born(site.sides[k].label, memory.history[k].births, 0.0, measurement.stamp_ns, site)
     memory.history[k].births += 1
-    # What came into view from here before was another vehicle: the new one starts without its mass.
-    if isinstance(memory.belief, WindowBelief):
-        memory.belief = memory.belief.map(partial(ExplanationBelief.forget_origin, direction=k))
     one = replace(
         one,
         side=k,
         came_from=1.0,
-        existence=min(sides.hidden[k], 1.0),
         motion=site.sides[k].prior(),
         # A detector adds to the kinds at the hand-over.
         labels=measurement.kinds or one.labels,
         sources=(measurement.source,),
-        side_shares=shares,
     )
-    memory.tracks = tracks.joined([one])
-    _put_on_its_side(memory.tracks, len(tracks), sides, site)
-
-
-def _put_on_its_side(tracks: Tracks, row: int, sides: SideBelief, site: SiteGeometry) -> None:
-    """Put an entity of unknown side on its likelier one; in a tie it stays, which rounding must not undo."""
-    if tracks.of_side(row) is not None:
-        tracks.side_shares[row] = ()
-        return
-    shares = sides.side_shares(site.settings.death_probability)
-    if shares[tracks.side[row]] < max(shares) * (1.0 - TIE):
-        side = shares.index(max(shares))
-        tracks.side[row] = side
-        tracks.put(row, site.sides[side].prior())
-    tracks.side_shares[row], tracks.existence[row] = shares, sides.existence(None)
+    memory.tracks = memory.tracks.joined([one])
 
 
 def _rearmed(memory: Memory) -> list[bool]:
@@ -145,22 +139,19 @@ def _rearmed(memory: Memory) -> list[bool]:
     return [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in stamps_ns]
 
 
-def _sides(site: SiteGeometry) -> range:
-    return range(len(site.sides))
-
-
 def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
     """Merge tracks that have become one; return by the ids that end those that go on.
 
-    Of two at one place, of the same class, one has just been found and the other not for a second. They go
-    on where the first is, under the id that was known earlier; so do the halves of one of unknown side.
+    Of two at one place, of the same class, one has just been found and the other not for a second. They go on
+    where the first is, under the id that was known earlier. Two that are only heard go on as the likelier one
+    if it is unlikely that there are two.
     """
     tracks, stamp_ns, into, ended = memory.tracks, memory.stamp_ns, dict[str, str](), list[int]()
-    hidden = hidden_rows(tracks)
-    if _are_halves(tracks, hidden, memory.sides, site):
-        first, second = sorted(hidden, key=partial(_age, tracks))
-        tracks.side_shares[first] = memory.sides.side_shares(site.settings.death_probability)
-        _put_on_its_side(tracks, first, memory.sides, site)
+    heard = _heard_rows(tracks)
+    least = site.street.birth * min((tracks.existence[i] for i in heard), default=0.0)
+    # Beside the less likely one the other one would not be born.
+    if len(heard) > 1 and memory.sides.both < least:
+        first, second, *_ = sorted(heard, key=lambda i: (-tracks.existence[i], *_age(tracks, i)))
         ended.append(second)
         into[tracks.id[second]] = tracks.id[first]
     lost = tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS) & (tracks.behind < HIDDEN)
@@ -168,7 +159,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
         found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
         apart = np.abs(wrap_angle(tracks.mean[:, AZIMUTH] - tracks.mean[other, AZIMUTH]))
         # The nearest: the first of several would be another one in a mirror.
-        there = [i for i in found if _at_one_place(tracks, i, other)]
+        there = [i for i in found if _at_one_place(tracks, i, other, site.street.gate_rad)]
         same = min(there, key=apart.__getitem__, default=None)
         if same is not None:
             first, second = sorted((same, other), key=partial(_age, tracks))
@@ -178,6 +169,8 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
                 column[same] = column[first]
             ended.append(other)
     memory.tracks = tracks.without(ended)
+    if ended:
+        view_heard(memory, site)
     return into
 
 
@@ -185,25 +178,12 @@ def _age(tracks: Tracks, row: int) -> tuple[int, str]:
     return tracks.created_ns[row], tracks.id[row]
 
 
-def _are_halves(tracks: Tracks, hidden: list[int], sides: SideBelief, site: SiteGeometry) -> bool:
-    r"""Tell whether two entities that are only heard are one, by the joint of both sides.
-
-    .. math:: P(C_k, C_j) < p_{birth}^2
-
-    which is less than two vehicles have that are each believed just enough to be born.
-    """
-    if len(hidden) != 2 or told_apart(tracks)[hidden].any() or len(set(tracks.side[hidden])) != 2:
-        return False
-    behind = all(sides.hidden_share(tracks.side[i]) >= HIDDEN for i in hidden)
-    return behind and sides.both is not None and sides.both < site.settings.birth_probability**2
-
-
 def told_apart(tracks: Tracks) -> BoolArray:
     """Return which were told apart from others: by a message, or since they were seen."""
     return np.asarray(tracks.detected | (tracks.last_seen_ns != NEVER_NS))
 
 
-def _at_one_place(tracks: Tracks, one: int, other: int) -> bool:
+def _at_one_place(tracks: Tracks, one: int, other: int, gate_rad: float) -> bool:
     """Tell whether two tracks of one class stand within each other's deviations of azimuth and range.
 
     One that has left the view is soon anywhere in it: beyond the gate no sighting would have been its own.
@@ -211,7 +191,7 @@ def _at_one_place(tracks: Tracks, one: int, other: int) -> bool:
     gap = tracks.mean[one] - tracks.mean[other]
     gap[AZIMUTH] = wrap_angle(gap[AZIMUTH])
     variance = (tracks.covariance[one] + tracks.covariance[other]).diagonal()
-    near = abs(gap[AZIMUTH]) <= GATE_RAD and all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
+    near = abs(gap[AZIMUTH]) <= gate_rad and all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
     alike = _likeliest(tracks.labels[one]) == _likeliest(tracks.labels[other])
     return near and alike and bool(tracks.moving[one] == tracks.moving[other])
 
@@ -227,18 +207,18 @@ def hidden_on(tracks: Tracks, k: int) -> int | None:
 
 
 def _may_be_on(tracks: Tracks, row: int, side: int) -> bool:
-    of_side = tracks.of_side(row)
-    return bool(tracks.side_shares[row][side] > 0.0) if of_side is None else of_side == side
+    shares = tracks.side_shares[row]
+    return bool(shares[side] > 0.0 if shares and not tracks.detected[row] else tracks.side[row] == side)
 
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.
-MOST_EVENTS = 64
+MOST_EVENTS = MOST_BOXES
 
 
-def published(tracks: Tracks, settings: FilterSettings) -> Tracks:
+def published(tracks: Tracks, street: StreetModel) -> Tracks:
     """Return the tracks that a snapshot names."""
     # A refuted claim is remembered while it is repeated: forgotten, it would be believed anew.
-    refuted = tracks.placed & (tracks.existence < settings.delete_existence)
+    refuted = tracks.placed & (tracks.existence < street.death)
     return tracks.taken(~refuted) if refuted.any() else tracks
 
 
@@ -273,21 +253,27 @@ def after_look(
     """
     tracks = memory.tracks
     # Of the side where it is: what was heard may have been believed on the other one. Of two the likelier.
-    residuals = [(max(HANDOVER_RESIDUAL, 1.0 - chance), int(tracks.side[i])) for i, chance in emerged.items()]
+    residuals = [
+        (max(site.street.unheard, 1.0 - chance), int(tracks.side[i])) for i, chance in emerged.items()
+    ]
     handed_over = {side: residual for residual, side in sorted(residuals, reverse=True)}
-    # First seen near an edge, it came past it unheard.
+    # First seen near an edge that hides vehicles, it came past it unheard.
     unheard = set[int]()
     for i in range(known, len(tracks)):
-        side = int(tracks.side[i])
-        apart_rad = site.sides[side].distance_rad(float(tracks.mean[i, AZIMUTH]), float(tracks.width_rad[i]))
-        if tracks.seen[i] and tracks.moving[i] and apart_rad <= 2.0 * EDGE_STD_RAD:
-            unheard.add(side)
-    memory.tracks = surviving(tracks, site.settings)
-    past_edges(memory, handed_over, unheard, stamp_ns)
+        side = site.sides[k := int(tracks.side[i])]
+        apart_rad = side.distance_rad(float(tracks.mean[i, AZIMUTH]), float(tracks.width_rad[i]))
+        if side.hides and tracks.seen[i] and tracks.moving[i] and apart_rad <= 2.0 * site.street.edge_std_rad:
+            unheard.add(k)
+    memory.tracks = surviving(tracks, site.street)
+    past_edges(memory, handed_over, unheard, stamp_ns, site.street)
 
 
 def past_edges(
-    memory: Memory, handed_over: Mapping[int, float], unheard: Collection[int], stamp_ns: int
+    memory: Memory,
+    handed_over: Mapping[int, float],
+    unheard: Collection[int],
+    stamp_ns: int,
+    street: StreetModel,
 ) -> None:
     """Update the memory after vehicles came past the edges of some sides: the one place that tells of it.
 
@@ -296,26 +282,21 @@ def past_edges(
     """
     if not handed_over and not unheard:
         return
-    if isinstance(memory.belief, WindowBelief):
-        for side, residual in handed_over.items():
-            emerge = partial(ExplanationBelief.emerge, direction=side, residual=residual)
-            memory.belief = memory.belief.map(emerge)
-    else:
-        tracks, hidden = memory.tracks, ~memory.tracks.seen
-        # One that is still believed hidden where another came from was not what came.
-        left = {k: float(k in tracks.side[hidden]) for k in unheard}
-        apart = set(tracks.side[hidden & told_apart(tracks)].tolist())
-        memory.belief = memory.belief.handed_over(left | dict(handed_over), apart, stamp_ns)
+    tracks, hidden = memory.tracks, ~memory.tracks.seen
+    # One that is still believed hidden where another came from was not what came.
+    left = {k: float(k in tracks.side[hidden]) for k in unheard}
+    apart = set(tracks.side[hidden & told_apart(tracks)].tolist())
+    memory.belief = memory.belief.handed_over(left | dict(handed_over), apart, stamp_ns, street)
     for side in handed_over:
         memory.history[side].handover_ns = stamp_ns
 
 
-def surviving(tracks: Tracks, settings: FilterSettings) -> Tracks:
+def surviving(tracks: Tracks, street: StreetModel) -> Tracks:
     """Return the tracks without seen entities of too little existence or too uncertain azimuth.
 
     What a camera would mostly miss is not lost for being missed: its existence says how long it is believed.
     """
-    known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= _LOST_RAD**2
+    known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= street.lost_rad**2
     known |= tracks.miss_rate > MOSTLY_MISSED
-    kept = known & (tracks.existence >= settings.delete_existence) | ~tracks.seen
+    kept = known & (tracks.existence >= street.death) | ~tracks.seen
     return tracks if kept.all() else tracks.taken(kept)

@@ -17,19 +17,23 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from worldstate.ground import InvalidArgumentError, nanoseconds, seconds
+from worldstate.abduction.sequence.sequence_inputs import HOP_S
+from worldstate.abduction.sequence.sequence_model import COMING_S, HELD_HOPS, SequenceAlarm
+from worldstate.ground import TINY, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.state.cue import Budget, Tally, Verdict
 
 # Whatever is advised of comes into view within the risk's own horizon, or was not there. So long after one
 # came, sound is that of a vehicle that has been seen: no onset of a street without hazards.
-HORIZON_NS = nanoseconds(8.0)
+HORIZON_NS = nanoseconds(COMING_S[-1])
 BET_NS, BET_S = nanoseconds(2.0), 2.0  # A chance of two seconds is known after two
 LOOK_NS = nanoseconds(0.5)  # A look tells of its own time, so longer steps were not watched
-ENDS_NS = nanoseconds(1.005)  # An alarm is held for a second: later it is another onset
+SLACK_NS = nanoseconds(0.05 * HOP_S)  # For the rounding of stamps
+# An alarm is held for a second: later it is another onset.
+ENDS_NS = nanoseconds(HELD_HOPS * HOP_S) + SLACK_NS
 _BEGUN_ANEW_HZ = 1.0 / (6.0 * SECONDS_PER_HOUR)
-# .05 in 24 hours, half for each test.
-BROKEN = (1.0 + 24.0 * SECONDS_PER_HOUR * _BEGUN_ANEW_HZ) / 0.025
+# By (1 + eta T) / b a probability of 0.05 in 24 hours, half for each test.
+BROKEN = 200.0
 IN_DOUBT = 0.1 * BROKEN
 # Onsets come in clusters of up to so many; the root of a Poisson ratio of that order still has a mean of at
 # most one for clusters that come at random.
@@ -38,7 +42,6 @@ RATES = (2.0, 10.0)  # Alternatives, in budgets: what is to be found within two 
 # A chance is held where the share that comes has log-odds within so much of its own; bets are at twice it.
 # Streets differ by a factor of three either way, 1.1 nats; what is learned of their traffic takes .5.
 TOLERANCE_NATS = 0.7
-_LEAST_CHANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +103,7 @@ def chance_factors(chances: Sequence[float], came: Sequence[bool]) -> list[float
 
 def _moved(chance: float, nats: float, came: bool) -> float:
     """Return the probability of an outcome after its chance has moved by some log-odds."""
-    inside = min(max(chance, _LEAST_CHANCE), 1.0 - _LEAST_CHANCE)
+    inside = min(max(chance, TINY), 1.0 - TINY)
     up = inside * math.exp(nats)
     return (up if came else 1.0 - inside) / (up + 1.0 - inside)
 
@@ -118,7 +121,7 @@ class WatchedHop:
 
 _NEVER: tuple[int | None, ...] = (None, None)
 _NO_ONSETS, _NO_CHANCES = Evidence((1.0,) * len(RATES)), Evidence((1.0, 1.0))
-_MOST = len(RATES) * BROKEN * (1.0 + 1e-9)  # All of the mean in one of them
+_MOST = len(RATES) * BROKEN * (1.0 + TINY)  # All of the mean in one of them
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,12 +217,14 @@ class BudgetWatch:
             raise InvalidArgumentError(f"memory.sequence.watch: expected e-values up to {_MOST:g}")
 
 
-def budget_of(watch: BudgetWatch, stamp_ns: int, onsets_per_hour: float) -> Budget:
-    """Return how the watch over a budget stands at a time."""
+def budget_of(watch: BudgetWatch, stamp_ns: int, alarm: SequenceAlarm) -> Budget:
+    """Return how the watch over the budget of an alarm stands at a time."""
     # In full precision they would take twice as long to write.
-    evidence_nats = {"onsets": round(watch.onsets.nats, 6), "within": round(watch.within.nats, 6)}
+    tests = {"onsets": watch.onsets, "within": watch.within}
+    evidence_nats = {name: round(one.nats, 6) for name, one in tests.items()}
     verdict, why = _verdict(watch, stamp_ns)
-    return Budget(verdict, why, evidence_nats, onsets_per_hour, 0.0, watch.tally)
+    asked, promise = alarm.asked_alpha, alarm.promise
+    return Budget(verdict, why, evidence_nats, alarm.onsets_per_hour, watch.tally, asked, promise)
 
 
 def _verdict(watch: BudgetWatch, stamp_ns: int) -> tuple[Verdict, str | None]:

@@ -8,19 +8,25 @@ from typing import NamedTuple
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.association import LEAST_EXISTENCE, MOST_EXISTENCE, associated
+from worldstate.belief.association import associated
 from worldstate.belief.detection import Detections, Scan, camera_scan, fused, miss_rates, position_scan
-from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import (
     CartesianBelief,
     at_position,
     update_bearing,
     update_position,
 )
-from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, RADIAL_RATE, MotionBelief, update
+from worldstate.belief.kinematics.motion import (
+    AZIMUTH,
+    LEAST_STD,
+    LOG_RANGE,
+    RADIAL_RATE,
+    MotionBelief,
+    update,
+)
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry, normal_shares
+from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import (
     Track,
     Tracks,
@@ -32,22 +38,19 @@ from worldstate.belief.track import (
     occluded,
     relabelled,
 )
-from worldstate.ground import FloatArray, seconds, wrap_angle
+from worldstate.ground import TINY, FloatArray, seconds, wrap_angle
 from worldstate.ground.typing import IndexArray
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
 from .birth_death import HIDDEN, after_look
-from .cues import NO_LOOK, claimed_nats, update_rule
 from .fixed_lag import LAG_NS
-from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory, SourceRule
-from .sequence_memory import SequenceMemory, alerted
+from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory
 from .site_model import FilterModel
+from .street_belief import alerted
 
 # Of (theta_dot rad/s, rho 1/s) at the first box: a car at 50 km/h passing at 15 m has .9 rad/s, two
-# deviations. A parked one has none, but zero would make the covariance singular.
-_NEW_RATE_STD = (0.5, 0.5)
-_PARKED_RATE_STD = (1e-3, 1e-3)
-_ROUNDING = 1e-12  # Odds of certainty have no quotient
+# deviations. A parked one has none.
+_NEW_RATE_STD, _PARKED_RATE_STD = 0.5, LEAST_STD
 
 
 def new_looks(
@@ -68,7 +71,7 @@ def new_looks(
         in_time = -FORGOTTEN_NS < look.stamp_ns - measurement.stamp_ns <= LAG_NS
         if in_time and (last is None or look.stamp_ns > last.stamp_ns):
             since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
-            new.append((one, min(max(since_s, 0.0) / settings.look_interval_s, 1.0)))
+            new.append((one, min(max(since_s, 0.0) / settings.street.look_s, 1.0)))
             memory.looks[look.sensor] = CountedLook(
                 look.stamp_ns, measurement.source, look.answer, look.sector_rad, look.fault
             )
@@ -84,30 +87,22 @@ def update_looks(
 ) -> None:
     """Update the memory with the new looks of a measurement, all cameras at once."""
     if looks:
-        births = model.site.settings.births_per_look
-        scans = [camera_scan(seen, model.site.view(seen.look), weight, births) for seen, weight in looks]
+        street = model.site.street
+        scans = [camera_scan(seen, model.site.view(seen.look), weight, street) for seen, weight in looks]
         detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
 
 
 def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> None:
     """Update the memory with the positions of a radar or a radio: entities, and announced hidden ones."""
-    settings, last = model.site.settings, memory.looks.get(scan.source)
+    street, last = model.site.street, memory.looks.get(scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
-    weight = min(elapsed_s / settings.look_interval_s, 1.0)
-    scans = [position_scan(scan, weight, settings.births_per_look)]
+    weight = min(elapsed_s / street.look_s, 1.0)
+    scans = [position_scan(scan, weight, street)]
+    before = memory.belief
     detection_update(memory, scans, None, scan.stamp_ns, model.site)
     memory.looks[scan.source] = _scan_look(scan)
-    if isinstance(memory.belief, SequenceMemory):
-        memory.belief = alerted(memory.belief, model.context)
-    chances = announced(memory.tracks, model.site)
-    if not any(chances):
-        # An entity that has come into view, or is gone, ends the rule of the source that announced it.
-        memory.rules.pop(scan.source, None)
-    elif scan.searched is None:
-        said = SignatureEvidence(model.context.directions, tuple(map(claimed_nats, chances)), 0.0, 0.0)
-        sides = tuple(k for k, chance in enumerate(chances) if chance > 0.5)
-        rule = SourceRule(scan.stamp_ns, announced=sides)
-        update_rule(memory, scan.source, rule, said, NO_LOOK, model)
+    if memory.belief is not before:  # Time alone raises no alarm
+        memory.belief = alerted(memory.belief, model.context, model.policy, street)
 
 
 def _scan_look(scan: PositionScan) -> CountedLook:
@@ -144,16 +139,16 @@ def detection_update(
     rows, missed, was_seen = np.flatnonzero(detection >= 0), np.flatnonzero(detection < 0), tracks.seen.copy()
     found = _Found(rows, detection[rows], detections)
     if scans[0].sector is None:
-        existence = _told(tracks, found, scans[0])
+        existence = _told(tracks, found, scans[0], 1.0 - site.street.doubt)
     else:
         existence = tracks.existence.copy()
         hits = np.minimum(whose.pairs.T @ by_look, 1.0)
-        existence[: len(known)], detected = _existence(known, hits, scans)
+        existence[: len(known)], detected = _existence(known, hits, scans, site.street)
         # What was only heard is found, or another one is.
         first = np.flatnonzero((detection[: len(known)] >= 0) & ~known.detected)
         another = (1.0 - chances[first]) * detections.existence[detection[first]]
         existence[first] = chances[first] + another
-    _move(tracks, found, chances)
+    _move(tracks, found, chances, site.street)
     _see(tracks, found, chances, scans, stamp_ns, site)
     follow_places(tracks, site)
     if scans[0].sector is None:
@@ -183,7 +178,7 @@ def _born(
     """Return a new entity before its detection counts; hidden where messages say so."""
     azimuth_rad = float(detections.azimuth_rad[by])
     side = None if detections.in_sight else site.hiding_side(detections.positions[by].position_m)
-    existence = min(float(detections.existence[by]), MOST_EXISTENCE)
+    existence = min(float(detections.existence[by]), 1.0 - site.street.doubt)
     if side is None:
         track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
         memory.counts.sighted += 1
@@ -193,7 +188,9 @@ def _born(
     return replace(track, side=side, came_from=1.0, sources=(scan.source,))
 
 
-def _existence(tracks: Tracks, hits: FloatArray, scans: Sequence[Scan]) -> tuple[FloatArray, FloatArray]:
+def _existence(
+    tracks: Tracks, hits: FloatArray, scans: Sequence[Scan], street: StreetModel
+) -> tuple[FloatArray, FloatArray]:
     r"""Return the existence after every look s of an instant, and P(a look detects it | in line of sight).
 
     With the chance c that a look has detected it,
@@ -204,15 +201,15 @@ def _existence(tracks: Tracks, hits: FloatArray, scans: Sequence[Scan]) -> tuple
 
     Of what is only heard the belief of its side decides.
     """
-    r = np.minimum(np.maximum(tracks.existence, _ROUNDING), 1.0 - _ROUNDING)
+    r = np.minimum(np.maximum(tracks.existence, TINY), 1.0 - TINY)
     detected = np.zeros(len(r))
     odds = ratio = r / (1.0 - r)
     for hit, scan in zip(hits.T, scans, strict=True):
         by_one = _searched(tracks, scan) * (1.0 - (scan.miss_rate or 0.0) ** scan.weight)
         detected = 1.0 - (1.0 - detected) * (1.0 - by_one)
         missed = after_empty_look(r, 1.0 - by_one * (1.0 - tracks.behind))
-        missed = np.where(tracks.seen, missed, np.maximum(missed, LEAST_EXISTENCE))
-        now = np.minimum(np.maximum(hit + (1.0 - hit) * missed, _ROUNDING), 1.0 - _ROUNDING)
+        missed = np.where(tracks.seen, missed, np.maximum(missed, street.doubt))
+        now = np.minimum(np.maximum(hit + (1.0 - hit) * missed, TINY), 1.0 - TINY)
         ratio = ratio * (now / (1.0 - now)) / odds
     return np.where(tracks.detected, ratio / (1.0 + ratio), tracks.existence), detected
 
@@ -227,9 +224,9 @@ def _hidden(
     with P(hidden) b before, P(detected | in line of sight) p, and for what is hidden q times as much: a radar
     also finds some of that, by multipath and diffraction.
     """
-    b, q = tracks.behind, site.settings.hidden_return if scan.detections.positions else 0.0
-    found = b * q / np.maximum(b * q + 1.0 - b, _ROUNDING)
-    missed = b / np.maximum(b + (1.0 - b) * (1.0 - detected), _ROUNDING)
+    b, q = tracks.behind, site.street.hidden_return if scan.detections.positions else 0.0
+    found = b * q / np.maximum(b * q + 1.0 - b, TINY)
+    missed = b / np.maximum(b + (1.0 - b) * (1.0 - detected), TINY)
     after = np.array(chances) * found + (1.0 - np.array(chances)) * missed
     return np.where(tracks.detected, after, b)
 
@@ -247,27 +244,27 @@ def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
     return np.where(covers, normal_shares(deviations), 0.0)
 
 
-def _told(tracks: Tracks, found: _Found, scan: Scan) -> FloatArray:
+def _told(tracks: Tracks, found: _Found, scan: Scan, most: float) -> FloatArray:
     """Return the existence after messages."""
     # A sender that lies in one message lies in the next: what a source repeats counts once.
     news = np.array([scan.source not in tracks.sources[i] for i in found.rows.tolist()], bool)
     rows, told = found.rows[news], found.detections.existence[found.by[news]]
-    odds, before = told / (1.0 - told), np.minimum(tracks.existence[rows], MOST_EXISTENCE)
+    odds, before = told / (1.0 - told), np.minimum(tracks.existence[rows], most)
     after = tracks.existence.copy()
-    after[rows] = np.minimum(before * odds / (before * odds + 1.0 - before), MOST_EXISTENCE)
+    after[rows] = np.minimum(before * odds / (before * odds + 1.0 - before), most)
     return after
 
 
-def _move(tracks: Tracks, found: _Found, chances: FloatArray) -> None:
+def _move(tracks: Tracks, found: _Found, chances: FloatArray, street: StreetModel) -> None:
     """Update the motion or the place of the found tracks with what was measured of them."""
     rows, by, detections = found
     placed = tracks.placed[rows] | bool(detections.positions)
     usual = ~placed & tracks.seen[rows] & (detections.moving[by] == tracks.moving[rows])
     for i, j in zip(rows[~usual].tolist(), by[~usual].tolist(), strict=True):
         if detections.positions or tracks.placed[i]:
-            tracks.put(i, _placed(tracks, i, detections, j))
+            tracks.put(i, _placed(tracks, i, detections, j, street.speed_mps))
         else:
-            tracks.put(i, _motion_at(detections, j, tracks.mean[i], tracks.covariance[i]))
+            tracks.put(i, _motion_at(detections, j, tracks.mean[i], tracks.covariance[i], street))
     if usual.any():
         rows, by = rows[usual], by[usual]
         before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
@@ -275,7 +272,7 @@ def _move(tracks: Tracks, found: _Found, chances: FloatArray) -> None:
         tracks.mean[rows], tracks.covariance[rows] = after.mean, after.covariance
 
 
-def _placed(tracks: Tracks, row: int, detections: Detections, by: int) -> CartesianBelief:
+def _placed(tracks: Tracks, row: int, detections: Detections, by: int, speed_mps: float) -> CartesianBelief:
     """Return the place of a track after a position, or after a bearing of what has a place."""
     place = tracks.place(row)
     if not detections.positions:
@@ -284,17 +281,20 @@ def _placed(tracks: Tracks, row: int, detections: Detections, by: int) -> Cartes
     position = detections.positions[by]
     if place is not None:
         return update_position(place, position)
-    place = at_position(position)
+    place = at_position(position, speed_mps)
     if not tracks.seen[row]:
         return place
     return update_bearing(place, float(tracks.mean[row, AZIMUTH]), float(tracks.azimuth_std_rad[row]))
 
 
-def _motion_at(boxes: Detections, by: int, mean: FloatArray, covariance: FloatArray) -> MotionBelief:
+def _motion_at(
+    boxes: Detections, by: int, mean: FloatArray, covariance: FloatArray, street: StreetModel
+) -> MotionBelief:
     """Return the motion belief at a box, with approach rate and range of an earlier belief."""
     moving = boxes.moving[by] > 0.0
-    rate_std, radial_std = _NEW_RATE_STD if moving else _PARKED_RATE_STD
-    expected, std = [boxes.azimuth_rad[by], 0.0, 0.0, 3.2], [boxes.std_rad[by], rate_std, radial_std, 0.6]
+    rate_std = _NEW_RATE_STD if moving else _PARKED_RATE_STD
+    expected = [boxes.azimuth_rad[by], 0.0, 0.0, math.log(street.range_m)]
+    std = [boxes.std_rad[by], rate_std, rate_std, street.range_spread]
     if moving:
         expected[2:] = mean[RADIAL_RATE:].tolist()
         std[2:] = np.sqrt(np.diag(covariance)[RADIAL_RATE : LOG_RANGE + 1]).tolist()
@@ -311,12 +311,12 @@ def _see(
 ) -> None:
     """Update the found tracks; those not in view before take their side and class there."""
     rows, by, detections = found
-    was_seen = tracks.seen[rows].tolist()
+    was_seen, gains = tracks.seen[rows].tolist(), (site.street.label_gain, site.street.doubt)
     tracks.updated_ns[rows] = stamp_ns
     for i, j, known in zip(rows.tolist(), by.tolist(), was_seen, strict=True):
         tracks.sources[i] = merged(tracks.sources[i], scans[0].source)
         if classes := detections.classes[j]:
-            tracks.labels[i] = relabelled(tracks.labels[i], classes) if known else classes
+            tracks.labels[i] = relabelled(tracks.labels[i], classes, *gains) if known else classes
     moving = detections.moving[by]
     tracks.moving[rows] = np.where(np.isnan(moving), tracks.moving[rows], moving > 0.0)
     if detections.positions:

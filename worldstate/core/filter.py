@@ -1,33 +1,31 @@
 """The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated_policy
-from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.detection import BY_ALL
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
-from worldstate.ground import LEAST_HEARD, InvalidArgumentError, in_range, integer_ns, nanoseconds
+from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds
 from worldstate.ground.serialisation import Layout, decode, encode
 from worldstate.measurement import Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
+from worldstate.state.world_state import judged
 
 from .birth_death import events_between, published
+from .budget_watch import SLACK_NS
 from .cues import cues_of
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
-from .memory import NEWS_HOLDS_NS, Memory, first_memory
+from .memory import MOST_BOXES, NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
 from .site_model import FilterModel, from_here, published_belief, site_geometry_of
 from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
 from .step import advanced, take_in
 
-# A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
-STAMP_SLACK_NS = 5_000_000
-# A crowded street shows some forty; at 600 a step took .3 s.
-MOST_BOXES = 64
+MOST_SIDES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class WorldFilter:
     context : Context
         Rates, occluders, ego motion.
     policy : CueingPolicy
-        Threshold, sustained rule and risk map; a model file brings one.
+        Threshold and risk map; a model file brings one.
     settings : FilterSettings
         Windows, births and deaths.
     start_ns : int
@@ -52,7 +50,7 @@ class WorldFilter:
     Raises
     ------
     InvalidArgumentError
-        If the policy and the context speak of different numbers of directions.
+        If the context has more than three approach sides.
 
     Examples
     --------
@@ -78,12 +76,9 @@ class WorldFilter:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_ns", integer_ns("start_ns", self.start_ns))
-        expected = len(self.context.directions) + 2
-        if len(self.policy.reference_prior) != expected:
-            got = len(self.policy.reference_prior)
-            raise InvalidArgumentError(
-                f"policy: expected {expected} reference priors for {self.context.directions}, got {got}"
-            )
+        if (sides := len(self.context.directions)) > MOST_SIDES:
+            # The joint of four sides has half a million states.
+            raise InvalidArgumentError(f"context: expected at most {MOST_SIDES} approach sides, got {sides}")
 
     @property
     def stamp_ns(self) -> int:
@@ -106,22 +101,17 @@ class WorldFilter:
         memory, last, settings = self._memory, self._memory.last, self.settings
         model = from_here(self._model, memory.ego)
         context = model.context
-        sensors, tracks = sensors_of(memory), published(memory.tracks, settings)
-        heard = hearings(memory)
-        # What could not be heard is no evidence, and no budget was measured without it.
-        deaf = heard is not None and all(one.share < LEAST_HEARD for one in heard)
+        sensors, tracks = sensors_of(memory), published(memory.tracks, settings.street)
         # Those of the last step hold until time passes, or odometry moves the place.
         is_fresh = memory is self._lag.latest and memory.ego is None
-        budget = None if memory.sequence is None else memory.sequence.budget(memory.stamp_ns)
-        broken = budget is not None and budget.verdict == "broken"
-        return WorldState(
+        state = WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.counts.measurements,
             entities=entities_of(tracks, memory, model.site),
             relations=memory.relations if is_fresh else relations_at(memory, tracks, model),
             context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
             cues=cues_of(memory, model, sensors),
-            calibrated=self.policy.alpha > 0.0 and not deaf and not broken,
+            calibrated=self.policy.alpha > 0.0,
             bearing=last.bearing,
             domain=last.domain,
             no_sequence=last.no_sequence,
@@ -130,10 +120,11 @@ class WorldFilter:
             sensors=sensors,
             searched=searched_views(memory, context),
             events=last.events,
-            heard=heard,
+            heard=hearings(memory),
             ego=None if memory.ego is None else ego_of(memory.ego),
-            budget=budget,
+            budget=memory.belief.budget(memory.stamp_ns),
         )
+        return judged(state)
 
     def predict(self, dt_s: float) -> "WorldFilter":
         """Return the filter `dt_s` seconds later, without a measurement.
@@ -143,7 +134,9 @@ class WorldFilter:
         InvalidArgumentError
             If the step is negative or not finite.
         """
-        return self.predict_to(self.stamp_ns + nanoseconds(in_range("dt_s", dt_s, 0.0, 1e10)))
+        return self.predict_to(
+            self.stamp_ns + nanoseconds(in_range("dt_s", dt_s, 0.0, math.inf, open_high=True))
+        )
 
     def predict_to(self, stamp_ns: int) -> "WorldFilter":
         """Return the filter at a later time, ns.
@@ -154,7 +147,7 @@ class WorldFilter:
             If that time is no integer or is earlier than the belief's.
         """
         stamp_ns = integer_ns("stamp_ns", stamp_ns)
-        if stamp_ns < self.stamp_ns - STAMP_SLACK_NS:
+        if stamp_ns < self.stamp_ns - SLACK_NS:
             raise InvalidArgumentError(
                 f"stamp_ns: expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
             )
@@ -175,7 +168,7 @@ class WorldFilter:
         Raises
         ------
         InvalidArgumentError
-            If the directions are not those of the context; what a measurement consists of is checked when it
+            If none of its directions is one of the context; what a measurement consists of is checked when it
             is built.
         """
         # Before anything is computed: a measurement that is refused leaves the filter as it was.
@@ -188,11 +181,11 @@ class WorldFilter:
         if lag.latest is not self._lag.latest:
             # From what was published last on: a late measurement changes what has become of it since.
             steps = (*(one.before for one in lag.arrivals), lag.latest)
-            known, now = (published(one.latest.tracks, self.settings) for one in (self._lag, lag))
+            known, now = (published(one.latest.tracks, self.settings.street) for one in (self._lag, lag))
             lag.latest.last.events = events_between(known, now, steps)
             lag = lag.counted(boxes_left_out=left_out)
         world = self._with(lag.latest, lag)
-        return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)
+        return world if self.stamp_ns <= world.stamp_ns + SLACK_NS else world.predict_to(self.stamp_ns)
 
     def refused(self, inputs: int) -> "WorldFilter":
         """Return the filter, whose `WorldState.delivery` counts so many more inputs refused before it."""
@@ -217,7 +210,7 @@ class WorldFilter:
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery
-        fresh = first_memory(self.context, measurement.stamp_ns)
+        fresh = first_memory(self.context, self.settings, measurement.stamp_ns)
         fresh.counts.left_out = self._memory.counts.left_out
         counted = replace(delivery, reanchored=delivery.reanchored + 1)
         world = replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=FixedLag(fresh, (), counted))
@@ -263,7 +256,7 @@ class WorldFilter:
 
     @cached_property
     def _memory(self) -> Memory:
-        return self.memory or first_memory(self.context, self.start_ns)
+        return self.memory or first_memory(self.context, self.settings, self.start_ns)
 
     @cached_property
     def _lag(self) -> FixedLag:
@@ -278,7 +271,7 @@ class WorldFilter:
 class FilterRecord:
     """All of a filter, as it is written."""
 
-    LAYOUT: ClassVar = Layout("worldstate.Filter", "3.0.0")
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "4.0.0")
 
     context: Context
     policy: CueingPolicy
@@ -292,13 +285,9 @@ class FilterRecord:
             self._check(memory)
 
     def _check(self, memory: Memory) -> None:
-        k, rules = len(self.context.directions), memory.rules.values()
+        k = len(self.context.directions)
         memory.belief.check(k)
-        if any(len(one.statistic) > self.policy.sustain_hops for one in rules):
-            raise InvalidArgumentError("memory.rules: expected statistics of the policy's rule")
-        announced = [side for one in rules for side in one.announced]
-        named = max((*announced, *memory.tracks.side.tolist()), default=0)
-        if len(memory.history) != k or named >= k:
+        if len(memory.history) != k or max(memory.tracks.side.tolist(), default=0) >= k:
             raise InvalidArgumentError("memory: expected known sides")
 
 
@@ -326,8 +315,6 @@ def _fitting(measurement: object, context: Context) -> Timed:
     if not isinstance(measurement, Measurement):
         raise InvalidArgumentError(f"measurement: expected a Measurement, got {type(measurement).__name__}")
     expected, got = context.directions, measurement.signature.directions
-    if got != expected:
-        raise InvalidArgumentError(f"signature: expected the directions {expected}, got {got}")
-    if isinstance(measurement.sequence, SequenceReading) and expected != SIDES:
-        raise InvalidArgumentError(f"sequence: expected the directions {SIDES}, got {expected}")
+    if not set(got) & set(expected):
+        raise InvalidArgumentError(f"signature: expected one of the directions {expected}, got {got}")
     return measurement

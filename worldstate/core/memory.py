@@ -1,65 +1,39 @@
 """The state that the filter carries from one call to the next."""
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, TypeAlias, TypeVar
+from dataclasses import dataclass, field
+from typing import Annotated, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.road_users import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief, corrected
+from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Track, Tracks
-from worldstate.belief.window_belief import ExplanationBelief, WindowBelief
 from worldstate.ground.serialisation import ADDED, Count, Probability, Via
-from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.ground.values import SECONDS_PER_HOUR, NotUsable, nanoseconds
 from worldstate.measurement import Odometry
 from worldstate.measurement.measurement import Bearing, Heard
 from worldstate.state import Context, Event, Relation
 
-from .sequence_memory import HOP_NS, SLACK_NS, SequenceMemory
+from .street_belief import StreetBelief
 
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
 NEWS_HOLDS_NS = nanoseconds(1.0)
 # Names come and go; without this, a checkpoint holds every one that was ever told.
-FORGOTTEN_NS = nanoseconds(3600.0)
-Belief: TypeAlias = WindowBelief | SequenceMemory
+FORGOTTEN_NS = nanoseconds(SECONDS_PER_HOUR)
+# Of an image, and of the events of a step; a crowded street shows some forty, and at 600 a step took 0.3 s.
+MOST_BOXES = 64
 ValueT = TypeVar("ValueT")
 
 
 @dataclass(frozen=True, slots=True)
-class SourceRule:
-    """What a source said last: its statistic over the hops of the sustained rule, and how it is.
+class SourceState:
+    """When a source last measured, what was wrong then, and how well it could hear, and since when."""
 
-    What another one measures does not end its alarm.
-    """
-
-    stamp_ns: int  # Of its last measurement
-    # Of as many hops of .1 s as the rule asks for, the last one last, which began then.
-    statistic: tuple[Probability, ...] = ()
-    hop_ns: int = 0
-    fault: str | None = None  # What was wrong with it then
-    announced: tuple[Count, ...] = ()  # Sides on which its messages announce vehicles; empty of what hears
-    heard: Heard = field(default=Heard())  # How well it could hear, and since when so
+    stamp_ns: int
+    fault: str | None = None
+    heard: Heard = field(default=Heard())
     heard_ns: int = 0
-
-    def after(self, last: "SourceRule | None", statistic: float, hops: int) -> "SourceRule":
-        """Return the rule with a statistic more, after that of the source's last measurement.
-
-        Time counts, not measurements: in one hop the least, and in a hop without one the less of its
-        neighbours. Of silence that ends an alarm nothing is known.
-        """
-        if last is None or not last.statistic:
-            return replace(self, statistic=(statistic,), hop_ns=self.stamp_ns)
-        since_ns = self.stamp_ns - last.hop_ns
-        steps = (since_ns + SLACK_NS) // HOP_NS if since_ns <= NEWS_HOLDS_NS else 1
-        less = min(last.statistic[-1], statistic)
-        if steps < 1:
-            return replace(self, statistic=(*last.statistic[:-1], less), hop_ns=last.hop_ns)
-        every = (*last.statistic, *[less] * (min(steps, hops) - 1), statistic)
-        return replace(self, statistic=every[-hops:], hop_ns=self.stamp_ns)
-
-    def sustained(self, hops: int) -> float:
-        """Return the least statistic of so many hops, 0 where there are fewer."""
-        return min(self.statistic[-hops:]) if len(self.statistic) >= hops else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,15 +54,15 @@ class SideHistory:
     births: Count = 0  # Hidden entities born
     handover_ns: int | None = None  # Last hand-over
     advised_ns: int | None = None  # Since when an advisory has been out
+    announced_ns: int | None = None  # When messages last raised the alarm: time alone raises none
 
 
 @dataclass(frozen=True, slots=True)
 class Instant:
     """What one window says by itself, at the policy's reference prior; JSON knows no infinity."""
 
-    statistic: Probability  # P(hidden), all directions together
-    log_lambda: float | None  # None for a ratio without bound
-    heard_nats: float  # Log-odds of hidden by sound alone
+    statistic: Probability | None = None  # P(hidden), all directions together
+    log_lambda: float | None = None  # None for a ratio without bound
 
 
 @dataclass
@@ -97,9 +71,10 @@ class LastSaid:
 
     # P(hidden), P(visible), P(none) before the last evidence; None before the first.
     predicted: tuple[Probability, Probability, Probability] | None = None
-    instant: Instant | None = None  # Of the last window; None before the first
+    instant: Instant = Instant()  # Of the last window
     bearing: Bearing | None = None
     domain: DomainVerdict | None = None
+    named: tuple[str, ...] = ()  # Sides that its evidence distinguishes
     no_sequence: NotUsable | None = None  # Why it did not say when vehicles come into view
     events: tuple[Event, ...] = ()
 
@@ -121,44 +96,37 @@ class Memory:
     """
 
     stamp_ns: int  # Time of the belief
-    # By single windows, until a sequence is read, which then is the only belief.
-    belief: Belief
+    belief: StreetBelief
     history: tuple[SideHistory, ...]
     tracks: Annotated[Tracks, Via(tuple[Track, ...], Tracks.rows, Tracks.of)] = field(
         default_factory=lambda: Tracks.of(())
     )
     counts: Counts = field(default_factory=Counts)
     last: LastSaid = field(default_factory=LastSaid)
-    rules: dict[str, SourceRule] = field(default_factory=dict)  # By the source
+    sources: dict[str, SourceState] = field(default_factory=dict)  # By the source
     looks: dict[str, CountedLook] = field(default_factory=dict)  # Last one by the sensor
     relations: tuple[Relation, ...] = ()  # With the intervals in which they have held
     ego: EgoBelief | None = None  # By odometry; None without
 
     @property
     def sides(self) -> SideBelief:
-        """What is believed of the sides, by whichever evidence there is; messages not yet taken in."""
+        """Marginals of the belief of the sides; messages not yet taken in."""
         return self.belief.sides
-
-    @property
-    def sequence(self) -> SequenceMemory | None:
-        """The belief by a sequence; None before the first one."""
-        return self.belief if isinstance(self.belief, SequenceMemory) else None
 
     def draft(self) -> "Memory":
         """Return a copy that a step may write into."""
         own = draft_of(self)
         own.history, own.tracks = tuple(map(draft_of, self.history)), self.tracks.draft()
         own.counts, own.last = draft_of(self.counts), draft_of(self.last)
-        own.rules, own.looks = dict(self.rules), dict(self.looks)
+        own.sources, own.looks = dict(self.sources), dict(self.looks)
         return own
 
     def forget(self) -> None:
         """Drop sources and sensors that have been unheard for an hour."""
         since_ns = self.stamp_ns - FORGOTTEN_NS
-        self.rules = {name: one for name, one in self.rules.items() if one.stamp_ns >= since_ns}
+        self.sources = {name: one for name, one in self.sources.items() if one.stamp_ns >= since_ns}
         self.looks = {name: one for name, one in self.looks.items() if one.stamp_ns >= since_ns}
-        if isinstance(self.belief, WindowBelief):
-            self.belief = self.belief.since(since_ns)
+        self.belief = self.belief.since(since_ns)
 
 
 def draft_of(value: ValueT) -> ValueT:
@@ -169,16 +137,9 @@ def draft_of(value: ValueT) -> ValueT:
     return own
 
 
-def first_memory(context: Context, start_ns: int) -> Memory:
+def first_memory(context: Context, settings: FilterSettings, start_ns: int) -> Memory:
     """Return the memory of a filter that has measured nothing."""
-    k, priors = len(context.directions), context.priors
-    # Without priors the filter starts as if it had waited for ever: neither alarmed nor sure of an empty
-    # street.
-    if priors is None:
-        belief = ExplanationBelief.settled(k, context.rates.values_hz)
-    else:
-        belief = ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)
-    history = tuple(SideHistory() for _ in range(k))
+    history = tuple(SideHistory() for _ in context.directions)
     # Without odometry the ego vehicle drives straight on, and corners that are known in metres come nearer.
     ego = corrected(None, Odometry("context", start_ns, speed)) if (speed := context.ego_speed_mps) else None
-    return Memory(start_ns, WindowBelief(belief, ((start_ns, belief),)), history, ego=ego)
+    return Memory(start_ns, StreetBelief.expected(context, settings.street), history, ego=ego)

@@ -8,9 +8,10 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import LONGEST_S, STATED
 from worldstate.belief.hidden_bearing import time_to_visible
+from worldstate.belief.kinematics.motion import LEAST_STD
 from worldstate.belief.site_geometry import normal_share
-from worldstate.belief.track import Track, Tracks, hidden_shares, occluded, side_weights
-from worldstate.ground import FloatArray, nanoseconds
+from worldstate.belief.track import Track, Tracks, occluded, side_weights
+from worldstate.ground import TINY, FloatArray, nanoseconds
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
 
@@ -18,13 +19,10 @@ from .memory import Memory
 from .site_model import FilterModel
 
 _HOLDS = 0.5  # The probability from which on a relation is said to hold
-_KEPT_NS = nanoseconds(5.0)  # Of a relation that has ended
+_KEPT_NS = nanoseconds(LONGEST_S)  # Of a relation that has ended
 # Half the width of a lane in town; below a walk the heading does not tell the lane.
 _HALF_LANE_M, _LEAST_SPEED_MPS = 1.6, 1.5
-_ALIKE = math.cos(math.radians(30.0))  # Of headings in one lane
-_LEAST_CROSSING_MPS = 0.3
-_CONFLICT_S = 5.0  # Beyond, vehicles have turned or braked
-_BESIDE = 10.0  # Metres ahead that a metre beside the lane counts for
+_ALIKE = 0.5  # Cosine of headings in one lane: within 60 degrees
 _LEAST = 0.05  # What is less likely is not named
 
 
@@ -36,11 +34,10 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
     if not memory.relations and not related.any():
         return ()
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
-    shares, some = hidden_shares(tracks, memory.sides)[related].tolist(), tracks.taken(related).rows()
-    edges = [
-        one for track, share in zip(some, shares, strict=True) for one in _edges(track, share, memory, model)
-    ]
-    placed = [one for one in some if one.place and one.place.known]
+    some = tracks.taken(related).rows()
+    edges = [one for track in some for one in _edges(track, memory, model)]
+    known_m = model.site.street.known_m
+    placed = [one for one in some if one.place and one.place.position_std_m < known_m]
     if placed:
         edges += _between(placed, memory.stamp_ns, model.context)
     edges += _hiding(tracks, memory.stamp_ns, model)
@@ -63,9 +60,9 @@ def _held(edge: Relation, before: Relation | None) -> Relation:
     return replace(edge, since_ns=before.since_ns, until_ns=until_ns) if is_kept else edge
 
 
-def _edges(track: Track, share: float, memory: Memory, model: FilterModel) -> Iterator[Relation]:
+def _edges(track: Track, memory: Memory, model: FilterModel) -> Iterator[Relation]:
     """Yield the relations of one entity to its occluder and to the ego vehicle."""
-    occluders, stamp_ns = model.context.occluders, memory.stamp_ns
+    occluders, stamp_ns, share = model.context.occluders, memory.stamp_ns, track.behind
     if not track.seen:
         for k, weight in enumerate(side_weights(track, len(occluders))):
             if weight > 0.0:
@@ -98,10 +95,10 @@ def _comes(track: Track, side: int, memory: Memory, model: FilterModel) -> float
     """Return P(it comes into view from there within five seconds | hidden), by its place or the sound."""
     if track.place is not None:
         return float(time_to_visible(track.place, model.site.sides[side], model.site, LONGEST_S)[0])
-    if memory.sequence is None:
+    if not memory.belief.has_times:
         return 1.0
-    coming = memory.sequence.coming[side]
-    return float(coming[:STATED].sum() / max(coming.sum(), 1e-12))
+    coming = memory.belief.coming[side]
+    return float(coming[:STATED].sum() / max(coming.sum(), TINY))
 
 
 def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterator[Relation]:
@@ -113,8 +110,9 @@ def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterat
               P(\text{in front}) = P(\text{one lane})\, P(u \cdot d > 0)
     """
     ids = [*(one.id for one in tracks), EGO]
-    mean = np.array([*(one.place.mean for one in tracks if one.place), (0.0, 0.0, 0.0, 0.0)])
-    covariance = np.array([*(one.place.covariance for one in tracks if one.place), np.zeros((4, 4))])
+    places = [one.place for one in tracks if one.place]
+    mean = np.array([*(one.mean for one in places), np.zeros_like(places[0].mean)])
+    covariance = np.array([*(one.covariance for one in places), np.zeros_like(places[0].covariance)])
     speed = np.hypot(*mean[:, 2:].T)
     heading = mean[:, 2:] / np.maximum(speed, _LEAST_SPEED_MPS)[:, None]
     heading[-1] = 1.0, 0.0
@@ -128,7 +126,7 @@ def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterat
     beside = np.maximum(np.abs(across) - _HALF_LANE_M, 0.0)
     near = alike & (beside <= 2.0 * np.sqrt(across_var)) & (along > 0.0)
     # Only the next one ahead: of twenty entities there are 380 pairs.
-    farness = np.where(near, along + _BESIDE * beside, np.inf)[:-1]
+    farness = np.where(near, along, np.inf)[:-1]
     for b in np.flatnonzero(np.isfinite(farness).any(axis=0)).tolist():
         a = int(np.argmin(farness[:, b]))
         aside, std_m = float(across[a, b]), math.sqrt(across_var[a, b])
@@ -151,14 +149,14 @@ def _crosses(track: Track, ego_speed_mps: float) -> float:
     """
     assert track.place is not None
     (x, y, vx, vy), covariance = track.place.mean.tolist(), track.place.covariance
-    if y * vy >= 0.0 or abs(vy) < _LEAST_CROSSING_MPS:
+    if y * vy >= 0.0 or abs(vy) < LEAST_STD:
         return 0.0
     time_s, closing = -y / vy, vx - ego_speed_mps
     slopes: FloatArray = np.array(
         [[0.0, -1.0 / vy, 0.0, y / vy**2], [1.0, -closing / vy, time_s, closing * y / vy**2]]
     )
     (time_var, _), (_, ahead_var) = (slopes @ covariance @ slopes.T).tolist()
-    soon = normal_share((_CONFLICT_S - time_s) / math.sqrt(time_var))
+    soon = normal_share((LONGEST_S - time_s) / math.sqrt(time_var))
     # An entity that may as well stand still or turn away has a deviation of its speed as large as that.
-    comes = normal_share(abs(vy) / math.sqrt(covariance[3, 3]))
+    comes = normal_share(abs(vy) / math.sqrt(covariance[-1, -1]))
     return soon * comes * normal_share((x + closing * time_s) / math.sqrt(ahead_var))

@@ -6,22 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.evidence import MOST_NATS
 from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.window_belief import LOG_FLOOR, WindowBelief
+from worldstate.ground import TINY
 from worldstate.measurement import Measurement
 from worldstate.state import Context
 from worldstate.state.context import seen_from
 
 from .memory import Memory
-
-_NONE = 1e-12  # Of a coming group where no vehicle can come: shares of none at all are not defined
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +46,9 @@ def site_geometry_of(
             one.hides,
             0.0 if one.corner_m is None else yaw_rad,
             None if one.corner_m is None else math.dist(one.corner_m, (x, y)),
-            settings.assumed_certainty if one.assumed else 1.0,
+            settings.street.assumed_certainty if one.assumed else 1.0,
             0.0 if one.corner_m is None else abs(one.corner_m[1] - y),
+            settings.street,
         )
         for one in context.occluders
     )
@@ -71,19 +69,14 @@ def from_here(model: FilterModel, ego: EgoBelief | None) -> FilterModel:
 
 
 def without_open_sides(measurement: Measurement, context: Context) -> Measurement:
-    """Remove the evidence for hidden vehicles on sides without an occluder."""
+    """Remove the evidence of a window for hidden vehicles on sides without an occluder."""
     if all(one.hides for one in context.occluders):
         return measurement
-    is_open = np.array([not one.hides for one in context.occluders])
-    said, reading = measurement.signature, measurement.sequence
-    hidden = np.where(is_open, LOG_FLOOR, said.hidden).tolist()
-    measurement = replace(measurement, signature=replace(said, hidden=tuple(hidden)))
-    if not isinstance(reading, SequenceReading):
-        return measurement
-    groups = reading.groups.copy()
-    groups[is_open] = np.maximum(groups[is_open] * (np.arange(len(GROUPS)) >= len(COMING_S)), _NONE)
-    groups /= groups.sum(axis=1, keepdims=True)
-    return replace(measurement, sequence=replace(reading, groups=groups))
+    is_open = {one.direction for one in context.occluders if not one.hides}
+    said = measurement.signature
+    pairs = zip(said.directions, said.hidden, strict=True)
+    hidden = tuple(-MOST_NATS if side in is_open else nats for side, nats in pairs)
+    return replace(measurement, signature=replace(said, hidden=hidden))
 
 
 def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
@@ -97,11 +90,11 @@ def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
     quieter than any.
     """
     sides = memory.sides
-    if isinstance(memory.belief, WindowBelief) and memory.belief.heard:
+    if memory.belief.read_ns and not memory.belief.has_times:
         hidden = sides.hypotheses[0]
         risk = min(float(model.policy.risk_map(hidden)), hidden)
         # The floor only matters where P(hidden) has underflowed; then no direction has a share.
-        share = risk / max(hidden, 1e-300)
+        share = risk / max(hidden, TINY)
         sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
     tracks = memory.tracks
     # What drives behind the ego explains nothing of what is ahead.

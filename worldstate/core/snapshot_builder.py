@@ -2,43 +2,49 @@
 
 import math
 from functools import partial
+from statistics import NormalDist
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import MOSTLY_MISSED, Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
+from worldstate.abduction.sequence.sequence_model import TAIL
 from worldstate.belief.hidden_bearing import hidden_bearing, time_to_visible
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.kinematics.motion import (
     AZIMUTH,
     AZIMUTH_RATE,
     FARTHEST_M,
-    LEAST_Q,
+    LEAST_STD,
     LOG_RANGE,
     NEAREST_M,
     RADIAL_RATE,
     MotionBelief,
+    white_acceleration,
 )
 from worldstate.belief.side_belief import SideBelief
-from worldstate.belief.site_geometry import HIDDEN_BIAS_STD, SiteGeometry
-from worldstate.belief.track import Track, Tracks, acceleration_psd, hidden_shares
+from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.track import Track, Tracks, acceleration_psd
 from worldstate.ground import seconds
 from worldstate.state import Classification, Context, Entity, Hearing, SearchedView, SensorHealth, Visibility
 from worldstate.state.entity import AzimuthSource, SideShare
 from worldstate.state.sensor import Ego
 
+from .birth_death import HIDDEN
 from .memory import NEWS_HOLDS_NS, CountedLook, Memory
-from .sequence_memory import SequenceMemory
+from .street_belief import StreetBelief
 
+# Of what is published: numbers in full precision take twice as long to write.
+_DIGITS, _SHORT = 9, 6
 # Beyond two seconds vehicles at junctions have turned or braked.
 _AFTER_S = np.array([1.0, 2.0])
-_CUBES = _AFTER_S**3 / 3.0
+_CUBES = np.array([white_acceleration(after_s)[0, 0] for after_s in _AFTER_S])
 _SOONER, _LATER = (f"{after_s:g}" for after_s in _AFTER_S)
 Forecast: TypeAlias = dict[str, tuple[float, float]]
 
 
-def forecasts(tracks: Tracks) -> list[Forecast]:
+def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
     r"""Return where entities will be, one forecast a track: constant velocity, all of them at once.
 
     With the state :math:`(\theta, \dot\theta, \rho, \log r)` and its covariance P, after t seconds
@@ -51,16 +57,19 @@ def forecasts(tracks: Tracks) -> list[Forecast]:
     """
     theta, omega, rho, log_range = tracks.mean.T[:, :, None]
     a, b = 1.0 + rho * _AFTER_S, omega * _AFTER_S
-    q = np.maximum(a * a + b * b, LEAST_Q)
+    # At the array itself, q = 0, the coordinates are singular; this is 1 % of the first range.
+    q = np.maximum(a * a + b * b, LEAST_STD)
     gradient = np.stack([np.ones_like(a), a * _AFTER_S / q, -b * _AFTER_S / q], axis=-1)
     known = (gradient @ tracks.covariance[:, :LOG_RANGE, :LOG_RANGE] * gradient).sum(axis=-1)
-    density = acceleration_psd(tracks.moving)
+    density = acceleration_psd(tracks.moving, site)
     range_m = np.exp(np.minimum(np.maximum(log_range, math.log(NEAREST_M)), math.log(FARTHEST_M)))
     variance = known + density[:, None] * _CUBES / (range_m**2 * q)
     azimuth_rad = theta + np.arctan2(b, a)
     azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
     # Full precision would take twice as long to write.
-    rows = np.stack([np.clip(azimuth_rad.round(6), -np.pi, np.pi), np.sqrt(variance).round(6)], axis=-1)
+    rows = np.stack(
+        [np.clip(azimuth_rad.round(_SHORT), -np.pi, np.pi), np.sqrt(variance).round(_SHORT)], axis=-1
+    )
     return [
         {_SOONER: (mean, std), _LATER: (then, then_std)} for (mean, std), (then, then_std) in rows.tolist()
     ]
@@ -68,12 +77,8 @@ def forecasts(tracks: Tracks) -> list[Forecast]:
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
 _KNOWN_LOG_RANGE_STD = 0.25
-_KNOWN_VELOCITY_STD_MPS = 5.0  # A change of pace
-NINE_OF_TEN = 1.645  # Standard deviations to either side
-_ROUNDING = 1e-9
+NINE_OF_TEN = NormalDist().inv_cdf(1.0 - TAIL)  # Standard deviations to either side
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
-# Of what is published: numbers in full precision take twice as long to write.
-_DIGITS = 9
 
 
 # Mean and deviations of a track's motion, covariance of azimuth and rate, forecast, as Python numbers.
@@ -85,18 +90,18 @@ def entities_of(tracks: Tracks, memory: Memory, site: SiteGeometry) -> tuple[Ent
     # All at once: a number taken out of an array by itself costs as much as a row.
     stds = np.sqrt(tracks.covariance.diagonal(axis1=1, axis2=2))
     lists = (array.round(_DIGITS).tolist() for array in (tracks.mean, stds, tracks.covariance[:, *_UPPER]))
-    shares = hidden_shares(tracks, memory.sides).tolist()
-    moments = zip(*lists, forecasts(tracks), strict=True)
+    moments = zip(*lists, forecasts(tracks, site), strict=True)
     build = partial(_entity, memory, memory.sides, site)
-    return tuple(map(build, tracks.rows(), shares, moments))
+    return tuple(map(build, tracks.rows(), moments))
 
 
-def _entity(
-    memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track, share: float, moments: _Moments
-) -> Entity:
+def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track, moments: _Moments) -> Entity:
     mean, std, (variance, mixed, rate_variance), forecast = moments
-    existence = existence_of(track, sides)
-    hidden = share >= 0.5
+    existence, share = track.existence, track.behind
+    hidden = share >= HIDDEN
+    if hidden and track.place is not None and not track.seen:
+        # Not combined: what is believed of the side may rest on the same messages.
+        existence = max(existence, sides.hidden[track.side])
     heard_only = hidden and not track.detected
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
     closing_hz = -mean[RADIAL_RATE] if track.approach_heard else None
@@ -104,7 +109,7 @@ def _entity(
     azimuth_rad, std_rad = min(max(mean[AZIMUTH], -math.pi), math.pi), std[AZIMUTH]
     source = _azimuth_source(track, track.motion, site)
     if heard_only:
-        azimuth_rad, std_rad, source = hidden_azimuth(track.side, track, memory.sequence, site)
+        azimuth_rad, std_rad, source = hidden_azimuth(track.side, track, memory.belief, site)
     return Entity(
         id=track.id,
         status="hidden" if hidden else "visible" if track.seen else "emerged",
@@ -137,8 +142,8 @@ def _entity(
 def _classes(track: Track) -> tuple[Classification, ...]:
     """Return the class probabilities of a track; what no label has is unknown, so that they sum to one."""
     classes = [Classification(label, share) for label, share in track.labels if label != UNKNOWN]
-    rest = 1.0 - sum([one.probability for one in classes])
-    return (*classes, Classification(UNKNOWN, round(rest, _DIGITS))) if rest > _ROUNDING else tuple(classes)
+    rest = round(1.0 - sum([one.probability for one in classes]), _DIGITS)
+    return (*classes, Classification(UNKNOWN, rest)) if rest > 0.0 else tuple(classes)
 
 
 def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
@@ -148,17 +153,9 @@ def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
         return -math.pi, math.pi
     # wrap_angle goes through arrays, which takes ten times as long for one number.
     right_rad, left_rad = azimuth_rad - half_rad, azimuth_rad + half_rad
-    return round(math.remainder(right_rad, math.tau), 6), round(math.remainder(left_rad, math.tau), 6)
-
-
-def existence_of(track: Track, sides: SideBelief) -> float:
-    """Return the existence of a track, from the belief of its side until it is seen."""
-    if track.seen or track.behind < 0.5:
-        return track.existence
-    if track.place is None:
-        return sides.existence(track.of_side)
-    # Not combined: what is believed of the side may rest on the same messages.
-    return max(track.existence, sides.hidden[track.side])
+    return round(math.remainder(right_rad, math.tau), _SHORT), round(
+        math.remainder(left_rad, math.tau), _SHORT
+    )
 
 
 def time_to_arrival(closing_hz: float | None, std_hz: float) -> float | None:
@@ -167,7 +164,7 @@ def time_to_arrival(closing_hz: float | None, std_hz: float) -> float | None:
 
 
 def hidden_azimuth(
-    side: int, track: Track | None, kept: SequenceMemory | None, site: SiteGeometry
+    side: int, track: Track | None, belief: StreetBelief, site: SiteGeometry
 ) -> tuple[float, float, AzimuthSource]:
     """Return where a hidden vehicle is, how far that may be off, and what it rests on.
 
@@ -175,14 +172,13 @@ def hidden_azimuth(
     """
     if track is not None and track.place is not None:
         return track.motion.azimuth_rad, track.motion.azimuth_std_rad, "measured"
-    if kept is not None:
-        coming = kept.coming if track is None else kept.own_coming
-        return *hidden_bearing(coming[side], site.sides[side]), "context"
+    if belief.has_times:
+        return *hidden_bearing(belief.coming[side], site.sides[side]), "context"
     heard = track if track is not None and track.side == side else None
     motion = site.sides[side].prior() if heard is None else heard.motion
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
     # that.
-    std_rad = math.hypot(motion.azimuth_std_rad, HIDDEN_BIAS_STD)
+    std_rad = math.hypot(motion.azimuth_std_rad, site.sides[side].bias_std_rad)
     return motion.azimuth_rad, std_rad, _azimuth_source(heard, motion, site)
 
 
@@ -196,22 +192,22 @@ def _azimuth_source(track: Track | None, motion: MotionBelief, site: SiteGeometr
 
 def _side_shares(track: Track, memory: Memory, site: SiteGeometry) -> tuple[SideShare, ...]:
     """Return the parts of the azimuth density of an entity that may be on several sides."""
-    if track.of_side is not None:
+    if track.detected:
         return ()
     shares = {k: share for k, share in enumerate(track.side_shares) if share > 0.0}
     if len(shares) < 2:
         return ()
-    at = {k: hidden_azimuth(k, track, memory.sequence, site)[:2] for k in shares}
+    at = {k: hidden_azimuth(k, track, memory.belief, site)[:2] for k in shares}
     return tuple(SideShare(site.sides[k].label, round(share, _DIGITS), *at[k]) for k, share in shares.items())
 
 
 def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
     """Return position, velocity and covariance where known, and when a hidden one comes into view."""
     place = track.place
-    if place is None or not place.known:
+    if place is None or place.position_std_m >= site.street.known_m:
         return {}
     x, y, vx, vy = place.mean.tolist()
-    moves = place.velocity_std_mps < _KNOWN_VELOCITY_STD_MPS
+    moves = place.velocity_std_mps < site.street.known_m  # A change of pace
     return {
         "position_m": (x, y, 0.0),
         "velocity_mps": (vx, vy, 0.0) if moves else None,
@@ -229,7 +225,7 @@ def ego_of(ego: EgoBelief) -> Ego:
 
 def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
     """Return how every sensor is that spoke or looked."""
-    spoke = {name: (rule.stamp_ns, rule.fault) for name, rule in memory.rules.items()}
+    spoke = {name: (one.stamp_ns, one.fault) for name, one in memory.sources.items()}
     looked = {name: (look.stamp_ns, _look_fault(look)) for name, look in memory.looks.items()}
     told = sorted((looked | spoke).items())
     return tuple(_health(name, ns, fault, memory.stamp_ns) for name, (ns, fault) in told)
@@ -237,8 +233,7 @@ def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
 
 def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
     """Return how well every source that listens could hear; of one that is silent nothing is known."""
-    every = sorted(memory.rules.items())
-    listening = [(name, one) for name, one in every if not one.announced and one.heard.measured]
+    listening = [(name, one) for name, one in sorted(memory.sources.items()) if one.heard.measured]
     told = tuple(
         Hearing(name, one.heard.share, one.heard_ns, one.heard.reason)
         for name, one in listening

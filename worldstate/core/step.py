@@ -4,19 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from worldstate.belief.association import HANDOVER_RESIDUAL
-from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.kinematics.cartesian import corrected, driven
-from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import Tracks, hidden_shares, predict_tracks, turn
+from worldstate.belief.track import Tracks, predict_tracks, turn
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
 from worldstate.state import Event
 
 from .acoustic_update import acoustic_update
 from .birth_death import (
-    HIDDEN,
     birth_death,
     hidden_on,
     hidden_rows,
@@ -24,15 +19,16 @@ from .birth_death import (
     past_edges,
     published,
     surviving,
+    view_heard,
 )
-from .cues import SideAdvisory, advisories, update_advisories
+from .cues import SideAdvisory, advisories, note_announced, note_source
 from .detection_update import new_looks, update_looks, update_positions
 from .fixed_lag import Timed
 from .memory import CountedLook, Memory
 from .relations import relations_at
-from .sequence_memory import SequenceMemory, carried
-from .side_update import update_sequence, update_windows
+from .side_update import update_belief
 from .site_model import FilterModel, from_here, without_open_sides
+from .street_belief import carried
 
 # All that two cameras and a radio find at a crowded crossing; a step costs with their square.
 MOST_TRACKS = 128
@@ -44,14 +40,12 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     # First: what has come into view by then depends on where the edges are by then.
     memory.ego = memory.ego and driven(memory.ego, seconds(step_ns))
     model = from_here(model, memory.ego)
-    predict_tracks(memory.tracks, memory.sides, seconds(step_ns), model.site)
-    memory.tracks = surviving(memory.tracks, model.site.settings)
+    predict_tracks(memory.tracks, seconds(step_ns), model.site)
+    memory.tracks = surviving(memory.tracks, model.site.street)
     memory.stamp_ns = stamp_ns
     memory.forget()
-    if isinstance(memory.belief, SequenceMemory):
-        memory.belief = carried(memory.belief, stamp_ns, step_ns, model.context)
-    else:
-        memory.belief = memory.belief.predict(model.context.rates.values_hz, step_ns)
+    memory.belief = carried(memory.belief, stamp_ns, step_ns, model.context, model.site.street)
+    view_heard(memory, model.site)
     if (before.tracks.placed & ~before.tracks.seen).any():
         _pass_places(before.tracks, memory, model)
     return memory
@@ -62,7 +56,7 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
     tracks, emerged, gone = memory.tracks, list[int](), list[int]()
     now = {name: row for row, name in enumerate(tracks.id)}
     # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
-    heard = [chance >= model.site.settings.birth_probability for chance in memory.sides.hidden]
+    heard = [chance >= model.site.street.birth for chance in memory.sides.hidden]
     for old in np.flatnonzero(before.placed & ~before.seen).tolist():
         row, side = now[before.id[old]], int(before.side[old])
         if before.behind[old] >= 0.5 > tracks.behind[row]:
@@ -72,7 +66,9 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
         if row in others and (len(others) > 1 or not heard[side]):
             gone.append(row)
     memory.tracks = tracks.without(gone)
-    past_edges(memory, dict.fromkeys(emerged, HANDOVER_RESIDUAL), (), memory.stamp_ns)
+    past_edges(
+        memory, dict.fromkeys(emerged, model.site.street.unheard), (), memory.stamp_ns, model.site.street
+    )
 
 
 def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
@@ -92,35 +88,33 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
         measurement = without_open_sides(measurement, model.context)
         _perceive(memory, measurement, start_ns, model)
     gone = _announced_in_view(before, memory)
-    if gone and isinstance(memory.belief, SequenceMemory):
-        memory.belief = memory.belief.not_held(gone)
+    if gone:
+        memory.belief = memory.belief.not_held(gone, model.policy, model.site.street)
+    note_announced(memory, model)
     named = advisories(memory, model)
     if isinstance(measurement, Measurement):
         birth_death(memory, [one is not None for one in named], measurement, model.site)
-        _place_hidden(memory, model.site)
     _keep_likeliest(memory)
     _note_advisories(memory, [None if k in gone else one for k, one in enumerate(held)], named)
     merged = merge_tracks(memory, model.site).items()
     memory.last.events = tuple(Event(memory.stamp_ns, "merged", name, into) for name, into in merged)
-    memory.relations = relations_at(memory, published(memory.tracks, model.site.settings), model)
+    memory.relations = relations_at(memory, published(memory.tracks, model.site.street), model)
 
 
 def _perceive(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
     """Update a draft with a measurement's signature, its looks and its sequence."""
-    spoke = memory.rules.get(measurement.source)
-    since_ns = measurement.stamp_ns - (start_ns if spoke is None else spoke.stamp_ns)
+    last = memory.sources.get(measurement.source)
+    since_ns = measurement.stamp_ns - (start_ns if last is None else last.stamp_ns)
     measurement, looks = new_looks(memory, measurement, start_ns, model.site.settings)
-    # Evidence first: association and births need the explanations of this very window.
-    update_windows(memory, measurement, model)
     # Of windows that overlap, what is new counts.
     weight = min(max(seconds(since_ns), 0.0) / model.site.settings.window_s, 1.0)
-    acoustic_update(memory, measurement, weight)
+    acoustic_update(memory, measurement, weight, model.site.street)
     update_looks(memory, measurement, looks, model)
-    update_advisories(memory, measurement, model)
-    update_sequence(memory, measurement, [seen for seen, _ in looks], model)
+    note_source(memory, measurement, model)
+    update_belief(memory, measurement, [seen for seen, _ in looks], model)
     bearing = measurement.bearing
     memory.last.bearing = None if isinstance(bearing, NotUsable) else bearing
-    memory.last.domain = measurement.domain
+    memory.last.domain, memory.last.named = measurement.domain, measurement.signature.directions
 
 
 def _take_odometry(memory: Memory, told: Odometry) -> None:
@@ -130,17 +124,6 @@ def _take_odometry(memory: Memory, told: Odometry) -> None:
     if faster:
         turn(memory.tracks, faster)
     memory.looks[told.source] = CountedLook(told.stamp_ns, told.source)
-
-
-def _place_hidden(memory: Memory, site: SiteGeometry) -> None:
-    """Put the entities that are only heard and hidden where the sequence has them."""
-    if memory.sequence is None:
-        return
-    tracks, coming = memory.tracks, memory.sequence.own_coming
-    shares = hidden_shares(tracks, memory.sides)
-    for i in np.flatnonzero(~tracks.detected & (shares >= HIDDEN)).tolist():
-        side, before = tracks.side[i], MotionBelief(tracks.mean[i], tracks.covariance[i])
-        tracks.put(i, hidden_motion(coming[side], float(shares[i]), site.sides[side], before))
 
 
 def _keep_likeliest(memory: Memory) -> None:

@@ -10,8 +10,10 @@ from .errors import WorldstateError as WorldstateError
 from .typing import BoolArray as BoolArray
 from .typing import FloatArray as FloatArray
 from .typing import IntArray as IntArray
+from .values import CERTAIN_NATS as CERTAIN_NATS
 from .values import LEAST_HEARD as LEAST_HEARD
 from .values import NANOSECONDS_PER_SECOND as NANOSECONDS_PER_SECOND
+from .values import TINY as TINY
 from .values import NotUsable as NotUsable
 from .values import falling as falling
 from .values import integer_ns as integer_ns

@@ -178,7 +178,7 @@ def check_fields(instance: object, **expected: Any) -> None:
             raise InvalidArgumentError(f"{name}: expected {_called(wanted)}, got {_shown(value)}")
 
 
-def all_of(name: str, values: object, kind: type[T], most: int) -> tuple[T, ...]:
+def all_of(name: str, values: object, kind: type[T], most: int = 64) -> tuple[T, ...]:
     """Return the values as a tuple if they are at most so many, and all of one kind.
 
     Examples

@@ -86,7 +86,7 @@ class SchemaVersionError(InputFileError):
     Examples
     --------
     >>> from worldstate import WorldState
-    >>> stranger = WorldState(0, 0).to_json().replace('"version":"3.', '"version":"9.')
+    >>> stranger = WorldState(0, 0).to_json().replace('"version":"4.', '"version":"9.')
     >>> try:
     ...     WorldState.from_json(stranger)
     ... except SchemaVersionError as error:

@@ -20,6 +20,11 @@ Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 # Share of a hop that could be heard below which nothing of it is read.
 LEAST_HEARD = 0.2
 
+# Keeps logarithms and quotients finite: of a probability, or of a share, that is none.
+TINY = 1e-12
+# Log-odds of certainty: e^-20 is once in fifteen years of hops.
+CERTAIN_NATS = 20.0
+
 _TURN = 2.0 * math.pi
 NANOSECONDS_PER_SECOND = 1_000_000_000
 SECONDS_PER_HOUR = 3600.0

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from worldstate.belief.kinematics.motion import AZIMUTH, LEAST_Q, MotionBelief
+from worldstate.belief.kinematics.motion import AZIMUTH, LEAST_STD, MotionBelief
 from worldstate.ground import FloatArray, IntArray, in_range, seconds, wrap_angle
 from worldstate.measurement import Approach, Bearing, Position
 
@@ -43,7 +43,7 @@ def moved(state: FloatArray, step_s: float) -> FloatArray:
     theta, turning, closing, log_m = state.tolist()
     # The filter's `propagate` takes the same steps for arrays, and forty times as long for one entity.
     a, b = 1.0 + closing * step_s, turning * step_s
-    q = max(a * a + b * b, LEAST_Q)
+    q = max(a * a + b * b, LEAST_STD)
     radial = (a * closing + b * turning) / q
     return np.array([theta + math.atan2(b, a), turning / q, radial, log_m + 0.5 * math.log(q)])
 

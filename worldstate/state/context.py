@@ -1,15 +1,18 @@
 """Context: rates, occluders, priors and the field of view, given before any measurement."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from operator import attrgetter
 from typing import ClassVar
+
+import numpy as np
 
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.checks import all_of, check_fields, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
-_LEAST_STD_RAD, _FASTEST_HZ = 1e-4, 100.0
+_LEAST_STD_RAD, _FASTEST = 1e-4, 100.0  # The second in Hz or m/s
+
 _AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (math.ulp(0.0), math.pi)
 _OCCLUDER = {
     "id": str,
@@ -18,20 +21,21 @@ _OCCLUDER = {
     "hidden_azimuth_rad": _AZIMUTHS_RAD,
     "hidden_std_rad": _STDS_RAD,
     "edge_std_rad": _STDS_RAD,
-    "pace_hz": (math.ulp(0.0), _FASTEST_HZ),
+    "pace_hz": (math.ulp(0.0), _FASTEST),
     "assumed": bool,
     "hides": bool,
 }
-_FARTHEST_M, _MOST_SIDES = 1e6, 64
+_FARTHEST_M = 1e6
 _PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: a vehicle that comes past it is in view
 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Transition rates of the Markov chain of explanations, 1/s.
+    """Transition rates of the explanations, 1/s: what a street is like in which nothing was measured.
 
-    The defaults are those of a side street with a few vehicles a minute: a hidden vehicle is heard for some
-    three seconds before it comes into view, and stays in view for about as long.
+    Their equilibrium is the prior of a context that gives none. The defaults are those of a side street with
+    a few vehicles a minute: a hidden vehicle is heard for some three seconds before it comes into view, and
+    stays in view for about as long.
 
     Parameters
     ----------
@@ -62,21 +66,35 @@ class Rates:
     arrival_hz: float = 0.05  # Three vehicles a minute from each side
     emergence_hz: float = 0.3  # Heard for some 3 s before it comes into view
     departure_hz: float = 0.1  # One in four hidden vehicles never comes into view
-    reocclusion_hz: float = 0.05  # One in seven vehicles in view goes behind a corner again
-    visible_arrival_hz: float = 0.05  # Along the ego vehicle's own street, as from a side
-    visible_departure_hz: float = 0.3  # In view for 3 s
+    reocclusion_hz: float = arrival_hz  # One in seven vehicles in view goes behind a corner again
+    visible_arrival_hz: float = arrival_hz  # Along the ego vehicle's own street, as from a side
+    visible_departure_hz: float = emergence_hz  # In view for 3 s
 
     def __post_init__(self) -> None:
-        check_fields(self, **{one.name: (0.0, 1e3) for one in fields(self)})
+        check_fields(self, **{one.name: (0.0, _FASTEST) for one in fields(self)})
 
-    @property
-    def values_hz(self) -> tuple[float, ...]:
-        """All six in the order of the fields."""
-        return _RATES_HZ(self)
+    def priors(self, sides: int) -> "Priors":
+        r"""Return the equilibrium of a street with so many sides: the three probabilities p with p Q = 0.
 
-
-# Read at every step.
-_RATES_HZ = attrgetter(*(one.name for one in fields(Rates)))
+        Examples
+        --------
+        >>> usual = Rates().priors(2)
+        >>> round(usual.hidden, 3), round(usual.visible, 3), round(usual.none, 3)
+        (0.176, 0.235, 0.588)
+        """
+        arrival_hz = sides * self.arrival_hz
+        # Each state's weight is the sum over the ways that lead into it from both others.
+        leaves_hidden, leaves_visible = (
+            self.emergence_hz + self.departure_hz,
+            self.reocclusion_hz + self.visible_departure_hz,
+        )
+        hidden = arrival_hz * leaves_visible + self.visible_arrival_hz * self.reocclusion_hz
+        visible = arrival_hz * self.emergence_hz + self.visible_arrival_hz * leaves_hidden
+        none = leaves_hidden * leaves_visible - self.emergence_hz * self.reocclusion_hz
+        total = hidden + visible + none
+        if total <= 0.0:  # Nothing ever changes, and nothing is known
+            return Priors(0.0, 0.0, 1.0)
+        return Priors(hidden / total, visible / total, none / total)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +123,7 @@ class Priors:
 
     def __post_init__(self) -> None:
         values = (self.hidden, self.visible, self.none)
-        if min(values) < 0 or not math.isclose(sum(values), 1.0, abs_tol=1e-6):
+        if min(values) < 0 or not np.isclose(sum(values), 1.0):
             raise InvalidArgumentError(f"priors: expected three probabilities that sum to one, got {values}")
 
 
@@ -244,8 +262,8 @@ def corner_at(
         raise InvalidArgumentError(
             f"corner_m: expected it ahead, beside the x axis, nearer than {crossing_m} m, got {corner_m}"
         )
-    in_range("speed_mps", speed_mps, 0.0, 100.0, open_low=True)
-    in_range("corner_std_m", corner_std_m, 0.0, 100.0, open_low=True)
+    in_range("speed_mps", speed_mps, 0.0, _FASTEST, open_low=True)
+    in_range("corner_std_m", corner_std_m, 0.0, _FARTHEST_M, open_low=True)
     pace_hz = speed_mps / crossing_m
     hidden_rad, hidden_std = hidden_behind(x_m, y_m, pace_hz)
     return Occluder(
@@ -308,7 +326,7 @@ def seen_from(
         hidden_azimuth_rad=math.remainder(hidden_rad - yaw, math.tau),
         hidden_std_rad=hidden_std,
         edge_std_rad=min(math.hypot(std_m / now_m, yaw_std_rad), math.pi),
-        pace_hz=min(pace_hz, _FASTEST_HZ),
+        pace_hz=min(pace_hz, _FASTEST),
     )
 
 
@@ -331,9 +349,13 @@ class Context:
     occluders : tuple of Occluder
         One per approach side, in the order of the signature model's directions.
     priors : Priors or None
-        Explanation priors: at the start in a context that is given (None for the equilibrium of the rates),
-        predicted to the time stamp in a snapshot. A sequence model is moved to the given ones all along, by
-        -.5 to +2 nats; without them it keeps the share of hazards that it was trained at.
+        Explanation priors: in a context that is given what is usual here (None for the equilibrium of the
+        rates), predicted to the time stamp in a snapshot. A sequence model is moved to the given ones all
+        along, by -0.5 to +2 nats; without them it keeps the share of hazards that it was trained at.
+    hidden_by_side : mapping of str to float, or None
+        P(a vehicle comes into view from a side within eight seconds) by its direction, as an outer model
+        gives it, in place of what `priors` has of that side. It may differ from step to step: the belief
+        moves by the ratio of the odds, with and without a sequence model.
     ego_speed_mps, degradation : float or None
         Ego speed, by which it drives straight on unless odometry says otherwise, and degradation level d of
         the co-evidence channel in [0, 1].
@@ -363,15 +385,20 @@ class Context:
     degradation: Probability | None = None
     site: str | None = None
     view_half_angle_rad: float = 0.6  # Of OVAD's camera
+    hidden_by_side: Mapping[str, Probability] | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "occluders", all_of("occluders", self.occluders, Occluder, _MOST_SIDES))
+        object.__setattr__(self, "occluders", all_of("occluders", self.occluders, Occluder))
         for names in (self.directions, tuple(occluder.id for occluder in self.occluders)):
             if not names or len(set(names)) != len(names):
                 raise InvalidArgumentError(f"occluders: expected different ids and directions, got {names}")
-        check_fields(self, rates=Rates, priors=Priors | None, site=str | None)
+        check_fields(self, rates=Rates, priors=Priors | None, site=str | None, hidden_by_side=Mapping | None)
         check_fields(self, view_half_angle_rad=(0.0, math.pi))
-        for name, span in (("ego_speed_mps", (-100.0, 100.0)), ("degradation", (0.0, 1.0))):
+        for side, chance in (self.hidden_by_side or {}).items():
+            in_range(f"hidden_by_side[{side!r:.40}]", chance, 0.0, 1.0)
+            if side not in self.directions:
+                raise InvalidArgumentError(f"hidden_by_side: expected {self.directions}, got {side!r:.40}")
+        for name, span in (("ego_speed_mps", (-_FASTEST, _FASTEST)), ("degradation", (0.0, 1.0))):
             if getattr(self, name) is not None:
                 check_fields(self, **{name: span})
 

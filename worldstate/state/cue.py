@@ -1,10 +1,12 @@
 """Predictive cues: the calibrated, direction-resolved risk of a hidden road user."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal, TypeAlias
 
-from worldstate.ground.serialisation import Count, Layout, Probability
+from worldstate.abduction.sequence.sequence_model import AlarmPromise
+from worldstate.ground import InvalidArgumentError
+from worldstate.ground.serialisation import ADDED, Count, Layout, Probability
 
 from .context import Priors
 from .entity import AzimuthSource
@@ -66,17 +68,16 @@ class EvidenceTerms:
     Parameters
     ----------
     hypothesis : {"coming", "hidden", "announced"}
-        A vehicle comes into view from this side within three seconds, by the alarm of a sequence model;
-        a vehicle is hidden on any side, by the sustained rule; or by the rule of messages alone.
+        A vehicle comes into view from this side within three seconds, by a sequence model; one is hidden on
+        any side, without such a model; or messages alone announce one.
     terms_nats : mapping of str to float
         By what was said: the prior, the sequence or the window, each sensor's look, what has just come into
         view, messages; each given those before it, so that they add up.
     compared_nats : float
-        What decides: for a sequence the mean of the log-odds over .3 s, of the less likely side no more than
-        that two come; for the rule the least log-odds of the hops that it asks for.
+        What decides: the mean of the log-odds over .3 s, of the less likely side no more than that two come.
     threshold_nats : float
         An advisory stands exactly where `compared_nats` is not below it, or where the cue says that it is
-        held. Of a sequence it is 1.2 higher for five seconds after a vehicle has come into view.
+        held. It is 1.2 higher for five seconds after a vehicle has come into view.
 
     Examples
     --------
@@ -104,12 +105,10 @@ class Tally:
         Vehicles that came into view.
     warned : int
         Those of them for whose side the alarm stood in the eight seconds before.
-    lost : int
-        Always 0 since no threshold is raised.
 
     Examples
     --------
-    >>> Tally().lost
+    >>> Tally().arrivals
     0
     """
 
@@ -117,10 +116,13 @@ class Tally:
     false_onsets: Count = 0
     arrivals: Count = 0
     warned: Count = 0
-    lost: Count = 0
 
 
 Verdict: TypeAlias = Literal["kept", "in doubt", "broken", "unwatched"]
+# Why a cue may not be acted on, in the order in which a cue gives its reasons.
+WhyNot: TypeAlias = Literal[
+    "uncalibrated", "unheard", "unknown sound", "too little sound", "budget broken", "expired", "masked"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,15 +139,19 @@ class Budget:
         Log e-values against "no more onsets an hour than the budget" (``"onsets"``), and against "what comes
         within two seconds is as frequent as stated" (``"within"``). Above zero they speak against it.
     onsets_per_hour : float
-        The budget, of time in which no vehicle comes into view.
-    threshold_shift_nats : float
-        Always 0: the watch moves no threshold.
+        The budget, of time in which no vehicle comes into view: what was asked, or what the curve of the
+        model promises at a share that was asked.
     tally : Tally
         What was counted since the filter began.
+    asked_alpha : float or None
+        Share of hazard-free time in alarm that was asked in place of onsets.
+    promise : AlarmPromise or None
+        Onsets an hour and share of time in alarm of the hazard-free streams on which the curve was measured,
+        at this threshold, and the intervals for other junctions; None of a model file without a curve.
 
     Examples
     --------
-    >>> Budget("kept", None, {"onsets": -2.0, "within": -0.5}, 25.0, 0.0, Tally()).verdict
+    >>> Budget("kept", None, {"onsets": -2.0, "within": -0.5}, 25.0, Tally()).verdict
     'kept'
     """
 
@@ -153,8 +159,9 @@ class Budget:
     why: str | None
     evidence_nats: Mapping[str, float]
     onsets_per_hour: float
-    threshold_shift_nats: float
     tally: Tally
+    asked_alpha: Probability | None = field(default=None, metadata=ADDED)
+    promise: AlarmPromise | None = field(default=None, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,31 +177,32 @@ class RiskCue:
 
     Parameters
     ----------
-    direction : str
-        Approach side.
+    direction : str or None
+        Approach side; None if the sound gives no side, as with an array without a model. What rests on a
+        side or on a model (risk, confidence, statistic, hypotheses) is None then, too.
     azimuth_rad, azimuth_std_rad : float
         Where to look, coarsely; left positive.
     azimuth_source : {"measured", "context"} or None
         What the azimuth rests on, as that of an `Entity`.
-    risk : float
-        r_k in [0, 1].
-    confidence : float
+    risk : float or None
+        r_k in [0, 1]; None if no model states it.
+    confidence : float or None
         P(k | hid): how sure the direction is, given a hidden road user.
-    statistic : float
-        s of the last window, all directions together, in [0, 1]; what the threshold is compared with.
+    statistic : float or None
+        s of the last window, all directions together, in [0, 1]; None before the first one.
     log_lambda : float or None
-        log Lambda of the last window, nats; None where it is infinite.
-    hypotheses : Priors
+        log Lambda of the last window, nats; None before the first one, and if it is infinite.
+    hypotheses : Priors or None
         Probabilities of the explanations. *hidden*: at least one vehicle that is not in line of sight and
         comes into view within eight seconds or is audible now, whether or not another is in view; *visible*:
         one in view and none hidden; *none*: neither.
     advisory : Advisory or None
-        Given where the sustained rule is in alarm and names this direction; with the alarm of a sequence
-        model, where it is raised for it. It ends with the hand-over of the vehicle that it announced, and
+        Given while the alarm of this side is raised or held. It ends with the hand-over of its vehicle, and
         none stands beside a risk below .1.
     alpha : float or None
-        False-positive budget that the rule was calibrated for; None for an uncalibrated policy, and where the
-        alarm of a sequence model stands in for the rule, which has a budget of onsets an hour.
+        Share of hazard-free time in alarm: of the budget that the rule was calibrated for, or of a sequence's
+        alarm what the curve of its model promises. None of an uncalibrated policy, of messages, and without a
+        curve.
     entity_id : str or None
         The hidden entity that it speaks of, if one was born; of one vehicle whose side is not known the cues
         of all its sides speak.
@@ -209,31 +217,45 @@ class RiskCue:
     sector_rad : (float, float) or None
         Where it is in nine of ten cases: from this azimuth to the left until that one.
     evidence : EvidenceTerms or None
-        What an advisory is raised by, piece by piece.
+        What an advisory is raised by, piece by piece; None of a side that no source distinguishes.
     held : Held or None
         Given where the advisory stands below its threshold, with what for and until when.
     not_advised : str or None
-        Where the risk is above .7 and no advisory is out, why.
+        If the risk is above 0.7 and no advisory is out, why; or that no source distinguishes this side.
+    usable : bool
+        Whether the cue, its advisory included, may be acted on: exactly if `why_not` is empty.
+    why_not : tuple of str
+        Every reason for which it may not, from a closed list: *uncalibrated*, no budget of false alarms was
+        measured for what decides; *unheard*, no source that listens can hear; *unknown sound*, the model was
+        not made for the sound of this hop; *too little sound*, less than a second so far; *budget broken*, a
+        camera finds more false alarms, or other chances, than stated; *expired*, nothing was measured for a
+        second; *masked*, a vehicle in view, or one that has just left the view, covers the sound.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If `usable` contradicts `why_not`.
 
     Examples
     --------
-    >>> RiskCue("left", 0.9, 0.3, 0.8, 0.95, 0.97, 3.1, Priors(0.9, 0.05, 0.05)).advisory is None
-    True
+    >>> cue = RiskCue("left", 0.9, 0.3, 0.8, 0.95, 0.97, 3.1, Priors(0.9, 0.05, 0.05))
+    >>> cue.advisory, cue.usable, cue.why_not
+    (None, False, ('uncalibrated',))
     """
 
     LAYOUT: ClassVar = Layout(
-        order="entity_id direction azimuth_rad azimuth_std_rad azimuth_source sector_rad risk confidence "
-        "statistic log_lambda hypotheses horizon_s"
+        order="entity_id direction usable why_not azimuth_rad azimuth_std_rad azimuth_source sector_rad risk "
+        "confidence statistic log_lambda hypotheses horizon_s"
     )
 
-    direction: str
+    direction: str | None
     azimuth_rad: float
     azimuth_std_rad: float
-    risk: Probability
-    confidence: Probability
-    statistic: Probability
+    risk: Probability | None
+    confidence: Probability | None
+    statistic: Probability | None
     log_lambda: float | None
-    hypotheses: Priors
+    hypotheses: Priors | None
     advisory: Advisory | None = None
     # None, not 0: a threshold without calibration has no budget, while 0 would promise no false alarms.
     alpha: Probability | None = None
@@ -246,3 +268,10 @@ class RiskCue:
     held: Held | None = None
     not_advised: str | None = None
     azimuth_source: AzimuthSource | None = None
+    # Nothing vouches for a cue until `judged` has looked at the snapshot that it stands in.
+    usable: bool = False
+    why_not: tuple[WhyNot, ...] = ("uncalibrated",)
+
+    def __post_init__(self) -> None:
+        if self.usable is bool(self.why_not):
+            raise InvalidArgumentError(f"usable: expected {not self.usable} with why_not {self.why_not}")

@@ -88,24 +88,26 @@ class Entity:
     ----------
     id : str
         UUID, stable for the life of the entity, through occlusion and back into view.
-    status : {"hidden", "emerged", "visible"}
-        Behind an occluder; in line of sight by its sound but not seen; handed over to vision.
+    status : {"hidden", "emerged", "visible"} or None
+        Behind an occluder; in line of sight by its sound but not seen; handed over to vision. None if it is
+        only known that something sounds there, as with an array without a model.
     existence_probability : float
         Probability that it exists; before vision has it, P(hidden on its side) + P(in view, come from there).
-    hidden_probability : float
-        Probability that it exists and is hidden.
+    hidden_probability : float or None
+        Probability that it exists and is hidden; None if no model states it.
     azimuth_rad, azimuth_std_rad : float
         Left positive, in (-pi, pi]. Hidden entities have a coarse azimuth: their side is what can be known.
         Where the side is not known, those of the likelier one.
     created_ns, updated_ns : int
         First and last time stamps of the belief, ns.
-    classification : tuple of Classification
-        Labels of the signature while hidden, of the detector once seen, and "unknown" for the rest.
+    classification : tuple of Classification, or None
+        Labels of the signature while hidden, of the detector once seen, and "unknown" for the rest; None if
+        nothing has classified it.
     moving : bool
         False for an object that vision holds for parked.
     direction : str or None
         Approach side that it is hidden on, the likelier one where `sides` has several; of one in view, the
-        side it came from, or whose edge it was first seen nearest to.
+        side it came from, or whose edge it was first seen nearest to. None if its side is not known.
     azimuth_rate_rad_s : float or None
         d azimuth / dt, rad/s; None while hidden.
     range_m : float or None
@@ -157,14 +159,14 @@ class Entity:
     )
 
     id: str
-    status: Status
+    status: Status | None
     existence_probability: Probability
-    hidden_probability: Probability
+    hidden_probability: Probability | None
     azimuth_rad: float
     azimuth_std_rad: float
     created_ns: int
     updated_ns: int
-    classification: tuple[Classification, ...] = ()
+    classification: tuple[Classification, ...] | None = ()
     moving: bool = True
     direction: str | None = None
     # None and not 0 from here on: a zero would read as a standing vehicle at the array.
@@ -198,7 +200,7 @@ class Entity:
                 if one.direction == self.direction
                 else str(uuid5(NAMESPACE_OID, f"{self.id}/{one.direction}")),
                 existence_probability=self.existence_probability * one.probability,
-                hidden_probability=self.hidden_probability * one.probability,
+                hidden_probability=self.hidden_probability and self.hidden_probability * one.probability,
                 direction=one.direction,
                 azimuth_rad=one.azimuth_rad,
                 azimuth_std_rad=one.azimuth_std_rad,

@@ -6,6 +6,7 @@ from typing import Literal, TypeAlias
 from worldstate.ground.serialisation import ADDED, Count, Probability
 
 Condition: TypeAlias = Literal["working", "impaired", "silent"]
+MASKED = "masked by a vehicle in view"  # Reason of a Hearing, which the sensor itself is not to blame for
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,20 +1,21 @@
 """The snapshot S_t."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
-from worldstate.abduction.road_users import DomainVerdict
-from worldstate.ground import InvalidArgumentError, NotUsable
+from worldstate.abduction.road_users import DomainVerdict, Foreign
+from worldstate.abduction.sequence.sequence_reader import TOO_FEW
+from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout, decode, decode_json, encode
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
-from .cue import Budget, RiskCue
+from .cue import Budget, RiskCue, WhyNot
 from .entity import EGO, Entity, Event, Relation
-from .sensor import Delivery, Ego, Hearing, SearchedView, SensorHealth
+from .sensor import MASKED, Delivery, Ego, Hearing, SearchedView, SensorHealth
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -44,7 +45,8 @@ class WorldState:
         What `stamp_ns` counts from.
     calibrated : bool
         Whether the cues hold to a false-alarm budget, of a model that is used for what it was made for; where
-        it is not, no cue states an alpha. False, too, while nothing can be heard or the budget is broken.
+        it is not, no cue states an alpha. False, too, while nothing can be heard or the budget is broken: it
+        is false exactly if a cue is *uncalibrated*, *unheard* or *budget broken*.
     bearing : Bearing or None
         Loudest source of the last measurement, with its standard deviation; None where it had no bearing.
     domain : Familiar, Foreign, WarningSignal or None
@@ -79,7 +81,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "3.0.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "4.0.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -108,12 +110,14 @@ class WorldState:
         relations = sorted(self.relations, key=lambda edge: (edge.src, edge.dst, edge.kind, edge.stamp_ns))
         object.__setattr__(self, "entities", tuple(entities))
         object.__setattr__(self, "relations", tuple(relations))
-        object.__setattr__(self, "cues", tuple(sorted(self.cues, key=lambda cue: cue.direction)))
+        cues = sorted(self.cues, key=lambda cue: (cue.direction or "", cue.azimuth_rad))
+        object.__setattr__(self, "cues", tuple(cues))
 
     @property
-    def risk(self) -> float:
-        """Largest risk of all directions, 0 before the first measurement."""
-        return max((cue.risk for cue in self.cues), default=0.0)
+    def risk(self) -> float | None:
+        """Largest risk of all directions, 0 before the first measurement; None if no model states one."""
+        risks = [cue.risk for cue in self.cues if cue.risk is not None]
+        return max(risks, default=None if self.cues else 0.0)
 
     def graph(self) -> "nx.MultiDiGraph[str]":
         """Return the scene graph: nodes are the ego vehicle, entities and occluders, edges the relations.
@@ -162,6 +166,8 @@ class WorldState:
     def from_dict(cls, value: object) -> "WorldState":
         """Return the snapshot that `to_dict` wrote; unknown keys are ignored.
 
+        One of schema 3.x is upgraded: what it holds decides whether its cues are usable.
+
         Raises
         ------
         SchemaVersionError
@@ -169,12 +175,91 @@ class WorldState:
         InvalidArgumentError
             If a value is missing, of the wrong type or out of range; the message says where.
         """
-        return decode(cls, value, "snapshot")
+        return _upgraded(value) if is_former(value) else decode(cls, value, "snapshot")
 
     @classmethod
     def from_json(cls, text: str) -> "WorldState":
         """Return the snapshot that `to_json` wrote; errors are those of `from_dict`."""
         return cls.from_dict(decode_json(text, "snapshot"))
+
+
+# Reasons for which a budget of alarms does not hold, so that a state is not calibrated.
+_NO_BUDGET = {"uncalibrated", "unheard", "budget broken"}
+
+
+def why_not(state: WorldState) -> tuple[WhyNot, ...]:
+    """Return why the cues of a snapshot may not be acted on, all reasons that apply in the order of `WhyNot`.
+
+    Parameters
+    ----------
+    state : WorldState
+        With `calibrated` true if a budget was measured for what decides.
+
+    Examples
+    --------
+    >>> why_not(WorldState(stamp_ns=2, seq=1, heard=(), valid_until_ns=1))
+    ('uncalibrated', 'unheard', 'expired')
+    """
+    hearing = [one for one in state.heard or () if one.share >= LEAST_HEARD]
+    applies: dict[WhyNot, bool] = {
+        "uncalibrated": not state.calibrated,
+        # What could not be heard is no evidence, and no budget was measured without it.
+        "unheard": state.heard is not None and not hearing,
+        "unknown sound": isinstance(state.domain, Foreign),
+        "too little sound": state.no_sequence == TOO_FEW,
+        "budget broken": state.budget is not None and state.budget.verdict == "broken",
+        "expired": state.valid_until_ns is not None and state.stamp_ns > state.valid_until_ns,
+        "masked": bool(hearing) and all(one.reason == MASKED for one in hearing),
+    }
+    return tuple(reason for reason in get_args(WhyNot) if applies[reason])
+
+
+def judged(state: WorldState) -> WorldState:
+    """Return a snapshot whose cues, and `calibrated`, follow from `why_not`.
+
+    Examples
+    --------
+    >>> from worldstate.state import EvidenceTerms
+    >>> heard = EvidenceTerms("coming", {"prior": 1.0}, 1.0, 0.0)
+    >>> cue = RiskCue("left", 0.9, 0.3, 0.8, 0.95, 0.97, 3.1, None, evidence=heard)
+    >>> judged(WorldState(0, 1, cues=(cue,), calibrated=True)).cues[0].usable
+    True
+    """
+    reasons = why_not(state)
+    cues = tuple(
+        # Of a side that no source distinguishes nothing was measured.
+        replace(cue, usable=not why, why_not=why)
+        for cue in state.cues
+        for why in [reasons or (() if cue.evidence else ("uncalibrated",))]
+    )
+    return replace(state, cues=cues, calibrated=_NO_BUDGET.isdisjoint(reasons))
+
+
+def is_former(value: object) -> bool:
+    """Tell whether a decoded snapshot is one of schema 3.x, which is upgraded when it is read.
+
+    Examples
+    --------
+    >>> is_former(WorldState(0, 0).to_dict())
+    False
+    """
+    stamp = value.get("schema") if isinstance(value, dict) else None
+    stated = stamp if isinstance(stamp, dict) else {}
+    return stated.get("name") == WorldState.LAYOUT.schema and str(stated.get("version")).startswith("3.")
+
+
+def _upgraded(value: Any) -> WorldState:
+    """Return the snapshot that is written in a value of schema 3.x."""
+    # Two fields that were always 0 are gone, and unknown keys are ignored; the cues' new ones follow below.
+    cues, new = value.get("cues"), {"usable": False, "why_not": ["uncalibrated"]}
+    if isinstance(cues, list):
+        cues = [one | new if isinstance(one, dict) else one for one in cues]
+    schema = {"name": WorldState.LAYOUT.schema, "version": WorldState.LAYOUT.version}
+    state = decode(WorldState, value | {"schema": schema, "cues": cues}, "snapshot")
+    # `calibrated` was false while nothing was heard, or the budget was broken, even if one was measured.
+    stated = state.budget is not None or any(cue.alpha is not None for cue in state.cues)
+    lost = not _NO_BUDGET.isdisjoint(why_not(replace(state, calibrated=True)))
+    return judged(replace(state, calibrated=state.calibrated or (stated and lost)))
 
 
 def snapshot_schema() -> dict[str, Any]:
@@ -189,7 +274,7 @@ def snapshot_schema() -> dict[str, Any]:
     --------
     >>> schema = snapshot_schema()
     >>> sorted(schema["$defs"])[:3], schema["properties"]["stamp_ns"]["type"]
-    (['Advisory', 'Bearing', 'Budget'], 'integer')
+    (['Advisory', 'AlarmPromise', 'Bearing'], 'integer')
     """
     shipped = files("worldstate") / "data" / "snapshot.schema.json"
     schema: dict[str, Any] = json.loads(shipped.read_text(encoding="utf-8"))

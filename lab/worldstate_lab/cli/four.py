@@ -149,7 +149,8 @@ def outcome(
 ) -> BoardOutcome:
     """Score the hops of one recording."""
     time_s = np.array([seconds(one.state.stamp_ns) for one in steps])
-    present = np.array([1.0 - one.state.cues[0].hypotheses.none for one in steps])
+    told = [one.state.cues[0].hypotheses for one in steps]
+    present = np.array([np.nan if one is None else 1.0 - one.none for one in told])
     advised = any(cue.advisory is not None for one in steps for cue in one.state.cues)
     late = [one for one, at_s in zip(steps, time_s, strict=True) if at_s > 0.5 * duration_s]
     loudness = [one.frame.band_log_energy.mean() for one in steps]
@@ -168,7 +169,9 @@ def _side(leftwards: FloatArray) -> str | None:
 
 
 def _of_risk(steps: Sequence[Step]) -> str | None:
-    risks = [{cue.direction: cue.risk for cue in one.state.cues} for one in steps]
+    risks = [
+        {cue.direction: np.nan if cue.risk is None else cue.risk for cue in one.state.cues} for one in steps
+    ]
     return _side(np.array([one[SIDES[0]] - one[SIDES[1]] for one in risks]))
 
 

@@ -12,6 +12,11 @@ other side of one, and onsets an hour by kind of hazard-free traffic. "worst" is
 cases or more. With --days, days are drawn from the streams, with as many false onsets as there are, as the
 budget allows and more: how often the watch calls the budget broken, and after how many hours.
 
+--curve MODEL writes the model with the curve from budget to threshold that hazard-free streams have, without
+a camera, and prints some of its points; --promise prints for budgets and shares what the model's curve
+promises and what these hazard-free streams have, those of each renderer by themselves. Neither follows
+vehicles.
+
 The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
 
 Examples
@@ -19,21 +24,31 @@ Examples
   worldstate-lab streams streams/*-2001-*.npz --model my_model.json
   worldstate-lab streams streams/SA1-*.npz --model my_model.json --camera none --json
   worldstate-lab streams streams/*-2001-*.npz --days 1000 --jobs 2
+  worldstate-lab streams quiet/*-81*.npz --curve my_model.json --budget 25 --jobs 2
+  worldstate-lab streams quiet/*-83*.npz --model my_model.json --promise --jobs 2
 """
 
 import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.files.model_file import read_model
+from worldstate.abduction.sequence.sequence_model import SequenceModel
+from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
-from worldstate.commissioning.commission import parts_of
+from worldstate.commissioning.alarm_curve import measured_curve, raised_at
+from worldstate.commissioning.commission import levels_of, parts_of, with_curve
+from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.checks import in_range
-from worldstate.operations.metrics.approach_table import Figures
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import SECONDS_PER_HOUR
+from worldstate.operations.metrics.approach_table import ApproachTable, Figures
+from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.simulation.parallel import in_processes
 from worldstate_lab.passes.budget_days import budget_days
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
@@ -58,6 +73,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--sides", action=argparse.BooleanOptionalAction, default=True,
         help="learn what either arm sounds like from vehicles that come into view (default: on)",
     )  # fmt: skip
+    add("--curve", type=Path, metavar="MODEL", help="write the model with the curve of these streams here")
+    add("--budget", type=float, metavar="N", help="its own, onsets an hour (default: that of the model)")
+    add("--promise", action="store_true", help="hold these streams against the curve of the model")
     add("--days", type=int, default=0, metavar="N", help="of each kind, drawn from the streams")
     add("--seed", type=int, default=0, help="of the camera's misses and of days (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -66,6 +84,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     model, days = read_model(arguments.model), in_range("--days", arguments.days, 0, 100_000)
+    if arguments.promise or arguments.curve is not None:
+        return _curve(arguments, model)
     given = {"camera": arguments.camera, "seed": arguments.seed, "learns": arguments.sides}
     follow = partial(passed_stream, model=model, **given)
     streams: dict[str, list[PassedStream]] = {}
@@ -88,6 +108,59 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         report["budget_days"] = found
         lines += ["", f"budget, {days:g} days each", *figure_lines(found, ".3f")]
     return CommandResult(report, table={}, lines=lines)
+
+
+BUDGETS, ALPHAS = (6.0, 12.0, 30.0), (0.01, 0.02, 0.05)
+
+
+def _curve(arguments: argparse.Namespace, model: Model) -> CommandResult:
+    """Write the curve of the streams, or hold them against that of the model."""
+    levels: dict[str, list[FloatArray]] = {}
+    found = in_processes(partial(_site_levels, model), arguments.streams, arguments.jobs)
+    for site, one in track(found, "following", len(arguments.streams)):
+        levels.setdefault(site, []).append(one)
+    if arguments.curve is not None:
+        alarm = parts_of(model)[1].alarm
+        budget = arguments.budget or (25.0 if alarm is None else alarm.onsets_per_hour)
+        model = with_curve(model, measured_curve(levels), in_range("--budget", budget, 0.1, 3600.0))
+        save_model(arguments.curve, model)
+    rows = promised_and_found(parts_of(model)[1], levels)
+    hours = sum(len(one) for some in levels.values() for one in some) * HOP_S / SECONDS_PER_HOUR
+    report = {"hours": hours, "junctions": len(levels), "rows": rows}
+    return CommandResult(report, table={}, lines=[f"{hours:.2f} hours", *figure_lines(rows, ".4f")])
+
+
+def _site_levels(model: Model, path: Path) -> tuple[str, FloatArray]:
+    heard = HeardStream.load(path)
+    if not heard.hazard_free:
+        raise InvalidArgumentError(f"{path}: expected a stream without hazards")
+    return heard.site, levels_of(model, heard)
+
+
+def promised_and_found(
+    sequence: SequenceModel, levels: Mapping[str, Sequence[FloatArray]]
+) -> dict[str, Figures]:
+    """Return what the curve promises at some budgets and shares, and what the streams of each renderer have.
+
+    The first letter of a junction's name is its renderer's. A found rate has its exact Poisson interval.
+    """
+    rows, groups = dict[str, Figures](), {name[0] for name in levels}
+    asked = [("budget", one) for one in BUDGETS] + [("alpha", one) for one in ALPHAS]
+    for name, value in asked:
+        try:
+            alarm = sequence.asking(**{name: value}).alarm
+        except InvalidArgumentError:
+            continue  # A short curve does not support all of them
+        assert alarm is not None
+        row: Figures = {"threshold_nats": alarm.threshold_nats}
+        row |= {} if alarm.promise is None else asdict(alarm.promise)
+        for group in sorted(groups):
+            some = [one for site, streams in levels.items() if site[0] == group for one in streams]
+            false = ApproachTable([], [raised_at(one, alarm.threshold_nats) for one in some]).false_alarms()
+            names = ("onsets_per_hour", "onsets_low", "onsets_high", "hazard_free_share")
+            row |= {f"{group}: {figure}": false[figure] for figure in names}
+        rows[f"{name} {value:g}"] = row
+    return rows
 
 
 def _figures(streams: Sequence[PassedStream]) -> Figures:

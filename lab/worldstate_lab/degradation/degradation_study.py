@@ -13,7 +13,7 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.source import ListenSettings, open_source
+from worldstate.adapters.source import open_source
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
@@ -369,7 +369,7 @@ class _Passes:
         ]
 
         def make() -> Tables:
-            source = open_source(recording.path, model=model, settings=ListenSettings(alpha=None))
+            source = open_source(recording.path, model=model)
             seen = cameras(self.settings.detectors, item.rates, item.tables)
             about: dict[str, Any] = {
                 "name": recording.recording_id,

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.cueing.risk_map import BINS
-from worldstate.commissioning.stream_outcomes import visible_errors
+from worldstate.commissioning.stream_exam import visible_errors
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray

@@ -10,34 +10,22 @@ from typing import Literal
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.road_users import DomainGuard, DomainVerdict, Foreign, beyond, neutral
 from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequenceModel
-from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.abduction.sequence.street_sides import StreetListener
-from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.adapters.acoustic import asked_again, beside_foreign
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Row, frame_of_rows
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import learn_passes
 from worldstate.adapters.source import street_listener
+from worldstate.commissioning.alarm_curve import measurements
 from worldstate.commissioning.commission import parts_of, stream_evidence
-from worldstate.commissioning.guard_training import heard_characters
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.commissioning.sequence_training import StreamTruth, stream_truth
 from worldstate.core.filter import WorldFilter
-from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import (
-    Approach,
-    Bearing,
-    CoEvidenceChannel,
-    Heard,
     Measurement,
 )
 from worldstate.operations.metrics.approach_table import AFTER_S
@@ -101,69 +89,6 @@ def _box(
         return project(camera, site, x, (ends[0], ends[1]), kind)
     half = 0.5 * kind.width_m
     return project(camera, site, x, (y - half, y + half), kind)
-
-
-def measurements(
-    heard: HeardStream,
-    model: EnsembleModel,
-    sequence: SequenceModel,
-    evidence: FloatArray,
-    vision: CoEvidenceChannel | None,
-    street: StreetListener | None = None,
-    guard: DomainGuard | None = None,
-) -> Iterator[Measurement]:
-    """Yield one measurement a hop, as the acoustic adapter makes them of the sound.
-
-    `street` corrects the sides, and learns from the passes that the filter reports to it.
-    """
-    domains = _judged(heard, guard)
-    if guard is not None:
-        foreign = np.array([isinstance(one, Foreign) for one in domains])
-        evidence = evidence.copy()
-        evidence[foreign, : len(SIDES)] = beyond(evidence[foreign, : len(SIDES)], guard.margin)
-    hops, signature, groups = heard.hops, SiteSignature(model), sequence.posterior(evidence).groups
-    for i in range(len(hops)):
-        if street is not None and i + 1 >= LEAST_HOPS:
-            told = street.turned(groups[i], hops.feature[i])
-        else:
-            told = groups[i]
-        reading = SequenceReading(told, sequence.share, sequence.margin_s, sequence.alarm)
-        said, domain = signature.evidence(hops.feature[i]), domains[i]
-        share = Heard(float(hops.heard[i]), str(hops.unheard[i]) or None, float(hops.excess_db[i]))
-        if isinstance(domain, Foreign) and guard is not None:
-            said, share = neutral(said, guard.margin), beside_foreign(domain, share)
-        measurement = Measurement(
-            stamp_ns=nanoseconds(float(hops.time_s[i])),
-            signature=said,
-            co_evidence=Unqueried("no camera"),
-            bearing=_bearing(heard, i),
-            approach=_approach(heard, i),
-            sequence=reading if i + 1 >= LEAST_HOPS else TOO_FEW,
-            heard=share,
-            domain=domain,
-        )
-        yield asked_again(measurement, vision)
-
-
-def _judged(heard: HeardStream, guard: DomainGuard | None) -> list[DomainVerdict | None]:
-    """Return what the guard says of every hop, None before it has heard enough."""
-    if guard is None:
-        return [None] * len(heard.hops)
-    rows, usable = heard_characters(heard)
-    told = iter(rows[:, : len(MEASURES)])
-    return [guard.judge(next(told)) if one else None for one in usable]
-
-
-def _bearing(heard: HeardStream, i: int) -> Bearing | NotUsable:
-    hops = heard.hops
-    if not np.isfinite(hops.bearing_rad[i]):
-        return NotUsable("no peak above noise")
-    return Bearing(float(hops.bearing_rad[i]), float(hops.bearing_std_rad[i]), float(hops.prominence[i]))
-
-
-def _approach(heard: HeardStream, i: int) -> Approach | NotUsable:
-    rate_hz, std_hz = float(heard.hops.looming_hz[i]), float(heard.hops.looming_std_hz[i])
-    return Approach(rate_hz, std_hz) if np.isfinite(rate_hz) else NotUsable("no looming above noise")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,6 +24,7 @@ from scipy.signal import lfilter, sosfilt
 
 from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S, held
+from worldstate.commissioning.alarm_curve import measured_curve
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import QUIET_KINDS
 from worldstate.commissioning.stream_exam import (
@@ -31,13 +32,12 @@ from worldstate.commissioning.stream_exam import (
     approach_table,
     approaches,
     chance_figures,
-    threshold_for,
     time_figures,
 )
-from worldstate.commissioning.stream_outcomes import HORIZON_S, shortly_before
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
+    HORIZON_S,
     LONGEST_LEAD_S,
     SLACK_S,
     ApproachOutcome,
@@ -46,6 +46,7 @@ from worldstate.operations.metrics.approach_table import (
     StreamApproach,
     auroc,
     mean_of,
+    shortly_before,
 )
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
@@ -232,7 +233,7 @@ def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Fi
     quiet = [above_place_db(one.heard) for one in streams if one.heard.hazard_free]
     if onsets_per_hour is None:
         return dict.fromkeys(("meter_detected", "meter_lead_missed_as_0_s", "meter_onsets_per_hour"))
-    least_db = threshold_for(quiet, onsets_per_hour)
+    least_db = measured_curve({"": quiet}).default(onsets_per_hour).threshold_nats
     louder = ((one.heard, held(above_place_db(one.heard) >= least_db)) for one in streams)
     figures = approach_table([(heard, np.stack([on, on], axis=1)) for heard, on in louder]).loud().figures()
     return {f"meter_{name}": figures[name] for name in ("detected", "lead_missed_as_0_s", "onsets_per_hour")}

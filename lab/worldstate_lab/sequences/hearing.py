@@ -159,6 +159,7 @@ def _product_row(step: Step) -> tuple[FloatArray, ...]:
     sides, reading = measured.signature.sides, measured.sequence
     history = step.checkpoint.history
     priors = cues[0].hypotheses
+    assert priors is not None  # A model listens here
     return (
         np.array([_LEAST_NATS if one.evidence is None else one.evidence.compared_nats for one in cues]),
         np.array([one.risk for one in cues]),

@@ -145,7 +145,8 @@ def _cue_rows(steps: Iterable[Step], recording: CornerRecording) -> Iterator[tup
             own, other = sorted(step.state.cues, key=lambda cue: cue.direction != recording.side)
             low_s, _, high_s = own.time_to_visible_s or (math.nan,) * 3
             best_s = math.nan if own.horizon_s is None else own.horizon_s
-            yield before_s, own.risk, other.risk, low_s, best_s, high_s
+            risks = (math.nan if cue.risk is None else cue.risk for cue in (own, other))
+            yield before_s, *risks, low_s, best_s, high_s
 
 
 def _bearings(steps: Iterable[Step], vision: VisionQuery, t0_s: float) -> HopTable:

@@ -84,7 +84,7 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     `reference_rad` of the camera's moving box; `about` says when the vehicle passes and why the tone of the
     pass-by cannot be used, if so.
     """
-    source = open_source(take.path, settings=ListenSettings(alpha=None, uncalibrated=True))
+    source = open_source(take.path, settings=ListenSettings(uncalibrated=True))
     vision = source.camera_channel()
     boxes = box_table(source, vision)
     truth = _truth(take, boxes)
@@ -219,7 +219,7 @@ def _decided(state: WorldState) -> tuple[Any, ...]:
     # What is held against the threshold, as a probability: another threshold would have raised by it.
     nats = max((cue.evidence.compared_nats for cue in state.cues if cue.evidence), default=np.nan)
     score = 1.0 / (1.0 + np.exp(-nats))
-    side = SIDES.get(told.direction, NO_SIDE) if raised and told is not None else NO_SIDE
+    side = SIDES.get(told.direction or "", NO_SIDE) if raised and told is not None else NO_SIDE
     return seconds(state.stamp_ns), bool(raised), side, _bearing(state), score, state.risk, _visible(told)
 
 

@@ -20,7 +20,7 @@ from typing import Annotated, TypeVar
 
 import numpy as np
 
-from worldstate.ground import FloatArray, wrap_angle
+from worldstate.ground import TINY, FloatArray, wrap_angle
 from worldstate.ground.serialisation import ADDED, Via
 from worldstate.measurement import Odometry, Position
 
@@ -34,15 +34,12 @@ from .motion import (
     GaussianBelief,
     MotionBelief,
     conditioned,
+    white_acceleration,
 )
 
-# A lane and a half: of a position that is less sure, a number would be taken for more than it says.
-_KNOWN_STD_M = 5.0
-# m/s: without a measured velocity a road user in town may drive at up to twice this, in any direction.
-_UNKNOWN_SPEED_STD = 10.0
 # Polar coordinates are singular at the array itself, and no road user comes nearer than this.
 _NEAREST_M = 1.0
-_LARGEST_PLACE_STD = 1e4  # m and m/s: ten times the least sure position that is taken
+_LARGEST_PLACE_STD = LARGEST_STD**2  # m and m/s: ten times the least sure position that is taken
 _IDENTITY = np.eye(4)
 NumbersT = TypeVar("NumbersT", float, FloatArray)
 
@@ -57,19 +54,14 @@ class CartesianBelief(GaussianBelief):
         return _longest(self.covariance[:2, :2])
 
     @property
-    def known(self) -> bool:
-        """Whether the position is sure enough to be told."""
-        return self.position_std_m < _KNOWN_STD_M
-
-    @property
     def velocity_std_mps(self) -> float:
         """Standard deviation of the velocity along its longest axis."""
         return _longest(self.covariance[2:, 2:])
 
 
-def at_position(position: Position) -> CartesianBelief:
+def at_position(position: Position, speed_std_mps: float) -> CartesianBelief:
     """Return the belief of an object that a first measurement places."""
-    return CartesianBelief(*full_measurement(position, _UNKNOWN_SPEED_STD))
+    return CartesianBelief(*full_measurement(position, speed_std_mps))
 
 
 def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArray, FloatArray]:
@@ -90,9 +82,8 @@ def arc(speed_mps: float, yaw_rate_rad_s: float, step_s: NumbersT) -> tuple[Floa
 
 def constant_velocity(step_s: float) -> tuple[FloatArray, FloatArray]:
     """Return F, and Q of a white acceleration of density 1, shape (4, 4) each."""
-    t = step_s
-    noise = np.kron(np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]]), np.eye(2))
-    return np.eye(4) + t * np.eye(4, k=2), noise
+    noise = np.asarray(np.kron(white_acceleration(step_s), np.eye(2)))
+    return _IDENTITY + step_s * np.eye(len(_IDENTITY), k=2), noise
 
 
 def predict_place(
@@ -147,21 +138,21 @@ def polar_motion(
     x, y, vx, vy = np.moveaxis(belief.mean, -1, 0)
     vx, r = vx - ego_speed_mps, np.hypot(x, y)
     # Moved out to the nearest distance; an entity at the array itself is taken to be ahead of it.
-    farther = _NEAREST_M / np.clip(r, 1e-9, _NEAREST_M)
-    x, y = np.where(r > 1e-9, x * farther, _NEAREST_M), y * farther
+    farther = _NEAREST_M / np.clip(r, TINY, _NEAREST_M)
+    x, y = np.where(r > TINY, x * farther, _NEAREST_M), y * farther
     square = x * x + y * y
     cosine, sine = x / square, y / square
     turning, closing = vy * cosine - vx * sine, vx * cosine + vy * sine
     # In complex numbers d log z = dz / z, so that log r and theta, rho and theta_dot share their derivatives.
-    slope = np.zeros((*belief.mean.shape, 4))
+    slope = np.zeros(belief.covariance.shape)
     slope[..., AZIMUTH, 0] = slope[..., AZIMUTH_RATE, 2] = -sine
-    slope[..., AZIMUTH, 1] = slope[..., AZIMUTH_RATE, 3] = cosine
+    slope[..., AZIMUTH, 1] = slope[..., AZIMUTH_RATE, -1] = cosine
     slope[..., AZIMUTH_RATE, 0] = vy / square - 2.0 * cosine * turning
     slope[..., AZIMUTH_RATE, 1] = -vx / square - 2.0 * sine * turning
     slope[..., RADIAL_RATE, 0] = vx / square - 2.0 * cosine * closing
     slope[..., RADIAL_RATE, 1] = vy / square - 2.0 * sine * closing
     slope[..., RADIAL_RATE, 2] = slope[..., LOG_RANGE, 0] = cosine
-    slope[..., RADIAL_RATE, 3] = slope[..., LOG_RANGE, 1] = sine
+    slope[..., RADIAL_RATE, -1] = slope[..., LOG_RANGE, 1] = sine
     # A sharp position far away would leave a covariance that is singular to rounding.
     covariance = slope @ belief.covariance @ slope.mT + LEAST_STD**2 * _IDENTITY
     # Axes that turn with the ego vehicle see everything turn the other way.
@@ -191,8 +182,9 @@ def _longest(covariance: FloatArray) -> float:
     return math.sqrt(0.5 * (a + b) + math.hypot(0.5 * (a - b), c))
 
 
-_ROW = Via(FloatArray, np.asarray, lambda row: row.reshape(3))
-_SQUARE = Via(FloatArray, np.ravel, lambda row: row.reshape(3, 3))
+_POSE = 3
+_ROW = Via(FloatArray, np.asarray, lambda row: row.reshape(_POSE))
+_SQUARE = Via(FloatArray, np.ravel, lambda row: row.reshape(_POSE, _POSE))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,7 +216,7 @@ def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
     yaw, heading = float(ego.pose[2]), float(ego.pose[2]) + 0.5 * turned
     x, y = (np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]) @ chord).tolist()
     pose = ego.pose + np.array([x, y, turned])
-    flow, gain = np.eye(3), np.array([[math.cos(heading), 0.0], [math.sin(heading), 0.0], [0.0, 1.0]])
+    flow, gain = np.eye(_POSE), np.array([[math.cos(heading), 0.0], [math.sin(heading), 0.0], [0.0, 1.0]])
     flow[:2, 2] = -y, x
     noise = gain * (np.array([ego.speed_std_mps, ego.yaw_rate_std_rad_s]) * step_s) ** 2 @ gain.T
     pose[2] = wrap_angle(pose[2])
@@ -233,7 +225,9 @@ def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
 
 def corrected(ego: EgoBelief | None, told: Odometry) -> EgoBelief:
     """Return the ego vehicle as odometry has it: its twist, and its pose where that was told."""
-    pose, covariance = (np.zeros(3), np.zeros((3, 3))) if ego is None else (ego.pose, ego.covariance)
+    pose, covariance = (
+        (np.zeros(_POSE), np.zeros((_POSE, _POSE))) if ego is None else (ego.pose, ego.covariance)
+    )
     if told.pose is not None:
         at = told.pose
         pose = np.array([*at.position_m, at.yaw_rad])

@@ -25,13 +25,12 @@ from typing import Annotated, Self, TypeAlias
 
 import numpy as np
 
-from worldstate.ground import FloatArray, InvalidArgumentError, wrap_angle
+from worldstate.ground import TINY, FloatArray, InvalidArgumentError, wrap_angle
 from worldstate.ground.serialisation import Via
 
-AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(4)
+_DIMENSIONS = 4
+AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(_DIMENSIONS)
 
-# q = 0 is a vehicle at the array itself, where the coordinates are singular; 1e-3 is 3 % of the first range.
-LEAST_Q = 1e-3
 _Numbers: TypeAlias = float | FloatArray  # Of one belief, or of each of many
 
 
@@ -45,7 +44,7 @@ def propagate(state: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]
     w = state[..., RADIAL_RATE] + 1j * state[..., AZIMUTH_RATE]
     z = 1.0 + w * step_s
     w, moved, by_rate, of_rate = w / z, np.log(z), step_s / z, z**-2
-    after, slope = state.copy(), np.zeros((*state.shape, 4))
+    after, slope = state.copy(), np.zeros((*state.shape, state.shape[-1]))
     after[..., AZIMUTH] += moved.imag
     after[..., LOG_RANGE] += moved.real
     after[..., AZIMUTH_RATE], after[..., RADIAL_RATE] = w.imag, w.real
@@ -64,9 +63,14 @@ def process_noise(acceleration_psd: _Numbers, range_m: _Numbers, step_s: float) 
     return np.asarray(strength[..., None, None] * _unit_noise(step_s))
 
 
-@lru_cache(maxsize=64)
+def white_acceleration(step_s: float) -> FloatArray:
+    """Return the covariance of place and speed after a white acceleration of density 1, shape (2, 2)."""
+    return np.array([[step_s**3 / 3.0, step_s**2 / 2.0], [step_s**2 / 2.0, step_s]])
+
+
+@lru_cache
 def _unit_noise(step_s: float) -> FloatArray:
-    twice, once, rate = step_s**3 / 3.0, step_s**2 / 2.0, step_s
+    (twice, once), (_, rate) = white_acceleration(step_s).tolist()
     return np.array(
         [[twice, once, 0.0, 0.0], [once, rate, 0.0, 0.0], [0.0, 0.0, rate, once], [0.0, 0.0, once, twice]]
     )
@@ -74,14 +78,14 @@ def _unit_noise(step_s: float) -> FloatArray:
 
 def _checked_covariance(row: FloatArray) -> FloatArray:
     """Return the covariance that a checkpoint holds as one row."""
-    covariance = row.reshape(4, 4)
+    covariance = row.reshape(_DIMENSIONS, _DIMENSIONS)
     if not (covariance == covariance.T).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise InvalidArgumentError("expected it symmetric and positive definite")
     return covariance
 
 
 # Of the largest variance, what every one has at least, so that rounding, 1e-16 of it, leaves none below zero.
-_CONDITION = 1e-13
+_CONDITION = 0.1 * TINY
 
 
 def conditioned(covariance: FloatArray, largest_std: float) -> FloatArray:
@@ -93,7 +97,8 @@ def conditioned(covariance: FloatArray, largest_std: float) -> FloatArray:
     A deviation above the largest one says nothing, but leaves no digits to the others.
     """
     covariance = 0.5 * (covariance + covariance.mT)
-    variance = covariance.reshape(*covariance.shape[:-2], 16)[..., ::5]  # A view
+    # A view of the diagonals.
+    variance = np.einsum("...ii->...i", covariance)
     largest = variance.max(axis=-1, keepdims=True)
     if (largest > largest_std**2).any():
         scale = np.minimum(largest_std / np.sqrt(np.maximum(variance, LEAST_STD**2)), 1.0)
@@ -111,14 +116,16 @@ class GaussianBelief:
     entities: with twenty a step takes half the time when all are predicted and updated at once.
     """
 
-    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(4))]
+    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(_DIMENSIONS))]
     covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, _checked_covariance)]
 
     @classmethod
     def stacked(cls, beliefs: Sequence[Self]) -> Self:
         """Return many beliefs, or none, as one with a leading axis."""
         mean, covariance = ([one.mean for one in beliefs], [one.covariance for one in beliefs])
-        return cls(np.array(mean).reshape(-1, 4), np.array(covariance).reshape(-1, 4, 4))
+        return cls(
+            np.reshape(mean, (-1, _DIMENSIONS)), np.reshape(covariance, (-1, _DIMENSIONS, _DIMENSIONS))
+        )
 
     def each(self) -> list[Self]:
         """Return the beliefs that were stacked."""

@@ -12,7 +12,7 @@ from worldstate.ground.extras import check_extra
 
 from .exports import needed_extras
 from .inputs import search_of
-from .output import say
+from .output import NO_STREET, say
 from .progress import progress_bar, track
 from .sensors import MOVING, GivenSensors, given_sensors
 
@@ -27,10 +27,10 @@ _EXTRAS = {"figure": "matplotlib", "camera_device": "cv2", "view": "rich"}
 
 
 def add_listen_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --model, --alpha, --site-memory, --uncalibrated, --grounded and the place."""
+    """Declare --model, --budget, --alpha, --site-memory, --uncalibrated, --grounded and the place."""
     add = parser.add_argument
     add("--model", type=Path, help="model file (default: that of --car, or the one that ships)")
-    add("--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)")
+    add_budget_options(parser)
     memory = "time constant with which the site is learned while listening, 0 for not at all (default: 300)"
     add("--site-memory", type=float, metavar="S", help=memory)
     add(
@@ -45,6 +45,13 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
     )
     street = "edges, pace and sides of this place as `street learn` wrote them, in place of --context"
     add("--street", type=Path, metavar="JSON", help=street)
+
+
+def add_budget_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --budget and --alpha, which set the threshold of the alarm."""
+    add = parser.add_mutually_exclusive_group().add_argument
+    add("--budget", type=float, metavar="ONSETS", help="false alarms an hour (default: the model's own)")
+    add("--alpha", type=float, metavar="SHARE", help="or the share of hazard-free time in alarm")
 
 
 def add_memory_options(parser: argparse.ArgumentParser, start: str) -> None:
@@ -142,6 +149,7 @@ def open_given(
     context = None if arguments.context is None else read_context(arguments.context)
     settings = replace(
         search_of(arguments),
+        budget=arguments.budget,
         alpha=arguments.alpha,
         site_adaptation=arguments.site_memory != 0.0,
         forgetting_s=arguments.site_memory or None,
@@ -152,7 +160,7 @@ def open_given(
     )
     if given.model is None and (moving_ego or (ego is not None and ego.moves)):
         say("the model of a moving ego is used, as odometry is given")
-    return adapters.open_source(
+    source = adapters.open_source(
         sound,
         ego=ego,
         moving_ego=moving_ego,
@@ -164,6 +172,9 @@ def open_given(
         settings=settings,
         **own,
     )
+    if source.street is None:
+        say(NO_STREET)
+    return source
 
 
 def listen_with_progress(

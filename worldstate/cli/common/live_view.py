@@ -50,7 +50,6 @@ def view_of(live: "LiveStep") -> RenderableType:
     lost = f"{live.overruns} overruns, {live.lost_s:.2f} s lost"
     head = Text(f"{ground.seconds(state.stamp_ns):9.1f} s   {late}   ")
     head.append(lost, style="red" if live.overruns else "green")
-    head.append("" if state.calibrated else "   not calibrated", style="bold red")
     return Group(head, _bearing(state), *map(_cue, state.cues), _entities(state.entities))
 
 
@@ -65,12 +64,14 @@ def _bearing(state: "WorldState") -> Text:
 
 
 def _cue(cue: "RiskCue") -> Text:
-    filled = round(cue.risk * _BAR)
-    line = Text(printable(f"{cue.direction:<6}"), style="bold")
-    line.append("█" * filled + "─" * (_BAR - filled), style="red" if cue.advisory else "yellow")
-    line.append(f"  risk {cue.risk:.2f}", style="default")
+    line = Text(printable(f"{cue.direction or '?':<6}"), style="bold")
+    if cue.risk is not None:
+        filled = round(cue.risk * _BAR)
+        line.append("█" * filled + "─" * (_BAR - filled), style="red" if cue.advisory else "yellow")
+        line.append(f"  risk {cue.risk:.2f}", style="default")
     if cue.advisory:
         line.append("  ADVISORY", style="bold red")
+    line.append("" if cue.usable else f"  not usable: {', '.join(cue.why_not)}", style="bold red")
     return line
 
 
@@ -78,8 +79,9 @@ def _entities(entities: "tuple[Entity, ...]") -> Table:
     table = Table("entity", "status", "exists", "azimuth", "is", box=None, padding=(0, 2, 0, 0))
     likeliest = sorted(entities, key=lambda one: -one.existence_probability)[:_MOST_ENTITIES]
     for one in likeliest:
-        label = max(one.classification, key=lambda said: said.probability).label if one.classification else ""
+        classes = one.classification or ()
+        label = max(classes, key=lambda said: said.probability).label if classes else ""
         azimuth = f"{math.degrees(one.azimuth_rad):+.0f} ± {math.degrees(one.azimuth_std_rad):.0f} deg"
-        cells = one.id[:8], one.status, f"{one.existence_probability:.2f}", azimuth, label
+        cells = one.id[:8], one.status or "heard", f"{one.existence_probability:.2f}", azimuth, label
         table.add_row(*(Text(printable(cell)) for cell in cells))  # text alone would be read as markup
     return table

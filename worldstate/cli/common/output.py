@@ -12,6 +12,7 @@ from worldstate.ground.errors import InputFileError
 
 from .exports import exported_files
 
+NO_STREET = "the model file holds no numbers of the belief: those that ship are used"
 _SINCE_1970_S = 1e9
 
 

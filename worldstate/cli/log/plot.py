@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if arguments.animate is not None:
         state_figure.check_gif(arguments.animate)
     states, title = [state for _, state in read_log(arguments.log)], arguments.log.name
-    shown = max(states, key=lambda state: state.risk)
+    shown = max(states, key=lambda state: state.risk or 0.0)
     if arguments.time is not None:
         shown = min(states, key=lambda state: abs(state.stamp_ns - ground.nanoseconds(arguments.time)))
     if arguments.out is not None:

@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         "last_s": ground.seconds(meter.last_ns),
         "peak_risk": meter.peak_risk,
         "calibration": calibration_words(meter.uncalibrated, meter.states),
+        "usable": meter.usable,
         "advisory_onsets_s": list(meter.summary().advisory_onsets_s),
     }
     return output.CommandResult(summary)

@@ -10,6 +10,7 @@ Examples
 """
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from worldstate import adapters
@@ -17,6 +18,7 @@ from worldstate.cli.common import output
 
 # Of the coefficients that ship; the data that a user trains on has a licence of its own.
 LICENCE = "Apache-2.0 for the coefficients that ship; no row of the training data is in the file"
+SHOWN = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0)  # Onsets an hour that may be asked for
 UNNAMED = "names no array, sample rate or ego motion: no budget is stated with it"
 
 
@@ -28,7 +30,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    card = model_card(adapters.read_model(arguments.file))
+    model = adapters.read_model(arguments.file)
+    if model.street is None:
+        output.say(output.NO_STREET)
+    card = model_card(model)
     return output.CommandResult(card, table=_readable(card))
 
 
@@ -36,8 +41,12 @@ def _readable(card: dict[str, object]) -> dict[str, object]:
     """Return the card with one line a threshold and a limit."""
     lines: dict[str, object] = {}
     for key, value in card.items():
-        if isinstance(value, list) and key in ("thresholds", "limits"):
+        if isinstance(value, list) and key in ("budgets", "thresholds", "limits"):
             lines |= {f"{key[:-1]} {number}": _words(one) for number, one in enumerate(value, start=1)}
+        elif isinstance(value, dict) and key == "street":
+            shown = "{name} {value:g} {unit} ({origin}: {why})"
+            rows = enumerate(value.items(), start=1)
+            lines |= {f"street {row}": shown.format(name=name, **one) for row, (name, one) in rows}
         else:
             lines[key] = _words(value)
     return lines
@@ -68,6 +77,7 @@ def model_card(model: "adapters.Model") -> dict[str, object]:
         "excluded_lists": list(origin.excluded_lists),
         "classifier": origin.classifier,
         **_made_for(model),
+        **_budgets(model),
         "thresholds": [
             {
                 "alpha": policy.alpha,
@@ -78,6 +88,7 @@ def model_card(model: "adapters.Model") -> dict[str, object]:
             for policy in model.policies.policies
         ],
         "figures": dict(origin.figures),
+        "street": {} if model.street is None else {k: asdict(v) for k, v in model.street.described.items()},
         "limits": _limits(model),
         "licence": LICENCE,
     }
@@ -95,6 +106,20 @@ def _made_for(model: "adapters.Model") -> dict[str, object]:
         "feature": domain.feature,
         "ego_motion": domain.ego_motion,
     }
+
+
+def _budgets(model: "adapters.Model") -> dict[str, object]:
+    """Return what the curve promises at the budget that is taken if none is asked for, and at some others."""
+    sequence = model.sequence
+    if sequence is None or sequence.alarm is None:
+        return {}
+    default, curve = sequence.alarm.onsets_per_hour, sequence.curve
+    if curve is None:
+        return {"default_budget": default, "budgets": []}
+    least, most = curve.least_onsets / curve.hours, float(curve.onsets_per_hour[-1])
+    promised = {asked: curve.default(asked).promise for asked in SHOWN if least <= asked <= most}
+    rows = [{"asked": asked} | asdict(one) for asked, one in promised.items() if one is not None]
+    return {"default_budget": default, "budget_hours": curve.hours, "budgets": rows}
 
 
 def _limits(model: "adapters.Model") -> list[str]:

@@ -17,7 +17,7 @@ from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
-from worldstate.adapters.source import ListenSettings, open_source
+from worldstate.adapters.source import open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.errors import InputFileError, OutOfDomainError
@@ -302,7 +302,7 @@ def read_input(
         if any({**about, **stream.about} != about for stream in streams):
             raise OutOfDomainError(f"{path}: heard with another model's signature; listen to the sound again")
         return streams
-    source = open_source(path, array=array, model=chosen, settings=ListenSettings(alpha=None))
+    source = open_source(path, array=array, model=chosen)
     measured = (measurement for _, measurement in measure_steps(source))
     if not path.is_dir():
         return [hop_stream(measured, name=str(path)).replace(about=about)]

@@ -12,7 +12,7 @@ alarm of each hazard-free stream, and asks the table of both for its figures:
 
 A detection is defined in two ways, and each kind of data keeps its own. A recording holds one approach,
 and the first *onset* counts: `onset_outcome`. In a stream an alarm may stand since the approach before,
-and either side may be named; the first *hop* in alarm counts: `hop_outcome` in `stream_outcomes`. Onsets more
+and either side may be named; the first *hop* in alarm counts: `hop_outcome`. Onsets more
 than five seconds before T0, and hops before the risk's horizon of eight, belong to something else.
 """
 
@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.abduction.signature.site_estimate import HOP_S
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
@@ -157,6 +158,45 @@ def onset_outcome(onsets_s: ArrayLike, t0_s: float) -> ApproachOutcome:
     early = lead_s > LONGEST_LEAD_S + SLACK_S
     counted = lead_s[(lead_s > SLACK_S) & ~early]
     return ApproachOutcome(float(counted.max(initial=0.0)), counted.size, int(early.sum()))
+
+
+HORIZON_S = COMING_S[-1]  # Of the risk: an alarm earlier than that is about something else
+
+
+def hop_outcome(
+    approach: StreamApproach, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
+) -> ApproachOutcome:
+    """Return the outcome of one approach of a stream: time_s (n,), alarm of either side (n, 2).
+
+    Alarms count from `longest_s` before T0 on.
+
+    Examples
+    --------
+    >>> time_s = 0.1 * np.arange(100)
+    >>> left = np.column_stack([time_s > 5.55, np.zeros(100, bool)])
+    >>> found = hop_outcome(StreamApproach("single", (8.0,), (1,)), time_s, left)
+    >>> round(found.lead_s, 1), found.own_side, found.other_side
+    (2.4, False, True)
+    """
+    first_s, last_s = approach.entries_s[0], max(approach.entries_s)
+    before, any_side = shortly_before(time_s, first_s, longest_s), np.asarray(raised.any(axis=1))
+    alarms_s, onsets_s = time_s[before & any_side], time_s[rising_edges(any_side)]
+    named = np.asarray(raised[before].any(axis=0))
+    pairs = zip(approach.entries_s, approach.sides, strict=True)
+    return ApproachOutcome(
+        lead_s=first_s - float(alarms_s[0]) if alarms_s.size else 0.0,
+        onsets=int(((onsets_s > first_s - longest_s) & (onsets_s < first_s)).sum()),
+        onsets_after=int(((onsets_s >= last_s) & (onsets_s < last_s + AFTER_S)).sum()),
+        own_side=bool(named[approach.sides[0]]),
+        other_side=bool(named[1 - approach.sides[0]]),
+        every_side=all(raised[shortly_before(time_s, t0_s, longest_s), side].any() for t0_s, side in pairs),
+        approach=approach,
+    )
+
+
+def shortly_before(time_s: FloatArray, entry_s: float, longest_s: float = HORIZON_S) -> BoolArray:
+    """Return the hops of the last seconds before a T0, shape (n,)."""
+    return np.asarray((time_s > entry_s - longest_s) & (time_s < entry_s - SLACK_S))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

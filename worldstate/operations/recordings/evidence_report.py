@@ -7,7 +7,8 @@ from typing import Literal, TypeAlias
 
 from worldstate.abduction.road_users import Foreign, WarningSignal
 from worldstate.ground.values import seconds
-from worldstate.state import Entity, RiskCue, WorldState
+from worldstate.state import Budget, Entity, RiskCue, WorldState
+from worldstate.state.cue import WhyNot
 
 Standing: TypeAlias = Literal["raised", "held", "above", "below"]
 _SAID = {
@@ -17,6 +18,15 @@ _SAID = {
     "below": "none: below the threshold",
 }
 _SAME_NS = 50_000_000  # half a hop
+WHY_NOT: dict[WhyNot, str] = {
+    "uncalibrated": "no budget of false alarms was measured for what decides",
+    "unheard": "no source that listens can hear",
+    "unknown sound": "the model was not made for this sound",
+    "too little sound": "less than a second of sound so far",
+    "budget broken": "a camera finds more false alarms, or other chances, than stated",
+    "expired": "nothing was measured for a second",
+    "masked": "a vehicle in view covers the sound",
+}
 _OF = {
     "coming": "a vehicle comes into view within 3 s",
     "hidden": "a vehicle is hidden on any side, by this window alone",
@@ -54,9 +64,9 @@ def told_advisories(states: Iterable[WorldState], side: str | None = None) -> tu
         first_ns = state.stamp_ns if first_ns is None else first_ns
         cues = [cue for cue in state.cues if side in (None, cue.direction)]
         for cue in cues:
-            if cue.advisory is not None:
+            if cue.advisory is not None and cue.direction is not None:
                 last_ns[cue.advisory.since_ns, cue.direction] = state.stamp_ns
-        risk = max((cue.risk for cue in cues), default=0.0)
+        risk = max((cue.risk for cue in cues if cue.risk is not None), default=0.0)
         if risk > highest:
             highest, riskiest_ns = risk, state.stamp_ns
     told = [ToldAdvisory(direction, since, last) for (since, direction), last in sorted(last_ns.items())]
@@ -104,7 +114,9 @@ class SideEvidenceReport:
         """Yield it for people."""
         cue, told = self.cue, self.cue.advisory
         said = _SAID[self.standing] if self.calibrated else _SAID[self.standing].partition(":")[0]
-        yield f"{cue.direction}: advisory {said}"
+        yield f"{cue.direction or 'side unknown'}: advisory {said}"
+        yield from (f"  usable: no, {one}: {WHY_NOT[one]}" for one in cue.why_not)
+        yield from ["  usable: yes"] * cue.usable
         if told is not None:
             since_s, until_s = seconds(told.since_ns), seconds(told.valid_until_ns)
             rests = ", ".join(f"{one.sensor} ({one.condition})" for one in told.sensors)
@@ -112,7 +124,8 @@ class SideEvidenceReport:
         if cue.not_advised is not None:
             yield f"  although the risk is high: {cue.not_advised}"
         yield from self._terms(now_s)
-        yield f"  side: {cue.confidence:.2f} of what is hidden; risk {cue.risk:.2f}"
+        if cue.confidence is not None and cue.risk is not None:
+            yield f"  side: {cue.confidence:.2f} of what is hidden; risk {cue.risk:.2f}"
         if cue.within is not None:
             chances = ", ".join(f"{chance:.2f} in {after_s} s" for after_s, chance in cue.within.items())
             yield f"  comes into view: {chances}{_time(cue)}"
@@ -148,7 +161,7 @@ def evidence_report(
             began = () if cue.advisory is None else _cues_at(read, cue.advisory.since_ns)
             first = next((one for one in began if one.direction == cue.direction), None)
             entity = entities.get(cue.entity_id or "")
-            reports[cue.direction] = SideEvidenceReport(cue, first, entity, state.calibrated)
+            reports[cue.direction or "unknown"] = SideEvidenceReport(cue, first, entity, state.calibrated)
     return reports
 
 
@@ -160,8 +173,8 @@ def _cues_at(read: Callable[[int], WorldState], stamp_ns: int) -> tuple[RiskCue,
 
 def common_lines(state: WorldState) -> Iterator[str]:
     """Yield what all sides share: sound, looks, the state of the sensors, what has just happened."""
-    if not state.calibrated:
-        yield "uncalibrated: no false-alarm budget stands behind the advisories"
+    if state.calibrated and state.budget is not None:
+        yield f"budget: {_promised(state.budget)}"
     if isinstance(state.domain, Foreign):
         yield f"sound: {state.domain.reason}: the evidence of this hop counts little"
     elif isinstance(state.domain, WarningSignal):
@@ -182,6 +195,18 @@ def common_lines(state: WorldState) -> Iterator[str]:
         yield f"event: {event.entity_id[:8]} {event.kind.replace('_', ' ')}"
 
 
+def _promised(budget: Budget) -> str:
+    """Return what was asked of the alarm, and what its curve promises."""
+    asked, promise = f"{budget.onsets_per_hour:g} onsets an hour", budget.promise
+    if budget.asked_alpha is not None:
+        asked = f"{budget.asked_alpha:.2%} of the time without hazards"
+    if promise is None:
+        return f"{asked}; the model file has no curve of what other budgets cost"
+    between = f"{promise.onsets_low:.1f} to {promise.onsets_high:.1f} at other junctions"
+    promised = f"{promise.onsets_per_hour:.1f} an hour ({between}) and {promise.alpha:.1%} of the time"
+    return f"{asked} asked; promised are {promised}"
+
+
 def _row(name: str, *nats: float) -> str:
     # Of what rounds to nothing the sign says nothing.
     return f"    {name:16s}{''.join(f'{round(value, 2) + 0.0:+14.2f}' for value in nats)}"
@@ -197,7 +222,8 @@ def _time(cue: RiskCue) -> str:
 def _described(entity: Entity) -> str:
     place = f"{math.degrees(entity.azimuth_rad):+.0f} deg (std {math.degrees(entity.azimuth_std_rad):.0f})"
     found = {"visible": "found it", "absent": "did not find it", "unqueried": "did not search there"}
+    status = entity.status or "heard"
     return (
-        f"{entity.id[:8]} {entity.status} at {place}, exists with {entity.existence_probability:.2f}, "
+        f"{entity.id[:8]} {status} at {place}, exists with {entity.existence_probability:.2f}, "
         f"by {', '.join(entity.sources)}; the last look {found[entity.visibility.answer]}"
     )

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -60,8 +61,10 @@ class WarningMeter:
     states: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    peak_risk: float = 0.0
+    peak_risk: float | None = None  # None until a state has stated a risk
     uncalibrated: int = 0  # States whose cues keep to no budget
+    unusable: int = 0  # States with a cue that is not usable
+    reasons: Counter[str] = field(default_factory=Counter)  # States by why not
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None
@@ -70,11 +73,14 @@ class WarningMeter:
     def update(self, state: WorldState) -> None:
         """Take in the next state of the recording."""
         self.first_ns, self.last_ns = self.first_ns if self.states else state.stamp_ns, state.stamp_ns
-        self.states, self.peak_risk = self.states + 1, max(self.peak_risk, state.risk)
+        self.states += 1
+        self.peak_risk = max((one for one in (self.peak_risk, state.risk) if one is not None), default=None)
         self.uncalibrated += not state.calibrated
+        self.unusable += not all(cue.usable for cue in state.cues)
+        self.reasons.update(dict.fromkeys((one for cue in state.cues for one in cue.why_not), 1))
         raised = [cue for cue in state.cues if cue.advisory]
         if raised:
-            now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk).entity_id
+            now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk or 0.0).entity_id
             if not self._raised:
                 # The first one of a log may have begun before it.
                 since_ns = min(cue.advisory.since_ns for cue in raised if cue.advisory is not None)
@@ -85,6 +91,14 @@ class WarningMeter:
         if self._visible_id is None:
             in_view = (one.id for one in state.entities if one.status == "visible" and one.moving)
             self._visible_id = next(in_view, None)
+
+    @property
+    def usable(self) -> str:
+        """In words: in how many states the cues could be acted on, and in how many each reason was given."""
+        if not self.unusable:
+            return "in every hop"
+        given = ", ".join(f"{reason} {number}" for reason, number in self.reasons.items())
+        return f"in {self.states - self.unusable} of {self.states} hops ({given})"
 
     def summary(self) -> WarningSummary:
         """Return the figures of all states so far."""
@@ -116,14 +130,16 @@ class RecordingReport:
         Advisories against line-of-sight entry.
     hops : int
         Decisions taken.
-    peak_risk : float
-        Largest risk of all hops.
+    peak_risk : float or None
+        Largest risk of all hops; None if none states one.
     realtime_factor : float
         Seconds of audio per second of wall time, the whole chain.
     health : RecordingHealth
         What was wrong with the microphones.
     calibration : str
         In words: "calibrated", "uncalibrated", or in how many hops it was not.
+    usable : str
+        In words: in how many hops the cues could be acted on, and why not in the others.
     end : Checkpoint or None
         Belief and site after the last hop, to go on from; None where there was none.
 
@@ -145,17 +161,19 @@ class RecordingReport:
 
     warning: WarningSummary
     hops: int
-    peak_risk: float
+    peak_risk: float | None
     realtime_factor: float
     health: RecordingHealth
     calibration: str
+    usable: str
     end: Checkpoint | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
         figures = {"hops": self.hops, "peak_risk": self.peak_risk, "realtime_factor": self.realtime_factor}
         masked = {"masked_microphones": [channel + 1 for channel in self.health.masked_channels]}
-        return asdict(self.warning) | figures | masked | {"calibration": self.calibration}
+        words = {"calibration": self.calibration, "usable": self.usable}
+        return asdict(self.warning) | figures | masked | words
 
 
 def run_recording(
@@ -210,10 +228,9 @@ def run_recording(
             end = step.checkpoint
     elapsed_s, last_ns = time.perf_counter() - started, max(meter.last_ns, source.start_ns)
     factor = seconds(last_ns - source.start_ns) / elapsed_s
-    calibration = calibration_words(meter.uncalibrated, meter.states)
-    return RecordingReport(
-        meter.summary(), meter.states, meter.peak_risk, factor, health.summary(), calibration, end
-    )
+    words = calibration_words(meter.uncalibrated, meter.states), meter.usable
+    figures = meter.states, meter.peak_risk, factor
+    return RecordingReport(meter.summary(), *figures, health.summary(), *words, end)
 
 
 def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehicle: str = "a vehicle") -> str:
@@ -255,7 +272,7 @@ def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
     """Return when an advisory began, seconds, of each side that had one."""
     onsets, standing = dict[str, list[float]](), set[str]()
     for state in states:
-        raised = {cue.direction for cue in state.cues if cue.advisory is not None}
+        raised = {cue.direction for cue in state.cues if cue.advisory and cue.direction}
         for side in raised - standing:
             onsets.setdefault(side, []).append(seconds(state.stamp_ns))
         standing = raised

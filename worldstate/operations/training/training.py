@@ -29,6 +29,7 @@ from worldstate.abduction.signature.window_classes import CLASSES, hazard_statis
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable, Group
 from worldstate.adapters.files.acoustic_domain import ego_motion_of
 from worldstate.adapters.files.model_file import Model, Provenance
+from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
@@ -302,7 +303,8 @@ def train_model(
         excluded_lists=tuple(excluded_lists),
         figures=_figures(table, levels[-1], settings.repeats),
     )
-    return Model(signature, _policies(table, signature, levels, settings), provenance)
+    policies = _policies(table, signature, levels, settings)
+    return Model(signature, policies, provenance, street=StreetModel())
 
 
 def fit_ensemble(inputs: FeatureTable, simulated: SimulatedWindows | None = None) -> EnsembleModel:

@@ -242,11 +242,11 @@ def _row(state: WorldState) -> Row:
     parts = (part for one in state.entities if one.moving for part in one.on_each_side())
     likeliest = sorted(parts, key=lambda one: -one.existence_probability)[:_MOST_ENTITIES]
     bearing = state.bearing
-    stated = [(one.direction, one.evidence) for one in state.cues if one.evidence is not None]
+    stated = [(one.direction, one.evidence) for one in state.cues if one.direction and one.evidence]
     return {
         "t": round(seconds(state.stamp_ns), 3),
         "entities": list(map(_entity, likeliest)),
-        "cues": list(map(_cue, state.cues)),
+        "cues": [_cue(one) for one in state.cues if one.direction is not None],
         "thresholds": {side: round(one.threshold_nats, 2) for side, one in stated},
         "bearing": None if bearing is None else _degrees(bearing.azimuth_rad),
         "prominence": None if bearing is None else round(bearing.prominence, 2),
@@ -280,10 +280,12 @@ def _cue(one: RiskCue) -> Row:
     held = one.held and f"held until {seconds(one.held.until_ns):.1f} s: now below the threshold"
     return {
         "side": one.direction,
-        "risk": round(one.risk, 3),
+        "risk": None if one.risk is None else round(one.risk, 3),
         "within": round(within["3"], 3) if "3" in within else None,
         "since": None if one.advisory is None else round(seconds(one.advisory.since_ns), 3),
         "said": [text for text in (held, one.not_advised) if text],
+        "usable": one.usable,
+        "why_not": list(one.why_not),
         **_sector(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
         "evidence": evidence
         and {

@@ -251,7 +251,7 @@ def _draw_probabilities(axes: "Axes", states: Sequence[WorldState]) -> None:
 def _probabilities(state: WorldState, sides: Sequence[str]) -> list[float]:
     """Return the existence of the likeliest vehicle in view, and the risk of each side."""
     in_view = [one.existence_probability for one in state.entities if one.moving and one.status != "hidden"]
-    risks = {cue.direction: cue.risk for cue in state.cues}
+    risks = {cue.direction: cue.risk for cue in state.cues if cue.risk is not None}
     return [max(in_view, default=0.0), *(risks.get(side, math.nan) for side in sides)]
 
 
@@ -331,11 +331,14 @@ def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
     """Draw the risk, and say it on the cue's own side below the ego, where no sector lies."""
     raised = cue.advisory is not None
     sector = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
-    _wedge(axes, sector, CUE_M, style.HIDDEN, 0.05 + 0.5 * cue.risk)
+    if cue.risk is not None:
+        _wedge(axes, sector, CUE_M, style.HIDDEN, 0.05 + 0.5 * cue.risk)
     if raised:
         _wedge(axes, sector, CUE_M, style.DECISION, 1.0, fill=False, lw=3.0, zorder=1.5)
-    within = "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
-    said = f"{cue.direction}{': ADVISORY' if raised else ''}\nrisk {cue.risk:.2f}{within}"
+    said = f"{cue.direction or 'side unknown'}{': ADVISORY' if raised else ''}"
+    said += "" if cue.risk is None else f"\nrisk {cue.risk:.2f}"
+    said += "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
+    said += "".join(f"\nnot usable: {reason}" for reason in cue.why_not)
     left = cue.azimuth_rad > 0.0
     x, side = (-37, "left") if left else (37, "right")
     color, weight = (style.DECISION, "bold") if raised else ("0.2", "normal")

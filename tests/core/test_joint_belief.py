@@ -1,0 +1,261 @@
+"""The joint belief of all sides: its laws over random inputs, against enumeration and gtsam."""
+
+import itertools
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
+from worldstate.belief.joint_belief import (
+    FIRST_BIN,
+    NONE,
+    PARTS,
+    STATES,
+    JointBelief,
+    SidePrior,
+    StreetPrior,
+    joint_reading,
+)
+from worldstate.belief.street_model import StreetModel
+from worldstate.ground import FloatArray
+
+SEEDS = st.integers(0, 2**32 - 1)
+STREET = StreetModel()
+CERTAIN = replace(STREET, works=1.0)  # The camera works
+COMING = len(COMING_S)
+
+
+def groups_of(rng: np.random.Generator, sides: int) -> FloatArray:
+    return np.asarray(0.99 * rng.dirichlet(np.full(len(GROUPS), 0.4), sides) + 0.01 / len(GROUPS))
+
+
+def prior_of(rng: np.random.Generator, sides: int) -> StreetPrior:
+    return StreetPrior.of(groups_of(rng, sides), STREET)
+
+
+def likelihoods(rng: np.random.Generator, sides: int) -> FloatArray:
+    return np.asarray(rng.uniform(0.05, 1.0, (*[PARTS] * sides, 2)))
+
+
+def product(prior: StreetPrior, weights: FloatArray, step_ns: int) -> FloatArray:
+    """Return a distribution a step later by one matrix over all states together."""
+    chain = np.ones((1, 1))
+    for axis in range(weights.ndim):
+        chain = np.kron(chain, prior.chain(axis, STREET, step_ns))
+    return (weights.ravel() @ chain).reshape(weights.shape)
+
+
+def part_of(states: tuple[int, ...]) -> tuple[int, ...]:
+    seen = states[-1] == 1 or any(state % 2 for state in states[:-1])
+    return (*(state // 2 for state in states[:-1]), int(seen))
+
+
+def every_state(sides: int) -> list[tuple[int, ...]]:
+    return list(itertools.product(*[range(STATES)] * sides, range(2)))
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+@given(SEEDS)
+@settings(max_examples=3, deadline=None)
+def test_it_is_what_enumeration_of_all_states_finds(sides: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    prior = prior_of(rng, sides)
+    belief, by_hand = JointBelief.expected(prior), prior.weights
+    for step_ns in rng.integers(5 * 10**7, 2 * 10**9, 3).tolist():
+        told = likelihoods(rng, sides)
+        belief = belief.carried(prior, STREET, step_ns).told(told)
+        by_hand = product(prior, by_hand, step_ns)
+        for states in every_state(sides):
+            by_hand[states] *= told[part_of(states)]
+        by_hand /= by_hand.sum()
+    np.testing.assert_allclose(belief.weights, by_hand, atol=1e-12)
+    hidden, visible, none = belief.explanations
+    parts = {part_of(states): 0.0 for states in every_state(sides)}
+    for states in every_state(sides):
+        parts[part_of(states)] += by_hand[states]
+    assert visible == pytest.approx(parts[(*[NONE] * sides, 1)], abs=1e-12)
+    assert none == pytest.approx(parts[(*[NONE] * sides, 0)], abs=1e-12)
+    assert hidden + visible + none == pytest.approx(1.0, abs=1e-12)
+
+
+@given(SEEDS)
+@settings(max_examples=2, deadline=None)
+def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    prior, told = prior_of(rng, 3), likelihoods(rng, 3)
+    belief = JointBelief.expected(prior).told(told).carried(prior, STREET, 3 * 10**8)
+    chains = [prior.chain(axis, STREET, 3 * 10**8) for axis in range(4)]
+    before = JointBelief.expected(prior).told(told).weights
+    by_hand = np.einsum("abce,ai,bj,ck,em->ijkm", before, *chains, optimize=True)
+    for k in range(3):
+        own = np.moveaxis(by_hand, k, 0).reshape(PARTS, 2, -1)
+        np.testing.assert_allclose(belief.hidden[k], own.sum(axis=(1, 2)), atol=1e-12)
+        assert belief.emerged_from[k] == pytest.approx(own[:FIRST_BIN, 1].sum(), abs=1e-12)
+    assert belief.none_comes == pytest.approx(
+        by_hand.reshape(PARTS, 2, PARTS, 2, PARTS, 4)[:FIRST_BIN, :, :FIRST_BIN, :, :FIRST_BIN].sum(),
+        abs=1e-12,
+    )
+
+
+@given(SEEDS)
+@settings(max_examples=1, deadline=None)
+def test_it_is_what_a_factor_graph_infers(seed: int) -> None:
+    """Oracle: gtsam's discrete factor graph of two sides over three steps, eliminated."""
+    rng = np.random.default_rng(seed)
+    prior, told = prior_of(rng, 2), [likelihoods(rng, 2) for _ in range(2)]
+    sizes = (STATES, STATES, 2)
+
+    def table(values: FloatArray) -> str:
+        return " ".join(repr(float(value)) for value in values.ravel())
+
+    keys = [[(10 * step + axis, sizes[axis]) for axis in range(3)] for step in range(3)]
+    graph, belief = gtsam.DiscreteFactorGraph(), JointBelief.expected(prior)
+    for axis, side in enumerate([one.states for one in prior.sides]):
+        graph.add([keys[0][axis]], table(side))
+    graph.add([keys[0][2]], table(np.array([1.0 - prior.elsewhere, prior.elsewhere])))
+    for step, likelihood in enumerate(told, 1):
+        for axis in range(3):
+            graph.add([keys[step - 1][axis], keys[step][axis]], table(prior.chain(axis, STREET, 10**8)))
+        states = np.array([likelihood[part_of(one)] for one in every_state(2)])
+        graph.add(keys[step], table(states))
+        belief = belief.carried(prior, STREET, 10**8).told(likelihood)
+    marginals = gtsam.DiscreteMarginals(graph)
+    for axis in range(3):
+        others = tuple(k for k in range(3) if k != axis)
+        np.testing.assert_allclose(
+            belief.weights.sum(axis=others), marginals.marginalProbabilities(keys[2][axis]), atol=1e-9
+        )
+
+
+@given(SEEDS)
+@settings(max_examples=5, deadline=None)
+def test_alone_a_reading_is_believed_as_it_is_whatever_was_believed_before(seed: int) -> None:
+    """With all of what is new believed at once, at 1e-9, and each side has its own chances to come."""
+    rng = np.random.default_rng(seed)
+    prior = prior_of(rng, 2)
+    belief = JointBelief.expected(prior)
+    for step_ns in rng.integers(5 * 10**7, 2 * 10**9, 5).tolist():
+        groups = groups_of(rng, 2)
+        groups[:, GROUPS.index("none")] += 1.0  # Else a vehicle is surer than two sides together allow
+        groups /= groups.sum(axis=1, keepdims=True)
+        reading = joint_reading(groups, 0.2, STREET.by_sound)
+        belief = belief.carried(prior, STREET, step_ns).read("ear", reading, prior, (0, 1))
+        np.testing.assert_allclose(belief.by_part, reading, atol=1e-9)
+        np.testing.assert_allclose(belief.hidden[:, FIRST_BIN:], groups[:, :COMING], atol=1e-9)
+
+
+@given(SEEDS)
+@settings(max_examples=3, deadline=None)
+def test_with_readings_of_the_same_chain_it_is_the_exact_filter_of_everything(seed: int) -> None:
+    """A reading is the posterior of the sound alone; what else is told keeps its worth."""
+    rng = np.random.default_rng(seed)
+    prior = prior_of(rng, 2)
+    belief = sound = exact = JointBelief.expected(prior)
+    for step_ns in rng.integers(5 * 10**7, 10**9, 5).tolist():
+        heard, message = likelihoods(rng, 2), likelihoods(rng, 2)
+        belief, sound, exact = (one.carried(prior, STREET, step_ns) for one in (belief, sound, exact))
+        sound, exact = sound.told(heard), exact.told(heard).told(message)
+        belief = belief.read("ear", sound.by_part, prior, (0, 1)).told(message)
+        np.testing.assert_allclose(belief.weights, exact.weights, atol=1e-9)
+
+
+@given(SEEDS)
+@settings(max_examples=5, deadline=None)
+def test_mirrored_evidence_gives_the_mirrored_belief(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    one = prior_of(rng, 1).sides[0]
+    prior = StreetPrior((one, one), 0.05)
+    here = there = JointBelief.expected(prior)
+    for _ in range(3):
+        told, answer = likelihoods(rng, 2), (Absent(0.05), Present(0.05))[rng.integers(2)]
+        here, there = here.told(told), there.told(told.transpose(1, 0, 2))
+        here, there = (one.carried(prior, STREET, 10**8) for one in (here, there))
+        stamp_ns = int(rng.integers(10**8, 10**9))
+        here, there = (one.looked("camera", answer, stamp_ns, STREET) for one in (here, there))
+    np.testing.assert_allclose(here.weights, there.weights.transpose(1, 0, 2), atol=1e-12)
+
+
+def read_often(looks_ns: list[int], street: StreetModel, miss: float = 0.05) -> JointBelief:
+    """Return the belief after a constant reading, in view 0.8 and coming 0.15, and empty looks."""
+    groups = np.full((1, len(GROUPS)), 1e-9)
+    groups[0, [GROUPS.index("seen"), GROUPS.index("coming_2s"), GROUPS.index("none")]] = 0.8, 0.15, 0.05
+    # One side alone: in view 0.8, coming 0.15 with nothing in view, so that they exclude each other.
+    reading = np.zeros((PARTS, 2))
+    reading[NONE], reading[FIRST_BIN + 3, 0] = (0.05, 0.8), 0.15
+    reading = np.maximum(reading, 1e-12) / reading.sum()
+    prior = StreetPrior((SidePrior.of(groups[0], 0.3, street),), 0.1)
+    belief = JointBelief.expected(prior).read("ear", reading, prior, (0,))
+    for stamp_ns in looks_ns:
+        belief = belief.looked("camera", Absent(miss, 0.0), stamp_ns, street)
+    return belief
+
+
+@given(st.integers(1, 6), st.floats(0.01, 0.6))
+@settings(max_examples=20, deadline=None)
+def test_empty_looks_a_correlation_time_apart_count_one_by_one(count: int, miss: float) -> None:
+    """Law 15, while the camera works: the odds of in view are those of eq. (6) with beta to the n."""
+    belief = read_often([k * 3 * 10**8 for k in range(count)], CERTAIN, miss)
+    assert belief.in_view / (1.0 - belief.in_view) == pytest.approx(4.0 * miss**count, rel=1e-6)
+
+
+@given(st.integers(1, 30), st.floats(0.01, 0.6))
+@settings(max_examples=20, deadline=None)
+def test_looks_within_one_correlation_time_count_as_one(count: int, miss: float) -> None:
+    looks = np.linspace(0, 140_000_000, count).astype(int).tolist()
+    one, many = read_often([0], CERTAIN, miss), read_often(looks, CERTAIN, miss)
+    assert many.in_view == pytest.approx(one.in_view, rel=1e-9)
+
+
+def test_a_second_of_empty_looks_denies_what_sounds_in_view() -> None:
+    after = read_often([k * 10**8 for k in range(10)], CERTAIN)
+    assert 0.0001 <= after.in_view <= 0.0004
+    within = read_often([k * 10**7 for k in range(10)], CERTAIN)
+    assert within.in_view == pytest.approx(0.8 * 0.05 / (0.8 * 0.05 + 0.2), rel=1e-6)
+
+
+def test_empty_looks_saturate_at_the_chance_that_the_camera_is_dead() -> None:
+    last = read_often([k * 3 * 10**8 for k in range(200)], STREET)
+    assert last.in_view / (1.0 - last.in_view) == pytest.approx(4.0 * (1.0 - STREET.works), rel=0.05)
+    works = last.trust["camera"].works
+    assert works.sum() > 0.9 and 1.0 - works.sum() >= 0.9 * last.in_view
+
+
+@given(SEEDS)
+@settings(max_examples=5, deadline=None)
+def test_a_vehicle_of_unknown_side_is_gone_from_the_other_side_and_a_second_one_is_not(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    prior = prior_of(rng, 2)
+    one, two = np.full((PARTS, PARTS, 2), 1e-6), np.full((PARTS, PARTS, 2), 1e-6)
+    one[FIRST_BIN, NONE, 0] = one[NONE, FIRST_BIN, 0] = 0.5
+    two[FIRST_BIN, FIRST_BIN + 1, 0] = 1.0
+    for reading, left in ((one, 0.05), (two, 0.95)):
+        before = JointBelief.expected(prior).read("ear", reading / reading.sum(), prior, (0, 1))
+        after = before.emerged(0, 0.02, 0.0, False, STREET)
+        assert after.emerged_from[0] > 0.9
+        assert (after.hidden[1, FIRST_BIN:].sum() < left) == (reading is one)
+        kept = before.emerged(0, 0.02, 0.0, True, STREET)
+        np.testing.assert_allclose(kept.hidden[1], before.hidden[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("sides", [2, 3])
+@given(st.integers(0, COMING - 1))
+@settings(max_examples=9, deadline=None)
+def test_one_seen_on_another_side_than_it_was_heard_on_is_two_as_seldom_as_one_comes_unheard(
+    sides: int, bin_: int
+) -> None:
+    """Heard on side 1, seen on side 0: it is still hidden with the odds (1 - c) p_u to c e^(-t / T_e)."""
+    weights = np.zeros((*[STATES] * sides, 2))
+    weights[(2 * NONE, 2 * (FIRST_BIN + bin_), *[2 * NONE] * (sides - 2), 0)] = 1.0
+    after = JointBelief(weights).emerged(0, 0.0, 0.0, False, STREET)
+    confused = STREET.side_confusion / (sides - 1)  # One of the other sides
+    one = confused * np.exp(-(0.0, *COMING_S)[bin_] / STREET.emergence_s)
+    two = (1.0 - confused) * STREET.unheard
+    assert after.hidden[1, FIRST_BIN:].sum() == pytest.approx(two / (one + two))
+    assert after.emerged_from[0] == pytest.approx(1.0)
+    apart = JointBelief(weights).emerged(0, 0.0, 0.0, True, STREET)
+    assert apart.hidden[1, FIRST_BIN:].sum() == pytest.approx(1.0)

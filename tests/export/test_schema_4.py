@@ -1,0 +1,198 @@
+"""Logs of schema 3.x, which version 0.3 wrote, and snapshots without side and risk, through every reader."""
+
+import csv
+import gzip
+import json
+import math
+import runpy
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import Writer
+from scripted_states import scripted_states
+
+from worldstate import WorldState
+from worldstate.adapters.export.log_messages import read_messages
+from worldstate.adapters.export.scene import scene_update
+from worldstate.adapters.ros.bag_writer import risk_advisories
+from worldstate.adapters.state_log import read_log
+from worldstate.cli.main import main
+from worldstate.operations.recordings.evidence_report import WHY_NOT
+from worldstate.state import RiskCue
+from worldstate.state.world_state import judged
+
+FORMER = Path(__file__).parent / "schema_3"
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
+# What follows for the cues of each snapshot, in turn, of the logs that 0.3 wrote.
+EXPECTED = {
+    "watched": [
+        ("too little sound",), (), (), ("budget broken",), ("budget broken",), ("budget broken", "masked"),
+        ("unheard", "expired"), ("budget broken",),
+    ],
+    "announced": [(), ("unknown sound",), (), (), ("unheard",)],
+    "uncalibrated": [("uncalibrated",), ("uncalibrated", "masked")],
+}  # fmt: skip
+
+
+def former_log(name: str, folder: Path) -> Path:
+    """Unpack a log of schema 3.0.0: JSON lines, or a bag."""
+    packed = FORMER / f"{name}.jsonl.gz"
+    if packed.is_file():
+        path = folder / f"{name}.jsonl"
+        path.write_bytes(gzip.decompress(packed.read_bytes()))
+        return path
+    bag = folder / name
+    shutil.copytree(FORMER / name, bag)
+    for part in bag.glob("*.gz"):
+        part.with_suffix("").write_bytes(gzip.decompress(part.read_bytes()))
+        part.unlink()
+    return bag
+
+
+def former_mcap(name: str, folder: Path) -> Path:
+    """Write a former log's lines as `--export mcap` did, with a scene, an image and sound beside."""
+    path, time = folder / f"{name}.mcap", {"sec": 1, "nsec": 0}
+    beside: dict[str, dict[str, Any]] = {
+        "/worldstate/scene": {"deletions": [], "entities": []},
+        "/camera/image": {"timestamp": time, "frame_id": "camera", "data": "AAAA", "format": "jpeg"},
+        "/microphones/sound": {
+            "timestamp": time, "data": "AAAA", "format": "pcm-s16", "sample_rate": 8000,
+            "number_of_channels": 1,
+        },
+    }  # fmt: skip
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        topics = ("/worldstate/snapshot", *beside)
+        channels = {one: writer.register_channel(one, "json", schema) for one in topics}
+        for line in former_log(name, folder).read_text().splitlines():
+            stamp_ns = json.loads(line)["stamp_ns"]
+            texts = {"/worldstate/snapshot": line} | {topic: json.dumps(one) for topic, one in beside.items()}
+            for topic, text in texts.items():
+                writer.add_message(channels[topic], stamp_ns, text.encode(), stamp_ns)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_former_log_is_read_as_its_upgrade_and_loses_nothing(name: str, tmp_path: Path) -> None:
+    log, upgraded = former_log(name, tmp_path), tmp_path / "upgraded.jsonl"
+    assert main(["log", "upgrade", str(log), str(upgraded)]) == 0
+    assert list(read_log(log)) == list(read_log(upgraded))
+    assert [{cue.why_not for cue in state.cues} for _, state in read_log(upgraded)] == [
+        {reasons} for reasons in EXPECTED[name]
+    ]
+    again = tmp_path / "again.jsonl"
+    assert main(["log", "upgrade", str(upgraded), str(again)]) == 0
+    assert again.read_bytes() == upgraded.read_bytes()
+    if log.suffix == ".jsonl":
+        for before, after in zip(*(map(json.loads, path.open()) for path in (log, upgraded)), strict=True):
+            assert after.pop("schema")["version"] == "4.0.0" and before.pop("schema")["version"] == "3.0.0"
+            for cue in after["cues"]:
+                assert cue.pop("usable") == (not cue.pop("why_not"))
+            if before["budget"] is not None:
+                assert (
+                    before["budget"].pop("threshold_shift_nats") == before["budget"]["tally"].pop("lost") == 0
+                )
+            # Added since.
+            assert after["context"].pop("hidden_by_side") is None
+            if after["budget"] is not None:
+                assert after["budget"].pop("asked_alpha") is after["budget"].pop("promise") is None
+            assert after == before
+
+
+def test_a_former_mcap_file_keeps_its_images_and_sound_and_is_drawn_anew(tmp_path: Path) -> None:
+    log, upgraded = former_mcap("watched", tmp_path), tmp_path / "upgraded.mcap"
+    assert main(["log", "upgrade", str(log), str(upgraded)]) == 0
+    assert list(read_log(log)) == list(read_log(upgraded))
+    for topic in ("/camera/image", "/microphones/sound"):
+        first, second = (
+            [(stamp_ns, json.loads(text)) for stamp_ns, _, text in read_messages(path, topic)]
+            for path in (log, upgraded)
+        )
+        assert len(first) == 8 and first == second
+    scenes = [text for _, _, text in read_messages(upgraded, "/worldstate/scene")]
+    assert "not usable: budget broken" in scenes[3] and "not usable" not in scenes[1]
+
+
+@pytest.mark.parametrize(("given", "named"), [("watched.mcap", "x.jsonl"), ("watched.jsonl", "x.mcap")])
+def test_an_upgrade_that_would_lose_images_or_lie_of_its_form_is_refused(
+    given: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    former_mcap("watched", tmp_path)
+    assert main(["log", "upgrade", str(tmp_path / given), str(tmp_path / named)]) == 2
+    assert named in capsys.readouterr().err and not (tmp_path / named).exists()
+
+
+def test_every_consumer_of_an_advisory_is_given_that_it_is_not_usable(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same states of an uncalibrated rule, and of one with a budget."""
+    shown = []
+    parts = runpy.run_path(str(EXAMPLES / "own_parts" / "own_parts.py"))
+    for calibrated in (False, True):
+        states = [judged(replace(state, calibrated=calibrated)) for state in scripted_states()]
+        assert any(cue.advisory for cue in states[0].cues)
+        log, page = tmp_path / "states.jsonl", tmp_path / "page.html"
+        log.write_text("".join(f"{state.to_json()}\n" for state in states))
+        with parts["risk_table"](str(tmp_path / "risks.csv")) as export:
+            export(states[0])
+        rows = list(csv.DictReader((tmp_path / "risks.csv").open()))
+        assert main(["log", "view", str(log), "--out", str(page)]) == 0
+        capsys.readouterr()
+        assert main(["explain", str(log), "--side", "left"]) == 0
+        explained = capsys.readouterr().out
+        assert main(["log", "replay", str(log)]) == 0
+        shown.append(
+            {
+                "JSON": '"usable":false,"why_not":["uncalibrated"]' in log.read_text().splitlines()[0],
+                "ROS": not all(one["usable"] for one in risk_advisories(states[0])["advisories"]),
+                "scene": "not usable: uncalibrated" in str(scene_update(states[0])),
+                "page": '"usable":false,"why_not":["uncalibrated"]' in page.read_text(),
+                "table": {row["usable"] for row in rows} == {"False"},
+                "explain": f"usable: no, uncalibrated: {WHY_NOT['uncalibrated']}" in explained,
+                "summary": "in every hop" not in capsys.readouterr().out,
+            }
+        )
+    assert set(shown[0].values()) == {True} and set(shown[1].values()) == {False}, shown
+
+
+def without_model(state: WorldState) -> WorldState:
+    """Return what an array without a model can state: where something sounds, no side, class or risk."""
+    cues = (RiskCue(None, 0.4, 0.2, None, None, None, None, None),)
+    heard = [
+        replace(
+            one, status=None, hidden_probability=None, classification=None, direction=None, sides=(),
+            sector_rad=None,
+        )
+        for one in state.entities
+    ]  # fmt: skip
+    return replace(state, cues=cues, entities=tuple(heard), relations=(), calibrated=False)
+
+
+def test_what_has_no_side_class_or_risk_is_left_out_and_not_taken_for_zero(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    states, log = [without_model(one) for one in scripted_states()], tmp_path / "states.jsonl"
+    log.write_text("".join(f"{one.to_json()}\n" for one in states))
+    assert [state for _, state in read_log(log)] == states and {one.risk for one in states} == {None}
+    (cue,) = risk_advisories(states[0])["advisories"]
+    assert cue["direction"] == "" and not cue["usable"]
+    assert all(math.isnan(cue[key]) for key in ("risk", "confidence", "hidden", "visible", "none"))
+    items = {item.id: item for item in scene_update(states[0]).entities}
+    assert items["cue side unknown"].triangles == () and "risk" not in str(items["cue side unknown"])
+    assert main(["explain", str(log)]) == 0
+    explained = capsys.readouterr().out
+    assert "side unknown: advisory none" in explained and "risk" not in explained.partition("time")[2]
+    outputs = "mcap=a.mcap", "autoware=a.jsonl", "mot=a.txt", "osi=a.osi", "rosbag=a.bag"
+    exports = [word for one in outputs for word in ("--export", one.replace("=", f"={tmp_path}/"))]
+    assert main(["log", "replay", str(log), *exports]) == 0
+    assert "peak_risk          -" in capsys.readouterr().out
+    page, figure, above = (tmp_path / one for one in ("page.html", "over_time.png", "above.png"))
+    assert main(["log", "view", str(log), "--out", str(page)]) == 0
+    assert '"cues":[]' in page.read_text() and '"risk"' not in page.read_text().partition("<script>")[0]
+    assert main(["log", "plot", str(log), "--out", str(figure), "--birds-eye", str(above)]) == 0

@@ -1,0 +1,493 @@
+r"""One distribution over the states of all approach sides together.
+
+The state of a side has two parts, and neither excludes the other: a hidden vehicle (none, a distant one, or
+one that comes into view within a bin of time), and a vehicle in view that came from there (no, yes). Beside
+all sides, a vehicle from elsewhere is in view or not. With A_k the chain of a side and A_e that of elsewhere,
+
+.. math:: \bar p_t = p_{t-1}\, (A_1 \otimes \dots \otimes A_K \otimes A_e), \qquad
+          p_t(s) \propto \bar p_t(s) \prod_j e_j(s)
+
+A reading q enters by what is new in it. It speaks of the hidden part of every side and of whether anything is
+in view; with r(s) these parts of a state, and n the belief that sound alone would have,
+
+.. math:: e(s) = \frac{q(r(s))}{\bar n(r(s))}, \qquad n_t(s) = \bar n_t(s)\, e(s)
+
+so that without other evidence p = n, whose parts are q, whatever the chain.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.abduction.sequence.markov_chain import balanced, transitions
+from worldstate.abduction.sequence.sequence_inputs import HOP_S
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
+from worldstate.ground import CERTAIN_NATS, TINY, BoolArray, FloatArray, seconds
+
+from .street_model import StreetModel
+
+BINS = len(COMING_S)
+# Hidden parts in the order of the axis: none, distant, and the bins of the time to visible.
+NONE, DISTANT, FIRST_BIN = 0, 1, 2
+PARTS = FIRST_BIN + BINS
+STATES = 2 * PARTS  # Of a side: hidden part, then whether one from there is in view
+COMES = np.arange(PARTS) >= FIRST_BIN
+_GROUP = {name: k for k, name in enumerate(GROUPS)}
+_SEEN, _OTHER, _LAST_BIN = _GROUP["seen"], _GROUP["other"], STATES - 2
+_DISTANT = [_GROUP["rising"], _GROUP["falling"]]
+_ABSENT = [_GROUP["none"], _GROUP["other"], _GROUP["past"], _SEEN]
+
+
+@dataclass(frozen=True, slots=True)
+class SidePrior:
+    """What is expected of a side without evidence: its hidden part, and whether one from there is in view."""
+
+    hidden: tuple[float, ...]  # shape (parts,)
+    in_view: float
+
+    @classmethod
+    def of(cls, groups: FloatArray, in_view: float, street: StreetModel) -> "SidePrior":
+        """Return the prior that goes with a prior of the sequence's groups, shape (groups,).
+
+        As many leave the view as come into it, but at most so that all sides together have `in_view`.
+        """
+        # Flows into a part of no probability have no proportion.
+        parts = np.maximum([groups[_ABSENT].sum(), groups[_DISTANT].sum(), *groups[:BINS]], TINY)
+        total = math.fsum(parts)
+        hidden = tuple(float(one) / total for one in parts)
+        passing = hidden[FIRST_BIN] / COMING_S[0] * street.passage_s
+        return cls(hidden, min(passing / (1.0 + passing), in_view))
+
+    @property
+    def states(self) -> FloatArray:
+        """Shape (states,)."""
+        return np.outer(self.hidden, [1.0 - self.in_view, self.in_view]).ravel()
+
+
+@lru_cache
+def _side_rates(prior: SidePrior, street: StreetModel) -> FloatArray:
+    """Return Q of a side, 1/s, which leaves its prior as it is; shape (states, states)."""
+    hop, share = np.eye(STATES), prior.states
+    spans_s = np.diff((0.0, *COMING_S)).tolist()
+    arrows = list[tuple[int, int, float]]()
+    for seen in (0, 1):
+        at = [2 * part + seen for part in range(PARTS)]
+        first, *later = at[FIRST_BIN:]
+        arrows.append((first, 2 * NONE + 1, spans_s[0]))
+        arrows += zip(later, at[FIRST_BIN:], spans_s[1:], strict=False)
+        arrows += [(at[NONE], at[-1], street.arrival_s), (at[NONE], at[DISTANT], street.arrival_s)]
+        arrows += [(at[DISTANT], at[NONE], street.far_s), (at[DISTANT], at[-1], street.arrival_s)]
+    arrows += [(2 * part + 1, 2 * part, street.passage_s) for part in range(PARTS)]
+    for one, to, mean_s in arrows:
+        hop[one, [one, to]] += [-HOP_S / mean_s, HOP_S / mean_s]
+    still = balanced((1.0 - street.leak) * hop + street.leak * share, share)
+    return np.asarray((still - np.eye(STATES)) / HOP_S)
+
+
+@lru_cache
+def _side_chain(prior: SidePrior, street: StreetModel, step_ns: int) -> FloatArray:
+    return transitions(_side_rates(prior, street), step_ns)
+
+
+@lru_cache
+def _elsewhere_chain(in_view: float, passage_s: float, step_ns: int) -> FloatArray:
+    """Return the chain of a vehicle from elsewhere: not in view, in view; shape (2, 2)."""
+    leaves = 1.0 / passage_s
+    comes = leaves * in_view / (1.0 - in_view)
+    return transitions(np.array([[-comes, comes], [leaves, -leaves]]), step_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class StreetPrior:
+    """What is expected of all sides and of elsewhere without evidence."""
+
+    sides: tuple[SidePrior, ...]
+    elsewhere: float  # P(a vehicle from elsewhere is in view)
+
+    @classmethod
+    def of(cls, groups: FloatArray, street: StreetModel) -> "StreetPrior":
+        """Return the prior that goes with priors of the sequence's groups, shape (sides, groups)."""
+        return _street_prior(groups.tobytes(), street)
+
+    @property
+    def weights(self) -> FloatArray:
+        """The distribution, shape (states, ..., states, 2)."""
+        weights = np.ones(())
+        for one in (*(side.states for side in self.sides), np.array([1.0 - self.elsewhere, self.elsewhere])):
+            weights = weights[..., None] * one
+        return weights
+
+    @property
+    def by_part(self) -> FloatArray:
+        """The joint of the hidden parts and of whether anything is in view, shape (parts, ..., parts, 2)."""
+        return _by_part(self.weights)
+
+    def chain(self, axis: int, street: StreetModel, step_ns: int) -> FloatArray:
+        """Return the chain of a side, or of elsewhere behind the last one; rows sum to one."""
+        if axis == len(self.sides):
+            return _elsewhere_chain(self.elsewhere, street.passage_s, step_ns)
+        return _side_chain(self.sides[axis], street, step_ns)
+
+    def carry(self, weights: FloatArray, street: StreetModel, step_ns: int) -> FloatArray:
+        """Return a distribution a step later, of its shape."""
+        for axis in range(weights.ndim):
+            # The axis in front goes to the end, so that after all of them the order is the same again.
+            weights = np.tensordot(weights, self.chain(axis, street, step_ns), ([0], [0]))
+        return weights
+
+
+@lru_cache(maxsize=256)
+def _street_prior(content: bytes, street: StreetModel) -> StreetPrior:
+    groups = np.frombuffer(content).reshape(-1, len(GROUPS))
+    seen = float((groups[:, _SEEN] / groups[:, BINS:].sum(axis=1)).mean())
+    seen = min(max(seen, TINY), 1.0 - street.doubt)
+    # The rest of what is in view comes from elsewhere, however little that is.
+    most = 1.0 - (1.0 - (1.0 - street.doubt) * seen) ** (1.0 / len(groups))
+    sides = tuple(SidePrior.of(one, most, street) for one in groups)
+    return StreetPrior(sides, 1.0 - (1.0 - seen) / math.prod(1.0 - one.in_view for one in sides))
+
+
+def _by_part(weights: FloatArray) -> FloatArray:
+    """Return the parts that a reading speaks of: (parts, ..., parts, 2), last whether anything is in view."""
+    sides = weights.ndim - 1
+    split = weights.reshape(*[PARTS, 2] * sides, 2)
+    nothing: list[slice | int] = [slice(None), 0] * sides
+    clear = split[(*nothing, 0)]
+    every = split.sum(axis=(*range(1, 2 * sides, 2), 2 * sides))
+    return np.stack([clear, np.maximum(every - clear, 0.0)], axis=-1)
+
+
+@lru_cache
+def _in_view(sides: int) -> BoolArray:
+    """Return which states have a vehicle in view, shape (states, ..., states, 2)."""
+    seen = np.zeros((*[STATES] * sides, 2), bool)
+    seen[..., 1] = True
+    for k in range(sides):
+        seen |= np.moveaxis((np.arange(STATES) % 2 == 1).reshape(STATES, *[1] * sides), 0, k)
+    return seen
+
+
+def _spread(by_part: FloatArray) -> FloatArray:
+    """Return the value of every state from that of its parts: the inverse of the sums of `_by_part`."""
+    sides = by_part.ndim - 1
+    clear, seen = by_part[..., 0], by_part[..., 1]
+    for k in range(sides):
+        clear, seen = (np.repeat(one, 2, axis=k) for one in (clear, seen))
+    # In C order, as a checkpoint is read: sums over another order differ in their last bit.
+    return np.ascontiguousarray(np.where(_in_view(sides), seen[..., None], clear[..., None]))
+
+
+def usual_groups(hidden: Sequence[float], in_view: float) -> FloatArray:
+    """Return the groups of a street of which only chances are known, shape (sides, groups).
+
+    Vehicles that come are as likely at any time within eight seconds.
+    """
+    groups = np.zeros((len(hidden), len(GROUPS)))
+    for row, chance in zip(groups, hidden, strict=True):
+        row[:BINS] = chance * np.diff((0.0, *COMING_S)) / COMING_S[-1]
+        row[[_SEEN, _GROUP["none"]]] = (1.0 - chance) * np.array([in_view, 1.0 - in_view])
+    return groups
+
+
+def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> FloatArray:
+    r"""Return the joint of the parts of one or two sides from the reading of each: (parts, .., parts, 2).
+
+    .. math:: P(\bar C_k, \bar C_j) = \tfrac{1}{2} \sum_k \big(1 - P(C_k) - q_k(other)\big)
+
+    within what the two chances allow. Given on which sides vehicles come, the bins of the sides are
+    independent, and each side has its own marginal. P(another one is in view ahead of one that comes) is the
+    mean of that by sound, of the street without it (share `by_sound`), and of the usual one (the rest), but
+    at most the first: a camera that finds what the sound denies is no evidence for a hidden vehicle. Of one
+    side "other" is a street without it.
+
+    Shapes: groups (sides, groups).
+    """
+    coming, other = groups[:, :BINS], groups[:, _OTHER] * (len(groups) > 1)
+    comes = np.minimum(coming.sum(axis=1), 1.0 - TINY)
+    rest = np.maximum(groups[:, BINS:].sum(axis=1) - other, TINY)
+    distant = np.minimum(groups[:, _DISTANT].sum(axis=1) / rest, 1.0)
+    seen = min(float((groups[:, _SEEN] / rest).mean()), 1.0)
+    behind = min((1.0 - by_sound) * usual_in_view + by_sound * seen, seen)
+    parts = np.zeros((len(groups), 2, PARTS))  # Side, whether one comes there, part
+    parts[:, 0, NONE], parts[:, 0, DISTANT] = 1.0 - distant, distant
+    parts[:, 1, FIRST_BIN:] = coming / np.maximum(comes, TINY)[:, None]
+    if len(groups) == 1:
+        alone, beside = (1.0 - comes[0]) * parts[0, 0], comes[0] * parts[0, 1]
+    else:
+        none = float((1.0 - comes - other).mean())
+        none = min(max(none, 1.0 - float(comes.sum()), 0.0), 1.0 - float(comes.max()))
+        both = max(float(comes.sum()) - (1.0 - none), 0.0)
+        chances = {(0, 1): comes[1] - both, (1, 0): comes[0] - both, (1, 1): both}
+        alone = none * np.outer(*parts[:, 0])
+        beside = np.sum([one * np.outer(parts[0, a], parts[1, b]) for (a, b), one in chances.items()], axis=0)
+    joint = np.stack(
+        [alone * (1.0 - seen) + beside * (1.0 - behind), alone * seen + beside * behind], axis=-1
+    )
+    joint = np.maximum(joint, TINY)
+    return np.asarray(joint / joint.sum())
+
+
+def window_likelihoods(
+    hidden: Sequence[float | None], visible: float, none: float, in_view: float
+) -> FloatArray:
+    r"""Return the likelihoods of a window of the parts, shape (parts, ..., parts, 2), the largest one.
+
+    .. math:: \ell(s) = \frac{1}{|C|} \sum_{k \in C} \ell_{hid,k}
+
+    of the sides C from which a vehicle comes, or that of one in view, or of none, if there is no such side:
+    eq. (6), for explanations that do not exclude one another. A window that denies one in view denies it
+    beside a hidden one as well; the mean over the usual chance `in_view` stays. Of a side without a number
+    (None) the window leaves open what comes.
+    """
+    sides, known = len(hidden), [k for k, one in enumerate(hidden) if one is not None]
+    nats = np.array([0.0 if one is None else one for one in hidden])
+    top = max([*nats[known], visible, none])
+    comes = np.stack(np.meshgrid(*[COMES] * sides, indexing="ij"), axis=-1)[..., known]
+    count = comes.sum(axis=-1)
+    mean = comes @ np.exp(nats[known] - top) / np.maximum(count, 1)
+    clear, seen = math.exp(none - top), math.exp(visible - top)
+    denied = min(seen / clear, 1.0) if clear > 0.0 else 1.0
+    mean = mean / (1.0 - in_view + in_view * denied)
+    pairs = ((clear, 1.0), (seen, denied))
+    found = np.stack([np.where(count > 0, mean * beside, one) for one, beside in pairs], axis=-1)
+    return np.asarray(np.maximum(found, TINY))
+
+
+@lru_cache
+def _noticed_shares(noticed_s: float, sides: int) -> FloatArray:
+    """Return P(a window notices a vehicle) of all hidden parts, shape (parts, ..., parts)."""
+    middle_s = 0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1])))
+    own = np.concatenate([[0.0] * FIRST_BIN, 1.0 / (1.0 + (middle_s / noticed_s) ** 4)])
+    shares = own
+    for _ in range(sides - 1):
+        shares = np.maximum(shares[..., None], own)
+    return shares
+
+
+def noticed(nats: float, sides: int, street: StreetModel) -> FloatArray:
+    r"""Return the likelihoods of a window of the hidden parts, against no vehicle: (parts, ..., parts).
+
+    .. math:: \ell = 1 - a(t) + a(t)\, e^{r}, \qquad a(t) = \frac{1}{1 + (t / T_n)^4}
+
+    with the log-odds r of a hidden vehicle by the window, and the time t until the next one comes into view.
+    """
+    shares = _noticed_shares(street.noticed_s, sides)
+    return 1.0 - shares + shares * math.exp(min(max(nats, -CERTAIN_NATS), CERTAIN_NATS))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorTrust:
+    """Whether a sensor works, jointly with the state of the street, and its last look."""
+
+    works: FloatArray  # The joint with "it works", of the shape of the belief
+    stamp_ns: int
+    miss_rate: float
+    # A look that begins a run weighs as one, and pays ahead for the next ones, which repeat its misses.
+    prepaid: float = 1.0
+    begins: bool = True
+
+    def next_weight(self, stamp_ns: int, street: StreetModel) -> tuple[float, float, bool]:
+        """Return the weight of the sensor's next look, what is prepaid after it, and whether it begins a run.
+
+        Looks a correlation time apart weigh as one each, any number within one as one together, and looks at
+        a steady rate as their time over it, in which the first one stands for an interval as well.
+        """
+        credit = seconds(stamp_ns - self.stamp_ns) / street.look_s
+        if credit >= 1.0:
+            return 1.0, 1.0, True
+        credit *= 2.0 if self.begins else 1.0
+        return max(credit - self.prepaid, 0.0), max(self.prepaid - credit, 0.0), False
+
+
+# No slots: marginals are computed once, and read by every entity and cue.
+@dataclass(frozen=True, eq=False)
+class JointBelief:
+    """The belief of all sides, what each source alone would make of it, and how far sensors are trusted."""
+
+    weights: FloatArray  # shape (states, ..., states, 2)
+    alone: dict[str, FloatArray] = field(default_factory=dict)  # The same shape, by the source
+    trust: dict[str, SensorTrust] = field(default_factory=dict)  # By the sensor
+
+    @classmethod
+    def expected(cls, prior: StreetPrior) -> "JointBelief":
+        """Return the belief before any evidence."""
+        return cls(prior.weights)
+
+    def carried(self, prior: StreetPrior, street: StreetModel, step_ns: int) -> "JointBelief":
+        """Return the belief a time step later, in which sensors fail and recover."""
+        weights, rate_hz = (
+            prior.carry(self.weights, street, step_ns),
+            1.0 / street.fails_s + 1.0 / street.recovers_s,
+        )
+        changed = -math.expm1(-rate_hz * seconds(step_ns)) * weights / (street.recovers_s * rate_hz)
+        kept = math.exp(-rate_hz * seconds(step_ns))
+        trust = {
+            name: replace(one, works=kept * prior.carry(one.works, street, step_ns) + changed)
+            for name, one in self.trust.items()
+        }
+        alone = {name: prior.carry(one, street, step_ns) for name, one in self.alone.items()}
+        return replace(self, weights=weights, alone=alone, trust=trust)
+
+    def times(self, evidence: FloatArray) -> "JointBelief":
+        """Return the belief after evidence, a likelihood of every state."""
+        weights = self.weights * evidence
+        total = weights.sum()
+        trust = {name: replace(one, works=one.works * evidence / total) for name, one in self.trust.items()}
+        return replace(self, weights=weights / total, trust=trust)
+
+    def read(
+        self,
+        source: str,
+        reading: FloatArray,
+        prior: StreetPrior,
+        sides: Sequence[int],
+        share: float = 1.0,
+        heard: float = 1.0,
+    ) -> "JointBelief":
+        r"""Return the belief after a reading of some sides: the joint of their parts, (parts, ..., parts, 2).
+
+        .. math:: e = (q / \bar n)^a
+
+        with the share a of what is new in a reading that is believed at once. The first reading of a source
+        is new as a whole.
+        """
+        before = self.alone.get(source)
+        if before is None:
+            before, share = prior.weights, 1.0
+        others = tuple(k for k in range(self.sides) if k not in sides)
+        expected = np.maximum(_by_part(before).sum(axis=others), TINY)
+        ratio, none = reading / expected, (slice(FIRST_BIN),) * len(sides)
+        if heard < 1.0:
+            quiet = reading[none].sum() / expected[none].sum()
+            mixed = heard * ratio + (1.0 - heard) * quiet
+            mixed[none] = ratio[none]
+            ratio = mixed / (mixed * expected).sum()
+        ratio = np.expand_dims(ratio**share, others)
+        shape = (*[PARTS] * self.sides, 2)
+        every = _spread(np.broadcast_to(ratio, shape))
+        return replace(self.times(every), alone=self.alone | {source: _normed(before * every)})
+
+    def told(self, by_part: FloatArray) -> "JointBelief":
+        """Return the belief after likelihoods of the parts, shape (parts, ..., parts, 2)."""
+        return self.times(_spread(by_part))
+
+    def at_prior(self, before: FloatArray, after: FloatArray) -> "JointBelief":
+        """Return the belief at another prior than it was held at, each of the shape of the belief."""
+        factor = after / before
+        alone = {name: _normed(one * factor) for name, one in self.alone.items()}
+        return replace(self.times(factor), alone=alone)
+
+    def looked(
+        self, sensor: str, answer: Absent | Present, stamp_ns: int, street: StreetModel
+    ) -> "JointBelief":
+        r"""Return the belief after a look of a sensor at all that is in line of sight.
+
+        .. math:: e(s) = w_v\, \ell_v^\kappa + (1 - w_v)\, \ell_0^\kappa
+
+        with the probability w that the sensor works, the likelihoods of a sensor that works and of one that
+        does not, and the weight :math:`\kappa` of a look that repeats the misses of those before.
+        """
+        miss, clutter = answer.miss_rate, answer.clutter_rate
+        last, run = self.trust.get(sensor), (1.0, 1.0, True)
+        if last is None:
+            last = SensorTrust(street.works * self.weights, stamp_ns, miss)
+        else:
+            run = last.next_weight(stamp_ns, street)
+        # Of a look with something in view, with nothing in view, and of a sensor that has failed.
+        told = np.array([miss * (1.0 - clutter), 1.0 - clutter, 1.0])
+        if isinstance(answer, Present):
+            told = np.array([1.0 - told[0], clutter, clutter])
+        in_view, clear, failed = (np.maximum(told, TINY) ** run[0]).tolist()
+        works = last.works * np.where(_in_view(self.sides), in_view, clear)
+        after = works + (self.weights - last.works) * failed
+        others = replace(self, trust={name: one for name, one in self.trust.items() if name != sensor})
+        seen = others.times(after / np.maximum(self.weights, np.finfo(float).tiny))
+        own = SensorTrust(works / after.sum(), stamp_ns, miss, *run[1:])
+        return replace(seen, trust={**seen.trust, sensor: own})
+
+    def emerged(
+        self, side: int, residual: float, follows: float, apart: bool, street: StreetModel
+    ) -> "JointBelief":
+        r"""Return the belief after a vehicle has come into view past the edge of a side.
+
+        .. math:: p' = (1 - r)\, E[p\, e] + r\, p, \qquad e(b) = e^{-t_b / T_e}
+
+        with the chance r that it was another vehicle than the one believed there, and E, which puts it in
+        view and another one behind it as often as vehicles follow. It may have been believed on another side,
+        which the sound has confused with this one. Where one was believed `apart` on another side, its
+        marginal stays: two vehicles are not one of unknown side.
+        """
+        starts_s = np.array((0.0, *COMING_S[:-1]))
+        likelihood = np.concatenate([[street.unheard] * FIRST_BIN, np.exp(-starts_s / street.emergence_s)])
+        gaps = np.diff(np.minimum((0.0, *COMING_S), street.follows_s)) / street.follows_s
+        behind = np.concatenate([[1.0 - follows], [0.0], follows * gaps])
+        others = [k for k in range(self.sides) if k != side and not apart]
+        if apart:
+            likelihood = np.ones(PARTS)
+
+        def came(weights: FloatArray) -> FloatArray:
+            every = [(1.0 - street.side_confusion if others else 1.0) * weights]
+            every += [street.side_confusion / len(others) * weights.swapaxes(side, k) for k in others]
+            split = np.moveaxis(np.sum(every, axis=0), side, 0).reshape(PARTS, 2, -1)
+            return np.asarray(likelihood @ split.sum(axis=1))
+
+        total = float(came(self.weights).sum())
+
+        def after(weights: FloatArray) -> FloatArray:
+            front = np.moveaxis(weights, side, 0)
+            mixed = residual * front.reshape(PARTS, 2, -1)
+            mixed[:, 1] += (1.0 - residual) / total * behind[:, None] * came(weights)
+            return np.ascontiguousarray(np.moveaxis(mixed.reshape(front.shape), 0, side))
+
+        weights = after(self.weights)
+        trust = {name: replace(one, works=after(one.works)) for name, one in self.trust.items()}
+        # What was heard until now was the vehicle that is in view.
+        return JointBelief(weights, dict.fromkeys(self.alone, weights), trust)
+
+    @property
+    def sides(self) -> int:
+        """Number of approach sides."""
+        return self.weights.ndim - 1
+
+    @cached_property
+    def by_part(self) -> FloatArray:
+        """Joint of the hidden parts and of whether anything is in view, shape (parts, ..., parts, 2)."""
+        return _by_part(self.weights)
+
+    @cached_property
+    def hidden(self) -> FloatArray:
+        """Marginals of the hidden parts, shape (sides, parts)."""
+        every, sides = self.by_part.sum(axis=-1), range(self.sides)
+        return np.stack([every.sum(axis=tuple(j for j in sides if j != k)) for k in sides])
+
+    @cached_property
+    def emerged_from(self) -> FloatArray:
+        """P(one from a side is in view, and none comes there), shape (sides,)."""
+        axes = [tuple(j for j in range(self.sides + 1) if j != k) for k in range(self.sides)]
+        by_side = [self.weights.sum(axis=one).reshape(PARTS, 2) for one in axes]
+        return np.array([one[~COMES, 1].sum() for one in by_side])
+
+    @property
+    def in_view(self) -> float:
+        """P(anything is in view)."""
+        return float(self.by_part[..., 1].sum())
+
+    @cached_property
+    def explanations(self) -> tuple[float, float, float]:
+        """P(hidden), P(visible), P(none) of eq. (6): one is hidden anywhere, else one in view, else none."""
+        visible = float(self.by_part[(*[NONE] * self.sides, 1)])
+        none = float(self.by_part[(*[NONE] * self.sides, 0)])
+        return max(1.0 - visible - none, 0.0), visible, none
+
+    @cached_property
+    def none_comes(self) -> float:
+        """P(no vehicle comes into view from any side within eight seconds)."""
+        return float(self.by_part[(slice(FIRST_BIN),) * self.sides].sum())
+
+
+def _normed(weights: FloatArray) -> FloatArray:
+    return np.asarray(weights / weights.sum())

@@ -1,0 +1,154 @@
+"""The numbers of the belief about a street: each has a symbol, a unit and a source, and stands in a file."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.serialisation import Layout, Via, decode
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A number of a street model, and how it was found."""
+
+    value: float
+    symbol: str
+    unit: str
+    origin: Literal["fitted", "measured", "assumed", "given"]
+    why: str  # What chose it
+
+
+@dataclass(frozen=True, slots=True)
+class StreetNumbers:
+    """The numbers of a street model by their names, as a file holds them."""
+
+    LAYOUT: ClassVar = Layout("worldstate.StreetModel", "1.0.0")
+
+    numbers: Mapping[str, Number]
+
+
+_SHIPPED = decode(
+    StreetNumbers, json.loads((files("worldstate") / "data/street_model.json").read_text()), "street_model"
+)
+
+
+def number(name: str) -> Any:
+    """Return a field whose default is the number that ships."""
+    return field(default=_SHIPPED.numbers[name].value)
+
+
+@dataclass(frozen=True, slots=True)
+class StreetModel:
+    """Numbers of the belief about the approach sides; without arguments those that ship.
+
+    `described` holds what each is: its symbol, its unit, whether it was fitted, measured, assumed or given by
+    the caller, and what chose it.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is not positive, or not finite.
+
+    Examples
+    --------
+    >>> street = StreetModel(look_s=1.0)
+    >>> [(one.value, one.origin) for one in (street.described["look_s"], street.described["works"])]
+    [(1.0, 'given'), (0.98, 'assumed')]
+    """
+
+    passage_s: float = number("passage_s")
+    arrival_s: float = number("arrival_s")
+    far_s: float = number("far_s")
+    leak: float = number("leak")
+    reading_s: float = number("reading_s")
+    reading_gain: float = number("reading_gain")
+    by_sound: float = number("by_sound")
+    window_gain: float = number("window_gain")
+    window_s: float = number("window_s")
+    noticed_s: float = number("noticed_s")
+    look_s: float = number("look_s")
+    works: float = number("works")
+    fails_s: float = number("fails_s")
+    recovers_s: float = number("recovers_s")
+    emergence_s: float = number("emergence_s")
+    unheard: float = number("unheard")
+    follows: float = number("follows")
+    follows_s: float = number("follows_s")
+    follows_like: float = number("follows_like")
+    traffic_like: float = number("traffic_like")
+    traffic_s: float = number("traffic_s")
+    traffic_nats: float = number("traffic_nats")
+    beside_s: float = number("beside_s")
+    beside_nats: float = number("beside_nats")
+    masked_s: float = number("masked_s")
+    death: float = number("death")
+    births: float = number("births")
+    clutter: float = number("clutter")
+    assumed_certainty: float = number("assumed_certainty")
+    hidden_return: float = number("hidden_return")
+    width_change: float = number("width_change")
+    size_spread: float = number("size_spread")
+    misread: float = number("misread")
+    side_confusion: float = number("side_confusion")
+    doubt: float = number("doubt")
+    gate_rad: float = number("gate_rad")
+    edge_std_rad: float = number("edge_std_rad")
+    range_m: float = number("range_m")
+    range_spread: float = number("range_spread")
+    closing_hz: float = number("closing_hz")
+    acceleration: float = number("acceleration")
+    unseen_s: float = number("unseen_s")
+    known_m: float = number("known_m")
+    speed_mps: float = number("speed_mps")
+    label_gain: float = number("label_gain")
+    heard_path: float = number("heard_path")
+    heard_std_rad: float = number("heard_std_rad")
+    seen_path: float = number("seen_path")
+    seen_std_rad: float = number("seen_std_rad")
+    pace_spread: float = number("pace_spread")
+    place_share: float = number("place_share")
+    extent_rad: float = number("extent_rad")
+    past_std_rad: float = number("past_std_rad")
+    lost_rad: float = number("lost_rad")
+    high_risk: float = number("high_risk")
+    birth: float = number("birth")
+    closing_std_hz: float = number("closing_std_hz")
+    turn_share: float = number("turn_share")
+    excess_low_db: float = number("excess_low_db")
+    excess_high_db: float = number("excess_high_db")
+    sources: StreetNumbers = field(default=_SHIPPED, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in _SHIPPED.numbers:
+            in_range(name, getattr(self, name), 0.0, 1e6, open_low=True)
+
+    @property
+    def described(self) -> dict[str, Number]:
+        """Every number with its source, by its name."""
+        pairs = ((name, one, getattr(self, name)) for name, one in self.sources.numbers.items())
+        given = "given by the caller"
+        return {
+            name: one if one.value == now else replace(one, value=now, origin="given", why=given)
+            for name, one, now in pairs
+        }
+
+    @classmethod
+    def of(cls, stored: StreetNumbers) -> "StreetModel":
+        """Return the model of a file: of a number that it does not hold, the one that ships."""
+        told = {name: one for name, one in stored.numbers.items() if name in _SHIPPED.numbers}
+        for name, one in told.items():
+            if one.unit != (unit := _SHIPPED.numbers[name].unit):
+                raise InvalidArgumentError(f"{name}: expected a number in {unit!r}, got {one.unit!r:.40}")
+        values = {name: one.value for name, one in told.items()}
+        return cls(**values, sources=StreetNumbers({**_SHIPPED.numbers, **told}))
+
+
+def _stored(street: StreetModel) -> StreetNumbers:
+    return StreetNumbers(street.described)
+
+
+# A street model as files and checkpoints hold it.
+StoredStreet: TypeAlias = Annotated[StreetModel, Via(StreetNumbers, _stored, StreetModel.of)]
