@@ -9,6 +9,11 @@ class, and everything of the library is imported from `worldstate` itself:
 - the signature model is any object with ``evidence(feature)``;
 - the camera is any object with ``ask`` and ``sightings``, here the detector behind a pinhole camera.
 
+Windows of a second, one every 0.1 s, repeat most of their sound. Of each the filter takes what is new in its
+posterior: a steady sound is believed as much as one window of it, however long it lasts. An image is a look,
+and empty looks accumulate until a broken camera is the likelier reason. The alarm is one threshold on the
+log-odds of a hidden vehicle, and names the likelier side.
+
 Sound and images are simulated: a plane wave of noise and a bright block, nothing that a model should be
 trained on.
 
@@ -19,6 +24,7 @@ Run it:
 
 import math
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,6 +43,7 @@ from worldstate import (
     WorldFilter,
     WorldState,
     nanoseconds,
+    uncalibrated_policy,
 )
 
 RATE_HZ = 16_000
@@ -154,7 +161,8 @@ def run(duration_s: float = 6.0, seed: int = 1) -> Iterator[WorldState]:
     """Yield the world-state after every tenth of a second, from the first full one on."""
     array, camera, rng = my_array(), LiveCamera(BrightBlocks()), np.random.default_rng(seed)
     adapter = AcousticAdapter(array, RATE_HZ, PatternSignature(), vision=camera)
-    world = WorldFilter()
+    # Assumed: an advisory from P(hidden) = 0.8 on. No budget of false alarms was measured for it.
+    world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=0.8))
     for hop in range(round(duration_s * 10)):
         camera.look(image((hop + 1) / 10))
         for measurement in adapter.measure(sound(array, hop / 10, rng)):

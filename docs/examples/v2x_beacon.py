@@ -6,6 +6,9 @@ plays elsewhere: its signature is the received power against what the claimed ra
 co-evidence is the object that the camera should see where the beacon says that it is. Nothing in `abduction`
 knows of radio: it is given log-likelihoods and an answer.
 
+Windows of sound repeat one another, and the filter takes what is new in their posterior. Every beacon has an
+error of its own once the vehicle has moved on by some metres, so that beacons are multiplied instead.
+
 Run it:
 
     python docs/examples/v2x_beacon.py
@@ -20,6 +23,7 @@ from worldstate import (
     Approach,
     Bearing,
     CoEvidenceChannel,
+    FilterSettings,
     Measurement,
     NotUsable,
     Present,
@@ -33,6 +37,8 @@ from worldstate import (
 )
 
 DIRECTIONS = ("left", "right")
+# Assumed: shadowing repeats for 0.3 s, 2 m at the pace of a side street.
+SETTINGS = FilterSettings(windows="likelihood", window_s=0.3)
 
 # What each kind of station should look like to a camera; a person in a car park need not be seen at all.
 EXPECTED_LABELS: dict[str, Collection[str]] = {
@@ -219,10 +225,12 @@ def approach_from_left(duration_s: float = 6.0, t0_s: float = 4.0) -> list[Beaco
     return beacons
 
 
-def run(beacons: list[Beacon], camera: CoEvidenceChannel | None) -> Iterator[WorldState]:
+def run(
+    beacons: list[Beacon], camera: CoEvidenceChannel | None, settings: FilterSettings = SETTINGS
+) -> Iterator[WorldState]:
     """Yield the world-state after every beacon."""
     # A threshold of this modality's own; a budget would have to be calibrated for it.
-    world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=0.7))
+    world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=0.7), settings=settings)
     for measurement in BeaconAdapter(vision=camera).measure(beacons):
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         yield world.state

@@ -73,14 +73,15 @@ class LoudSide:
 
 @contextmanager
 def risk_table(target: str) -> Iterator[Callable[[WorldState], None]]:
-    """Open an exporter: risk and advisory of every side as CSV."""
+    """Open an exporter: risk and advisory of every side, and whether they may be acted on, as CSV."""
     with Path(target).open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
-        table.writerow(["time_s", "side", "risk", "advisory"])
+        table.writerow(["time_s", "side", "risk", "advisory", "usable", "why_not"])
 
         def export(state: WorldState) -> None:
             for cue in state.cues:
-                row = state.stamp_ns / 1e9, cue.direction, round(cue.risk, 4), cue.advisory is not None
-                table.writerow(row)
+                risk = None if cue.risk is None else round(cue.risk, 4)
+                stated = cue.direction, risk, cue.advisory is not None, cue.usable, "; ".join(cue.why_not)
+                table.writerow([state.stamp_ns / 1e9, *stated])
 
         yield export
