@@ -385,3 +385,24 @@ def test_a_relation_says_since_when_it_holds_and_until_when_it_did() -> None:
     assert told[94] == {"emerged_from": (2 * 10**9, None)}
     edges = world.predict(0.1).state.graph().edges(data=True)
     assert [edge["since_ns"] for _, _, edge in edges] == [2 * 10**9]
+
+
+@pytest.mark.parametrize("reads", [True, False])
+@pytest.mark.parametrize("none", [2.0, 4.0])
+def test_one_silent_in_view_makes_no_hidden_vehicle(reads: bool, none: float) -> None:
+    """A person in view for ten seconds, of whom the sound has nothing."""
+    share = np.full(len(GROUPS), 0.02)
+    share[[GROUPS.index("none"), GROUPS.index("seen")]] = 0.5, 0.2
+    groups = np.full((2, len(GROUPS)), 0.002)
+    groups[:, [GROUPS.index("none"), GROUPS.index("seen")]] = 0.95, 0.1 / none
+    reading = SequenceReading(
+        groups / groups.sum(axis=1, keepdims=True), share / share.sum(), 0.0, SequenceAlarm(-0.5, 20.0)
+    )
+    quiet, found = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, none), Present(0.04, 0.01)
+    person, world, off = Sighting(0.1, 0.02, "person", 0.9), WorldFilter(), NotUsable("-")
+    for number in range(1, 101):
+        look = Look("camera", number * 10**8, found)
+        said = Measurement(number * 10**8, quiet, found, off, off, (person,), look=look)
+        world = world.update(replace(said, sequence=reading if reads else None))
+        assert not any(cue.advisory for cue in world.state.cues)
+    assert max(world.belief.hidden) < 0.05
