@@ -157,7 +157,6 @@ _HORIZONS = [COMING_S.index(end_s) for end_s in HORIZONS_S]
 TAIL = 0.05  # Of either end: intervals hold nine of ten
 _LEVELS = np.array([[TAIL], [1.0 - TAIL]])
 SMOOTHED_HOPS, HELD_HOPS = 3, 10
-_OTHER = GROUPS.index("other")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,35 +223,6 @@ class SequenceAlarm:
     onsets_per_hour: float  # Budget: what was asked, or the curve's promise if a share was asked
     asked_alpha: Probability | None = field(default=None, metadata=ADDED)  # In place of a budget
     promise: AlarmPromise | None = field(default=None, metadata=ADDED)  # None if no curve was measured
-
-    def deciding(
-        self, log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
-    ) -> FloatArray:
-        r"""Return what is held against the threshold, nats.
-
-        The log-odds, and of the less likely side at most
-
-        .. math:: \gamma + \log \frac{P(\text{comes here})}{P(\text{comes on the other side, not here})}
-
-        Where it is not known from which side one vehicle comes, both are likely; that two come is told by how
-        rarely the other one is believed to come alone.
-
-        Shapes: log_odds (..., 2), groups (..., 2, groups), learned_nats (2,): what was learned of the traffic
-        of a side, which `groups` hold and `log_odds` do not.
-
-        Examples
-        --------
-        >>> either = np.zeros((1, 2, len(GROUPS)))
-        >>> either[..., [3, GROUPS.index("other")]] = 0.45, 0.45
-        >>> SequenceAlarm(-1.0, 30.0).deciding(np.array([[0.1, 0.0]]), either).round(3).tolist()
-        [[0.1, -1.0]]
-        """
-        here, elsewhere = groups[..., : len(COMING_S)].sum(axis=-1), groups[..., _OTHER]
-        apart = np.log(np.maximum(here, TINY)) - np.log(np.maximum(elsewhere, TINY)) - learned_nats
-        likelier = log_odds >= log_odds.max(axis=-1, keepdims=True)
-        # One that is exactly as likely alone as here is not named.
-        least = self.threshold_nats + np.where(apart > 0.0, apart, np.minimum(apart, -TINY))
-        return np.asarray(np.where(likelier, log_odds, np.minimum(log_odds, least)))
 
 
 def _last(rates: FloatArray, most: float) -> int:

@@ -28,7 +28,7 @@ from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks, born
 from worldstate.core.acoustic_update import association_probability
 from worldstate.core.birth_death import hidden_on
-from worldstate.core.street_belief import ArrivalRate, StreetBelief, informed
+from worldstate.core.street_belief import ArrivalRate, StreetBelief, informed, of_two
 from worldstate.ground import LEAST_HEARD
 from worldstate.measurement import CameraLook, Heard, Look, Sector
 
@@ -193,12 +193,13 @@ def test_behind_one_that_has_come_into_view_another_comes_as_often_as_usual(seed
 @given(SEEDS, st.tuples(LARGE, LARGE), st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)))
 @settings(max_examples=20)
 def test_the_alarm_takes_learned_traffic_out_of_what_both_sides_allow(seed, log_odds, learned) -> None:
-    alarm, groups = SequenceAlarm(0.3, 20.0), drawn(seed)
+    groups = drawn(seed)
     busy = groups.copy()
     busy[:, :COMING] *= np.exp(learned)[:, None]
+    nats, alone = np.array(log_odds), GROUPS.index("other")
     one, other = (
-        alarm.deciding(np.array(log_odds), groups),
-        alarm.deciding(np.array(log_odds), busy, np.array(learned)),
+        of_two(nats, said[:, :COMING].sum(axis=1), said[:, alone], nats, 0.3, moved)
+        for said, moved in ((groups, np.zeros(2)), (busy, np.array(learned)))
     )
     np.testing.assert_allclose(one, other, atol=1e-9)
     # Of the less likely side no more than that it is likelier than that only the other one comes.

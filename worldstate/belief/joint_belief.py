@@ -37,7 +37,7 @@ PARTS = FIRST_BIN + BINS
 STATES = 2 * PARTS  # Of a side: hidden part, then whether one from there is in view
 COMES = np.arange(PARTS) >= FIRST_BIN
 _GROUP = {name: k for k, name in enumerate(GROUPS)}
-_SEEN, _OTHER, _LAST_BIN = _GROUP["seen"], _GROUP["other"], STATES - 2
+_SEEN, _OTHER = _GROUP["seen"], _GROUP["other"]
 _DISTANT = [_GROUP["rising"], _GROUP["falling"]]
 _ABSENT = [_GROUP["none"], _GROUP["other"], _GROUP["past"], _SEEN]
 
@@ -152,7 +152,7 @@ def _street_prior(content: bytes, street: StreetModel) -> StreetPrior:
 
 
 def _by_part(weights: FloatArray) -> FloatArray:
-    """Return the parts that a reading speaks of: (parts, ..., parts, 2), last whether anything is in view."""
+    """Return the parts that a reading is about: (parts, ..., parts, 2), last whether anything is in view."""
     sides = weights.ndim - 1
     split = weights.reshape(*[PARTS, 2] * sides, 2)
     nothing: list[slice | int] = [slice(None), 0] * sides
@@ -319,10 +319,8 @@ class JointBelief:
 
     def carried(self, prior: StreetPrior, street: StreetModel, step_ns: int) -> "JointBelief":
         """Return the belief a time step later, in which sensors fail and recover."""
-        weights, rate_hz = (
-            prior.carry(self.weights, street, step_ns),
-            1.0 / street.fails_s + 1.0 / street.recovers_s,
-        )
+        weights = prior.carry(self.weights, street, step_ns)
+        rate_hz = 1.0 / street.fails_s + 1.0 / street.recovers_s
         changed = -math.expm1(-rate_hz * seconds(step_ns)) * weights / (street.recovers_s * rate_hz)
         kept = math.exp(-rate_hz * seconds(step_ns))
         trust = {
@@ -350,10 +348,14 @@ class JointBelief:
     ) -> "JointBelief":
         r"""Return the belief after a reading of some sides: the joint of their parts, (parts, ..., parts, 2).
 
-        .. math:: e = (q / \bar n)^a
+        .. math:: e = (q' / \bar n)^a, \qquad
+                  \frac{q'(r)}{\bar n(r)} \propto
+                  s\, \frac{q(r)}{\bar n(r)} + (1 - s)\, \frac{q(0)}{\bar n(0)}
 
-        with the share a of what is new in a reading that is believed at once. The first reading of a source
-        is new as a whole.
+        with the share a of what is new in a reading that is believed at once, and the chance s that the
+        source would have heard a vehicle that comes (`heard`): a masked one sounds as if it were not there.
+        Parts in which none comes, 0, count together and stay. The first reading of a source is new as a
+        whole.
         """
         before = self.alone.get(source)
         if before is None:
@@ -418,7 +420,7 @@ class JointBelief:
 
         with the chance r that it was another vehicle than the one believed there, and E, which puts it in
         view and another one behind it as often as vehicles follow. It may have been believed on another side,
-        which the sound has confused with this one. Where one was believed `apart` on another side, its
+        which the sound has confused with this one. If one was believed `apart` on another side, its
         marginal stays: two vehicles are not one of unknown side.
         """
         starts_s = np.array((0.0, *COMING_S[:-1]))

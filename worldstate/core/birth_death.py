@@ -74,8 +74,7 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
 
 def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
     """Return the belief of the sides without a vehicle that has just come into view: it has a track."""
-    sides, since_ns = memory.sides, memory.belief.since_emerged_ns(memory.stamp_ns)
-    found = [ns <= nanoseconds(site.street.beside_s) for ns in since_ns]
+    sides, found = memory.sides, memory.belief.emerged_recently(memory.stamp_ns, site.street)
     emerged = tuple(0.0 if own else one for own, one in zip(found, sides.emerged, strict=True))
     return replace(sides, emerged=emerged)
 

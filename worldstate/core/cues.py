@@ -41,12 +41,8 @@ class SideAdvisory:
 
 def note_source(memory: Memory, measurement: Measurement, model: FilterModel) -> None:
     """Note how a source is, and what its window alone makes of the policy's reference prior."""
-    source, stamp_ns, heard = (
-        measurement.source,
-        measurement.stamp_ns,
-        heard_beside(memory, measurement, model.site.street),
-    )
-    domain = measurement.domain
+    source, stamp_ns, domain = measurement.source, measurement.stamp_ns, measurement.domain
+    heard = heard_beside(memory, measurement, model.site.street)
     fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
     last = memory.sources.get(source)
     since_ns = last.heard_ns if last is not None and last.heard.reason == heard.reason else stamp_ns
@@ -83,10 +79,7 @@ def raised_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory 
     None is raised in the first second of a sequence, which was counted in no budget.
     """
     belief, stamp_ns = memory.belief, memory.stamp_ns
-    threshold, raised = (
-        belief.threshold_nats(model.policy, model.site.street),
-        list[SideAdvisory | None](),
-    )
+    threshold, raised = belief.threshold_nats(model.policy, model.site.street), list[SideAdvisory | None]()
     pairs = zip(belief.alarm_ends_ns(stamp_ns), belief.decided_at(stamp_ns), strict=True)
     for end_ns, decided in pairs:
         stands = end_ns is not None and memory.last.no_sequence != TOO_FEW
@@ -129,14 +122,12 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
         return "less than a second of sound: no alarm is raised yet"
     if not belief.has_news(memory.stamp_ns):
         return "nothing was measured for a second"
-    log_odds = list(belief.log_odds(model.context, model.site.street).values())
-    learned, threshold = (
-        belief.read_nats(model.context, model.site.street)[side],
-        belief.threshold_nats(model.policy, model.site.street),
-    )
-    if log_odds[-1][side] < threshold <= log_odds[-1][side] + learned:
+    context, street = model.context, model.site.street
+    nats, learned = belief.alarm_nats(context, street), belief.read_nats(context, street)[side]
+    threshold = belief.threshold_nats(model.policy, street)
+    if nats[side] < threshold <= nats[side] + learned:
         return "only by the traffic learned here, which is left out of the alarm"
-    if log_odds[-1][side] < log_odds[-1].max():
+    if nats[side] < nats.max():
         return "one vehicle is likelier than two, and likelier on the other side"
     if belief.has_times:
         return "it is not sure to come within three seconds, or not for long enough"
