@@ -272,17 +272,27 @@ def test_predict_is_that_of_an_extended_kalman_filter(state, spread, seed, time_
     assert after.covariance == pytest.approx(kalman.P, abs=1e-12)
 
 
-@given(states, spreads, turns, st.floats(-3.1, 3.1), st.floats(0.01, 1.0), st.sampled_from([0, 2]))
-def test_update_is_that_of_an_extended_kalman_filter(state, spread, seed, value, std, row):
-    belief = correlated(state, spread, seed)
+@given(
+    states,
+    spreads,
+    turns,
+    st.floats(-3.1, 3.1),
+    st.floats(0.01, 1.0),
+    st.sampled_from([(0, 0.0), (0, 0.3), (0, 1.0), (2, 0.0)]),
+)
+def test_update_is_that_of_an_extended_kalman_filter(state, spread, seed, value, std, measured):
+    """A bearing of some time ago measures the azimuth less its rate times that time."""
+    (row, ago_s), belief = measured, correlated(state, spread, seed)
     kalman, pick = engine(belief), np.eye(4)[row : row + 1]
+    if row == 0:
+        pick[0, 1] = -ago_s
     kalman.update(
         np.array([value]),
         HJacobian=lambda x: pick,
-        Hx=lambda x: x[row : row + 1],
+        Hx=lambda x: pick @ x,
         R=np.array([[std**2]]),
         residual=(lambda z, x: wrap_angle(z - x)) if row == 0 else np.subtract,
     )
-    after = update(belief, row, value, std, 1.0)
+    after = update(belief, row, value, std, 1.0, ago_s)
     assert wrapped(after.mean - kalman.x) == pytest.approx(0.0, abs=1e-12)
     assert after.covariance == pytest.approx(kalman.P, abs=1e-12)

@@ -447,20 +447,59 @@ def test_a_street_on_which_nobody_comes_is_watched_and_expected_to_stay_so() -> 
     assert WorldFilter.from_dict(world.to_dict()).state == world.state
 
 
-def test_who_came_into_view_unseen_is_where_it_sounds() -> None:
+@pytest.mark.parametrize("believed", ["left", "right"])
+def test_what_came_into_view_unseen_is_where_its_sound_is(believed: str) -> None:
+    """Peaks move it to where it is, from whichever side it was believed to come.
+
+    A vehicle drives from 28 degrees left to 46 degrees right. The walls reflect: one peak in seven is an
+    image, the first half second has only images of the other side, and each peak is of the last second.
+    """
+    k, readings = ("left", "right").index(believed), list[SequenceReading]()
     coming, seen = (np.full((2, len(GROUPS)), 1e-3) for _ in range(2))
-    coming[0, GROUPS.index("coming_0.5s")] = seen[0, GROUPS.index("seen")] = 1.0
-    coming[1, GROUPS.index("other")] = seen[1, GROUPS.index("other")] = 1.0
-    world, azimuths = WorldFilter(), np.radians(np.linspace(20.0, -50.0, 25))
+    coming[k, GROUPS.index("coming_0.5s")], seen[:, GROUPS.index("seen")] = 0.7, 1.0
+    coming[1 - k, GROUPS.index("coming_0.5s")] = 0.25
+    coming[:, GROUPS.index("other")] = coming[::-1, : len(COMING_S)].sum(axis=1)
+    readings = [SequenceReading(one / one.sum(axis=1, keepdims=True), SHARE) for one in (coming, seen)]
+    world, azimuths = WorldFilter(settings=EXACT), np.radians(np.linspace(28.0, -46.0, 25))
     for hop in range(30):
-        groups = coming if hop < 5 else seen
-        said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, None)
-        # Stated as where walls reflect: one peak in seven is another one, the others are off by 7 degrees.
-        bearing = SILENT if hop < 5 else Bearing(float(azimuths[hop - 5]), math.radians(20.0), 3.0)
-        world = world.update(replace(heard(hop, said), bearing=bearing))
-        if hop >= 15:
-            [car] = [one for one in world.state.entities if one.direction == "left"]
-            assert car.azimuth_rad == pytest.approx(azimuths[hop - 5], abs=math.radians(10.0))
+        bearing: Bearing | NotUsable = SILENT
+        if hop >= 5:
+            late = math.radians(-48.0) if hop < 10 else float(azimuths[hop - 8])
+            bearing = Bearing(late, math.radians(20.0), 3.0)
+        world = world.update(replace(heard(hop, readings[hop >= 5]), bearing=bearing))
+        if hop >= 22:
+            (car,) = world.state.entities
+            assert car.status == "emerged"
+            assert car.azimuth_rad == pytest.approx(azimuths[hop - 5], abs=math.radians(15.0))
+
+
+def test_what_was_in_view_by_its_sound_is_there_until_it_can_have_passed_or_a_camera_looks() -> None:
+    """The sound of one that leaves the view ends before the vehicle does; a look ends it at once."""
+    said = approach()[:45]
+    gone = np.full((2, len(GROUPS)), 1e-4)
+    gone[:, GROUPS.index("none")] = 1.0
+    said += [SequenceReading(gone / gone.sum(axis=1, keepdims=True), SHARE)] * 40
+    world = run(WorldFilter(settings=EXACT), [heard(hop + 1, one) for hop, one in enumerate(said)])
+    (before,) = world[44].state.entities
+    for since_s in (0.5, 1.0, 1.5):
+        (now,) = world[44 + round(10 * since_s)].state.entities
+        expected = before.existence_probability * math.exp(-since_s / STREET.passage_s)
+        assert now.status == "emerged" and now.id == before.id
+        assert now.existence_probability == pytest.approx(expected, abs=0.01)
+    looked = world[49].update(heard(51, said[51], Absent(0.04, 0.01)))
+    assert not [one for one in looked.state.entities if one.existence_probability > 0.1]
+
+
+def test_what_sounds_in_view_is_an_entity_though_it_was_none_before_if_no_camera_looks() -> None:
+    unsure = np.full((2, len(GROUPS)), 1e-4)
+    unsure[:, GROUPS.index("none")] = 1.0
+    unsure[0, GROUPS.index("coming_0.5s")] = 0.8
+    before = SequenceReading(unsure / unsure.sum(axis=1, keepdims=True), SHARE)
+    said = [before] * 5 + approach()[35:50]
+    for answer, found in ((UNASKED, 1), (Absent(0.04, 0.01), 0)):
+        measured = [heard(hop, one, UNASKED if hop < 5 else answer) for hop, one in enumerate(said)]
+        world = run(WorldFilter(settings=EXACT), measured)
+        assert not world[4].state.entities and len(world[-1].state.entities) == found
 
 
 def test_who_will_read_a_sequence_waits_for_it() -> None:

@@ -21,12 +21,13 @@ its place on the ground.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, TAIL
 from worldstate.belief.kinematics.cartesian import CartesianBelief, arc
-from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, MotionBelief
+from worldstate.belief.kinematics.motion import AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, MotionBelief
 from worldstate.ground import TINY, FloatArray, wrap_angle
 
 from .site_geometry import USUAL_EDGE_STD, SideGeometry, SiteGeometry
@@ -79,12 +80,13 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
 
     A vehicle past the edge goes on as it came,
 
-    .. math:: \dot\theta = -\frac{v}{d} \cos^2\theta
+    .. math:: \dot\theta = -\frac{v}{d} \cos^2\theta, \qquad \frac{\dot r}{r} = \dot\theta \tan\theta
 
-    and stands half-way between edge and axis, give or take; what was heard of its approach rate is kept.
+    and stands at the edge, give or take. Of a hidden one what was heard of its approach
+    rate is kept.
     """
     hidden_rad, hidden_std = hidden_bearing(coming, side)
-    in_view_rad = 0.5 * (side.edge_azimuth_rad - side.yaw_rad)
+    in_view_rad = side.edge_azimuth_rad
     azimuth_rad = share * hidden_rad + (1.0 - share) * in_view_rad
     # Mean and variance of the two together.
     apart = share * (1.0 - share) * (hidden_rad - in_view_rad) ** 2
@@ -93,11 +95,33 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
     rate = -math.copysign(side.pace_hz * math.cos(azimuth_rad + side.yaw_rad) ** 2, along_rad)
     mean, covariance = before.mean.copy(), before.covariance.copy()
     mean[[AZIMUTH, AZIMUTH_RATE]] = azimuth_rad, rate
-    # Both are read anew from the sequence, whatever else was believed of them.
-    for axis, spread in ((AZIMUTH, variance), (AZIMUTH_RATE, (side.street.turn_share * rate) ** 2)):
+    rate_variance = (side.street.turn_share * rate) ** 2
+    spreads = [(AZIMUTH, variance), (AZIMUTH_RATE, rate_variance)]
+    if not share:
+        mean[RADIAL_RATE] = rate * math.tan(azimuth_rad + side.yaw_rad)
+        spreads.append((RADIAL_RATE, rate_variance))
+    # They are read anew from the sequence, whatever else was believed of them.
+    for axis, spread in spreads:
         covariance[axis], covariance[:, axis] = 0.0, 0.0
         covariance[axis, axis] = spread
     return MotionBelief(mean, covariance)
+
+
+def motion_in_view(
+    coming: FloatArray, shares: Sequence[float], site: SiteGeometry, before: MotionBelief
+) -> MotionBelief:
+    """Return the motion of a vehicle that has come into view, from one of the sides with these shares.
+
+    Its mean is that of the likeliest side, its deviations hold the others: peaks move it there if it is not.
+    Shapes: coming (K, 9), shares (K,).
+    """
+    pairs = zip(coming, site.sides, strict=True)
+    every = MotionBelief.stacked([hidden_motion(one, 0.0, side, before) for one, side in pairs])
+    weights = np.array(shares)
+    mean = every.mean[weights.argmax()]
+    apart = every.mean - mean
+    covariance = np.tensordot(weights, every.covariance + apart[:, :, None] * apart[:, None, :], 1)
+    return MotionBelief(mean.copy(), covariance)
 
 
 def time_to_visible(

@@ -108,6 +108,7 @@ class StreetModel:
     heard_std_rad: float = number("heard_std_rad")
     seen_path: float = number("seen_path")
     seen_std_rad: float = number("seen_std_rad")
+    bearing_s: float = number("bearing_s")
     pace_spread: float = number("pace_spread")
     place_share: float = number("place_share")
     extent_rad: float = number("extent_rad")

@@ -11,11 +11,11 @@ from worldstate.belief.kinematics.motion import (
     log_azimuth_likelihood,
     update,
 )
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import merged
 from worldstate.ground import TINY, FloatArray
 from worldstate.ground.values import NotUsable
-from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.measurement import Bearing, Measurement
 
 from .birth_death import HIDDEN
 from .memory import Memory
@@ -26,13 +26,13 @@ _LOG_CLUTTER_DENSITY = -math.log(math.pi)
 _ANYWHERE_RAD2 = math.pi**2 / 12.0
 
 
-def acoustic_update(memory: Memory, measurement: Measurement, weight: float, street: StreetModel) -> None:
+def acoustic_update(memory: Memory, measurement: Measurement, weight: float, site: SiteGeometry) -> None:
     """Update the entities with the bearing and the approach rate of a measurement.
 
     R is divided by `weight`: consecutive windows overlap, and full weight for each would count the same
     samples up to ten times.
     """
-    tracks, bearing, approach = memory.tracks, measurement.bearing, measurement.approach
+    tracks, bearing, approach, street = memory.tracks, measurement.bearing, measurement.approach, site.street
     # A measured position tells more than a bearing that may be that of a wall.
     rows = np.flatnonzero(tracks.moving & ~tracks.placed)
     silent = isinstance(bearing, NotUsable) and isinstance(approach, NotUsable)
@@ -44,9 +44,10 @@ def acoustic_update(memory: Memory, measurement: Measurement, weight: float, str
     if not isinstance(bearing, NotUsable):
         hidden = tracks.behind[rows] >= HIDDEN
         heard_hidden = (street.heard_std_rad,), (street.heard_path,)
-        std_rad, path = np.where(hidden, heard_hidden, _path_in_view(bearing.std_rad, street))
-        own = association_probability(motion, bearing.azimuth_rad, std_rad, path * sounding)
-        motion = update(motion, AZIMUTH, bearing.azimuth_rad, std_rad / math.sqrt(weight), own)
+        std_rad, path = np.where(hidden, heard_hidden, _path_in_view(bearing, site))
+        azimuth_rad, ago_s = bearing.azimuth_rad, street.bearing_s
+        own = association_probability(motion, azimuth_rad, std_rad, path * sounding, ago_s)
+        motion = update(motion, AZIMUTH, azimuth_rad, std_rad / math.sqrt(weight), own, ago_s)
     if not isinstance(approach, NotUsable):
         std_hz = approach.std_hz / math.sqrt(weight)
         motion = update(motion, RADIAL_RATE, -approach.inverse_tta_hz, std_hz, sounding)
@@ -58,21 +59,25 @@ def acoustic_update(memory: Memory, measurement: Measurement, weight: float, str
 
 
 def association_probability(
-    motion: MotionBelief, azimuth_rad: float, std_rad: FloatArray, own_path_probability: FloatArray
+    motion: MotionBelief,
+    azimuth_rad: float,
+    std_rad: FloatArray,
+    own_path_probability: FloatArray,
+    ago_s: float = 0.0,
 ) -> FloatArray:
     r"""Return the probability that a peak belongs to each entity's own path.
 
     .. math:: w = \frac{p\, N(z; \theta, P_\theta + R)}{p\, N(z; \theta, P_\theta + R) + (1 - p)/\pi}
     """
     p = np.minimum(np.maximum(own_path_probability, TINY), 1.0)
-    own = log_azimuth_likelihood(motion, azimuth_rad, std_rad) + np.log(p)
+    own = log_azimuth_likelihood(motion, azimuth_rad, std_rad, ago_s) + np.log(p)
     other = _LOG_CLUTTER_DENSITY + np.log1p(-np.minimum(p, 1.0 - TINY))
     weight = np.exp(-np.logaddexp(0.0, other - own))
     certain = (own_path_probability <= 0.0) | (own_path_probability >= 1.0)
     return np.where(certain, own_path_probability, weight)
 
 
-def _path_in_view(std_rad: float, street: StreetModel) -> tuple[tuple[float], tuple[float]]:
+def _path_in_view(bearing: Bearing, site: SiteGeometry) -> tuple[tuple[float], tuple[float]]:
     r"""Return standard deviation and prior path probability of a peak of an entity in line of sight.
 
     The deviation that comes with a peak holds that it may be another one, which association weighs itself:
@@ -80,7 +85,10 @@ def _path_in_view(std_rad: float, street: StreetModel) -> tuple[tuple[float], tu
     .. math:: \sigma^2 = \sigma_0^2 + p\, \frac{\pi^2}{12}
 
     with the deviation :math:`\sigma_0` of peaks that are the entity's, and p the chance that this one is not.
+    Nor is it past an edge, where nothing is in view: there it is an image, or that of a hidden vehicle.
     """
-    own_rad = min(std_rad, street.seen_std_rad)
-    astray = (std_rad**2 - own_rad**2) / _ANYWHERE_RAD2
-    return (own_rad,), (min(max(1.0 - astray, 0.0), street.seen_path),)
+    street, azimuth_rad = site.street, np.array([bearing.azimuth_rad])
+    own_rad = min(bearing.std_rad, street.seen_std_rad)
+    astray = (bearing.std_rad**2 - own_rad**2) / _ANYWHERE_RAD2
+    sight = site.line_of_sight(azimuth_rad, np.array([own_rad]), np.array([street.range_m]))
+    return (own_rad,), (min(max(1.0 - astray, 0.0), street.seen_path) * float(sight[0]),)

@@ -9,7 +9,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import MOSTLY_MISSED
 from worldstate.abduction.road_users import UNKNOWN, ClassShares
-from worldstate.belief.hidden_bearing import hidden_motion
+from worldstate.belief.hidden_bearing import hidden_motion, motion_in_view
 from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, MotionBelief
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
@@ -62,12 +62,16 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
         # In a tie it stays, which rounding must not undo.
         if shares and shares[tracks.side[i]] < max(shares) * (1.0 - TINY):
             tracks.side[i] = shares.index(max(shares))
-            tracks.put(i, site.sides[tracks.side[i]].prior())
-        of_side = None if is_open else int(tracks.side[i])
+            if tracks.behind[i] >= HIDDEN:
+                tracks.put(i, site.sides[tracks.side[i]].prior())
+        of_side, was_hidden = None if is_open else int(tracks.side[i]), bool(tracks.behind[i] >= HIDDEN)
         tracks.side_shares[i] = shares if is_open else ()
         tracks.existence[i], tracks.behind[i] = sides.existence(of_side), sides.hidden_share(of_side)
-        if belief.has_times and tracks.behind[i] >= HIDDEN:
-            side, before = int(tracks.side[i]), MotionBelief(tracks.mean[i], tracks.covariance[i])
+        side, before = int(tracks.side[i]), MotionBelief(tracks.mean[i], tracks.covariance[i])
+        if belief.has_times and was_hidden and tracks.behind[i] < HIDDEN:
+            own = shares or tuple(float(k == side) for k in range(len(site.sides)))
+            tracks.put(i, motion_in_view(belief.coming, own, site, before))
+        elif belief.has_times and was_hidden:
             motion = hidden_motion(belief.coming[side], float(tracks.behind[i]), site.sides[side], before)
             tracks.put(i, motion)
 
@@ -113,6 +117,9 @@ def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) 
         return None
     if not taken and all(rearmed) and (sides.hidden_on(None) >= least or any(alarmed)):
         return max(every, key=sides.hidden_on)
+    # In view by its sound, while no sensor looks.
+    if not heard and all(rearmed) and max(memory.belief.shown) >= least:
+        return max(every, key=memory.belief.shown.__getitem__)
     free = [k for k in every if rearmed[k] and k not in taken and (sides.hidden[k] >= least or alarmed[k])]
     return max(free, key=sides.hidden_on, default=None)
 

@@ -108,7 +108,7 @@ def _perceive(memory: Memory, measurement: Measurement, start_ns: int, model: Fi
     measurement, looks = new_looks(memory, measurement, start_ns, model.site.settings)
     # Of windows that overlap, what is new counts.
     weight = min(max(seconds(since_ns), 0.0) / model.site.settings.window_s, 1.0)
-    acoustic_update(memory, measurement, weight, model.site.street)
+    acoustic_update(memory, measurement, weight, model.site)
     update_looks(memory, measurement, looks, model)
     note_source(memory, measurement, model)
     update_belief(memory, measurement, [seen for seen, _ in looks], model)

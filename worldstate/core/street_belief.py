@@ -113,6 +113,8 @@ class StreetBelief:
     recent: tuple[tuple[int, tuple[float, ...]], ...] = ()
     # When what was heard was last masked by a vehicle that came into view, from any side.
     masked_ns: int | None = None
+    # P(one from a side has come into view and has not gone for long), while no sensor looks, by side.
+    shown: tuple[float, ...] = ()
     stamp_ns: int = 0
     watch: BudgetWatch = field(default_factory=BudgetWatch)  # Over the alarm's budget, and over the chances
 
@@ -123,7 +125,13 @@ class StreetBelief:
         first = cls(_NOTHING, np.zeros(()), never, (_LEAST_NATS,) * k, never, (ArrivalRate(),) * k)
         usual = _usual(context, None)
         joint = JointBelief.expected(StreetPrior.of(usual, street))
-        return replace(first, joint=joint, usual=usual, watch=BudgetWatch(over_ns=never, emerged_ns=never))
+        return replace(
+            first,
+            joint=joint,
+            usual=usual,
+            shown=(0.0,) * k,
+            watch=BudgetWatch(over_ns=never, emerged_ns=never),
+        )
 
     def check(self, directions: int) -> None:
         """Refuse what a file cannot have been written with, for so many approach sides."""
@@ -142,7 +150,7 @@ class StreetBelief:
             total = float(array.sum())
             if (array < 0.0).any() or not (key.startswith("trust") or np.isclose(total, 1.0)):
                 raise InvalidArgumentError(f"{name}.{key}: expected probabilities")
-        for key in ("decided", "over_ns", "emerged_ns", "arrivals"):
+        for key in ("decided", "over_ns", "emerged_ns", "arrivals", "shown"):
             if (got := len(getattr(self, key))) != directions:
                 raise InvalidArgumentError(f"{name}.{key}: expected {directions}, got {got}")
         self.watch.check(directions)
@@ -197,7 +205,8 @@ class StreetBelief:
     def sides(self) -> SideBelief:
         """Marginals of the joint belief over sides and explanations."""
         # The last digits depend on the order of sums, and must not decide at a threshold.
-        told, emerged = (tuple(one.round(12).tolist()) for one in (self.comes, self.joint.emerged_from))
+        in_view = np.maximum(self.joint.emerged_from, np.minimum(self.shown, 1.0 - self.comes))
+        told, emerged = (tuple(one.round(12).tolist()) for one in (self.comes, in_view))
         return SideBelief(
             told, emerged, told, 1.0 - self.joint.none_comes, self.joint.explanations, self.both_come
         )
@@ -378,9 +387,10 @@ def carried(
     prior = kept.expected_of(kept.learned_nats(context, street), street)
     watched = kept.watched(stamp_ns)
     arrivals = tuple(rate.later(seconds(step_ns), watched, street) for rate in kept.arrivals)
-    return replace(
-        kept, joint=kept.joint.carried(prior, street, step_ns), arrivals=arrivals, stamp_ns=stamp_ns
-    )
+    gone = math.exp(-seconds(step_ns) / street.passage_s)
+    shown = tuple(gone * one for one in kept.shown)
+    joint = kept.joint.carried(prior, street, step_ns)
+    return replace(kept, joint=joint, arrivals=arrivals, shown=shown, stamp_ns=stamp_ns)
 
 
 def _expecting(kept: StreetBelief, context: Context, street: StreetModel) -> StreetBelief:
@@ -411,7 +421,17 @@ def informed(
             joint = joint.looked(look.sensor, look.answer, look.stamp_ns, street)
     if kept is before and joint is kept.joint:  # No news: what is out ends as in silence
         return replace(kept, stamp_ns=measurement.stamp_ns)
-    return alerted(replace(kept, joint=joint, stamp_ns=measurement.stamp_ns), context, policy, street)
+    kept = _shown(replace(kept, joint=joint, stamp_ns=measurement.stamp_ns), street)
+    return alerted(kept, context, policy, street)
+
+
+def _shown(kept: StreetBelief, street: StreetModel) -> StreetBelief:
+    """Return the belief with the vehicles that are in view by their sound alone; a look finds them itself."""
+    if kept.watched(kept.stamp_ns):
+        return replace(kept, shown=(0.0,) * kept.k)
+    own, now = kept.emerged_recently(kept.stamp_ns, street), kept.joint.emerged_from.tolist()
+    pairs = zip(own, kept.shown, now, strict=True)
+    return replace(kept, shown=tuple(0.0 if is_own else max(pair) for is_own, *pair in pairs))
 
 
 def _read(

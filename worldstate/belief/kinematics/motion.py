@@ -214,33 +214,54 @@ def relax(
     return _belief(towards.mean + phi * offset, covariance)
 
 
-def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: _Numbers) -> FloatArray:
-    """Return log N(z; theta, P_theta + R) of a bearing, residual wrapped, nats per rad."""
-    variance = belief.covariance[..., AZIMUTH, AZIMUTH] + np.square(std_rad)
-    residual = wrap_angle(azimuth_rad - belief.mean[..., AZIMUTH])
+def _expected(belief: MotionBelief, row: int, ago_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the mean of a component as it was some time ago, its covariance with the state, its variance."""
+    mean, column = belief.mean[..., row], belief.covariance[..., row]
+    if not ago_s:
+        return mean, column, column[..., row]
+    rate = row + 1  # The azimuth's; no other component is measured late
+    column = column - ago_s * belief.covariance[..., rate]
+    return mean - ago_s * belief.mean[..., rate], column, column[..., row] - ago_s * column[..., rate]
+
+
+def log_azimuth_likelihood(
+    belief: MotionBelief, azimuth_rad: float, std_rad: _Numbers, ago_s: float = 0.0
+) -> FloatArray:
+    """Return log N(z; h m, h P h^T + R) of a bearing of some time ago, residual wrapped, nats per rad."""
+    mean, _, variance = _expected(belief, AZIMUTH, ago_s)
+    variance = variance + np.square(std_rad)
+    residual = wrap_angle(azimuth_rad - mean)
     return np.asarray(-0.5 * (residual**2 / variance + np.log(2.0 * math.pi * variance)))
 
 
 def update(
-    belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weight: _Numbers | None = None
+    belief: MotionBelief,
+    row: int,
+    value: _Numbers,
+    std: _Numbers,
+    weight: _Numbers | None = None,
+    ago_s: float = 0.0,
 ) -> MotionBelief:
     r"""Return the belief after one component was measured, of this entity with probability w.
 
     Probabilistic data association, of a certain one where no weight is given: a bearing is one of AZIMUTH, an
-    approach rate -1/TTA one of RADIAL_RATE.
+    approach rate -1/TTA one of RADIAL_RATE. A bearing of `ago_s` ago measures
+    :math:`h^T m = \theta - t\dot\theta`.
 
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
     """
     noise = np.square(np.maximum(std, LEAST_STD))[..., None]
-    residual = value - belief.mean[..., row]
+    mean, column, variance = _expected(belief, row, ago_s)
+    residual = value - mean
     if row == AZIMUTH:
         residual = wrap_angle(residual)
-    gain = belief.covariance[..., row] / (belief.covariance[..., row, row, None] + noise)
+    gain = column / (variance[..., None] + noise)
     # Joseph's form stays positive definite where P - K H P loses it to rounding: a sharp bearing on a belief
     # that is sharp already. Of one component it is two outer products.
-    swept = belief.covariance - _outer(gain, belief.covariance[..., row])
-    updated = swept - _outer(swept[..., row], gain) + noise[..., None] * _outer(gain, gain)
+    swept = belief.covariance - _outer(gain, column)
+    crossed = column - gain * variance[..., None]
+    updated = swept - _outer(crossed, gain) + noise[..., None] * _outer(gain, gain)
     step = gain * np.asarray(residual)[..., None]
     if weight is None:
         return _belief(belief.mean + step, updated)
