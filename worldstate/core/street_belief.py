@@ -526,8 +526,10 @@ def alerted(kept: StreetBelief, context: Context, policy: CueingPolicy, street: 
     watch = kept.watch
     if kept.alarm is not None:
         watch = watch.after(_watched(kept, over & ~denied), kept.alarm.onsets_per_hour)
-    # A risk that denies an alarm ends it: it is not held, and time alone does not bring it back.
-    sides = zip(over, denied, kept.over_ns, strict=True)
+    # A risk that denies an alarm ends it: it is not held, and time alone does not bring it back. One vehicle
+    # is on one side: what is held there ends as another side's alarm begins.
+    moved = ~over & (over.any() and kept.both_come <= _TWO)
+    sides = zip(over, denied | moved, kept.over_ns, strict=True)
     over_ns = tuple(None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides)
     decided = np.where(over & denied, _LEAST_NATS, decided)
     after = replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns, watch=watch)
