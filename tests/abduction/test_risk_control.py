@@ -1,4 +1,4 @@
-"""Risk control over units not yet seen, and how many windows a stream is worth."""
+"""How many independent windows a stream is worth."""
 
 import math
 
@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapie.risk_control.methods import find_best_predict_param, get_r_hat_plus
 from scipy.signal import lfilter
 
 from worldstate.abduction.cueing.cueing_policy import sustained_statistic
 from worldstate.abduction.cueing.risk_map import correlation_time_hops
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold, risk_controlling
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.errors import InvalidArgumentError
 
 WINDOWS, PHI = 91, 0.9
@@ -42,33 +41,6 @@ def test_the_correlation_time_of_the_alarm_is_that_of_the_law(alpha):
 def test_correlation_time_of_an_autoregression(phi):
     streams = autoregressive(np.random.default_rng(1), 30, 4000, phi)
     assert correlation_time_hops(streams) == pytest.approx((1 + phi) / (1 - phi), rel=0.15)
-
-
-def losses(rng, units, thresholds=30, largest=3.0):
-    """Losses of units that rise towards lower thresholds, each at its own, now and then falling again."""
-    at = rng.uniform(0.0, thresholds, (units, 1))
-    rising = np.maximum(np.arange(thresholds) - at, 0.0) * rng.exponential(0.3, (units, 1))
-    return np.minimum(rising * rng.choice([1.0, 0.0], rising.shape), largest)
-
-
-@settings(deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(2, 40), st.floats(0.05, 2.5))
-def test_the_expected_loss_of_a_unit_left_out_is_within_the_budget_whatever_the_losses(seed, units, alpha):
-    table = losses(np.random.default_rng(seed), units)
-    kept = [risk_controlling(np.delete(table, unit, axis=0), alpha, 3.0) for unit in range(units)]
-    lost = [row[k - 1] if k else 0.0 for row, k in zip(table, kept, strict=True)]
-    assert np.mean(lost) <= alpha + 1e-9
-
-
-@settings(deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(5, 40), st.floats(0.1, 0.9))
-def test_a_controlled_risk_is_that_of_another_implementation(seed, units, alpha):
-    table = np.maximum.accumulate(losses(np.random.default_rng(seed), units), axis=1)
-    table[:, 0], numbers = 0.0, np.arange(table.shape[1], dtype=float)
-    _, bound = get_r_hat_plus(table / 3.0, numbers, "crc", None, None, None)
-    if bound[0] < alpha < bound[-1]:
-        theirs = find_best_predict_param(numbers, bound, np.array([alpha]))
-        assert risk_controlling(table, 3.0 * alpha, 3.0) == theirs[0] + 1
 
 
 def test_nothing_is_known_of_no_windows():

@@ -20,12 +20,12 @@ from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
     SequenceAlarm,
     SequencePosterior,
-    smoothed_log_odds,
 )
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks, born
+from worldstate.commissioning.stream_exam import smoothed_log_odds
 from worldstate.core.memory import first_memory
 from worldstate.core.site_model import site_geometry_of
 from worldstate.core.step import _announced_in_view
