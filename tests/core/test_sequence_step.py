@@ -441,7 +441,7 @@ def test_a_street_on_which_nobody_comes_is_watched_and_expected_to_stay_so() -> 
         nobody = Look("camera", hop * 10**8, Absent(0.04))
         world = world.update(replace(heard(hop, readings[0]), look=nobody))
     watched = world.memory.belief
-    moved = np.log(watched.moved(watched.learned_nats(Context(), STREET)) / watched.usual)
+    moved = np.log(watched.groups / watched.usual)
     assert [one.watched_s for one in watched.arrivals] == pytest.approx([553.0] * 2, abs=5.0)
     assert moved[:, 0] - moved[:, -1] == pytest.approx([-0.5, -0.5], abs=1e-9)
     assert WorldFilter.from_dict(world.to_dict()).state == world.state

@@ -312,11 +312,6 @@ class JointBelief:
     alone: dict[str, FloatArray] = field(default_factory=dict)  # The same shape, by the source
     trust: dict[str, SensorTrust] = field(default_factory=dict)  # By the sensor
 
-    @classmethod
-    def expected(cls, prior: StreetPrior) -> "JointBelief":
-        """Return the belief before any evidence."""
-        return cls(prior.weights)
-
     def carried(self, prior: StreetPrior, street: StreetModel, step_ns: int) -> "JointBelief":
         """Return the belief a time step later, in which sensors fail and recover."""
         weights = prior.carry(self.weights, street, step_ns)
@@ -411,9 +406,7 @@ class JointBelief:
         own = SensorTrust(works / after.sum(), stamp_ns, miss, *run[1:])
         return replace(seen, trust={**seen.trust, sensor: own})
 
-    def emerged(
-        self, side: int, residual: float, follows: float, apart: bool, street: StreetModel
-    ) -> "JointBelief":
+    def emerged(self, side: int, residual: float, apart: bool, street: StreetModel) -> "JointBelief":
         r"""Return the belief after a vehicle has come into view past the edge of a side.
 
         .. math:: p' = (1 - r)\, E[p\, e] + r\, p, \qquad e(b) = e^{-t_b / T_e}
@@ -426,7 +419,7 @@ class JointBelief:
         starts_s = np.array((0.0, *COMING_S[:-1]))
         likelihood = np.concatenate([[street.unheard] * FIRST_BIN, np.exp(-starts_s / street.emergence_s)])
         gaps = np.diff(np.minimum((0.0, *COMING_S), street.follows_s)) / street.follows_s
-        behind = np.concatenate([[1.0 - follows], [0.0], follows * gaps])
+        behind = np.concatenate([[1.0 - street.follows], [0.0], street.follows * gaps])
         others = [k for k in range(self.sides) if k != side and not apart]
         if apart:
             likelihood = np.ones(PARTS)

@@ -77,7 +77,6 @@ class StreetModel:
     unheard: float = number("unheard")
     follows: float = number("follows")
     follows_s: float = number("follows_s")
-    follows_like: float = number("follows_like")
     traffic_like: float = number("traffic_like")
     traffic_s: float = number("traffic_s")
     traffic_nats: float = number("traffic_nats")
