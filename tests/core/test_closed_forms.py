@@ -40,8 +40,8 @@ COMING = len(COMING_S)
 SHARE = 0.9 * np.random.default_rng(0).dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
 LEFT, RIGHT = SideGeometry("left", 0.56, 0.96, 0.35), SideGeometry("right", -0.56, -0.96, 0.35)
 SITE = SiteGeometry((LEFT, RIGHT), 0.6, FilterSettings())
-# All of a reading or of a window is believed at once, and a window beside a reading counts for nothing.
-WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, window_s=1e-3, window_gain=1e-12)
+# All of a reading or of a window is believed at once.
+WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, window_s=1e-3)
 
 
 def odds(chance: float) -> float:

@@ -40,8 +40,8 @@ NOBODY = SignatureEvidence(("left", "right"), (-1.0, -1.0), -1.0, 1.0)
 SILENT = NotUsable("not scripted")
 UNASKED = Unqueried("no camera")
 COMING = len(COMING_S)
-# All of a reading is believed at once, the window beside it counts for nothing, and every camera works.
-WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, window_gain=1e-12, works=1.0)
+# All of a reading is believed at once, and every camera works.
+WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, works=1.0)
 EXACT, STREET = FilterSettings(street=WHOLE), StreetModel()
 
 

@@ -26,7 +26,7 @@ from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.markov_chain import balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
-from worldstate.ground import CERTAIN_NATS, TINY, BoolArray, FloatArray, seconds
+from worldstate.ground import TINY, BoolArray, FloatArray, seconds
 
 from .street_model import StreetModel
 
@@ -255,28 +255,6 @@ def window_likelihoods(
     pairs = ((clear, 1.0), (seen, denied))
     found = np.stack([np.where(count > 0, mean * beside, one) for one, beside in pairs], axis=-1)
     return np.asarray(np.maximum(found, TINY))
-
-
-@lru_cache
-def _noticed_shares(noticed_s: float, sides: int) -> FloatArray:
-    """Return P(a window notices a vehicle) of all hidden parts, shape (parts, ..., parts)."""
-    middle_s = 0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1])))
-    own = np.concatenate([[0.0] * FIRST_BIN, 1.0 / (1.0 + (middle_s / noticed_s) ** 4)])
-    shares = own
-    for _ in range(sides - 1):
-        shares = np.maximum(shares[..., None], own)
-    return shares
-
-
-def noticed(nats: float, sides: int, street: StreetModel) -> FloatArray:
-    r"""Return the likelihoods of a window of the hidden parts, against no vehicle: (parts, ..., parts).
-
-    .. math:: \ell = 1 - a(t) + a(t)\, e^{r}, \qquad a(t) = \frac{1}{1 + (t / T_n)^4}
-
-    with the log-odds r of a hidden vehicle by the window, and the time t until the next one comes into view.
-    """
-    shares = _noticed_shares(street.noticed_s, sides)
-    return 1.0 - shares + shares * math.exp(min(max(nats, -CERTAIN_NATS), CERTAIN_NATS))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,6 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import MOSTLY_MISSED, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.markov_chain import at_prior, context_prior
 from worldstate.abduction.sequence.sequence_inputs import HOP_S, SIDES
 from worldstate.abduction.sequence.sequence_model import (
@@ -31,7 +30,6 @@ from worldstate.belief.joint_belief import (
     JointBelief,
     StreetPrior,
     joint_reading,
-    noticed,
     usual_groups,
     window_likelihoods,
 )
@@ -70,26 +68,6 @@ def bounded_log_odds(probability: float) -> float:
     return math.log(inside) - math.log1p(-inside)
 
 
-@dataclass(frozen=True, slots=True)
-class WindowPresence:
-    """Log-odds of a hidden vehicle on any side by the windows of a source, averaged over their memory."""
-
-    nats: float
-    stamp_ns: int
-
-    def after(self, nats: float, stamp_ns: int, memory_s: float) -> "WindowPresence":
-        """Return the average after one more window."""
-        new = -math.expm1(-seconds(stamp_ns - self.stamp_ns) / memory_s)
-        return WindowPresence(self.nats + new * (nats - self.nats), stamp_ns)
-
-
-def presence_nats(said: SignatureEvidence) -> float:
-    """Return the log-odds of hidden on any side by a window, against what is in view and nothing."""
-    rest = float(np.logaddexp(said.visible, said.none))
-    ratios = np.array(said.hidden) - rest if said.sides is None else np.array(said.sides.log_ratios)
-    return float(np.logaddexp.reduce(ratios))
-
-
 # No slots: what is derived is computed once, and read by every entity and cue.
 @dataclass(frozen=True, eq=False)
 class StreetBelief:
@@ -109,7 +87,6 @@ class StreetBelief:
     share: FloatArray | None = None  # shape (groups,): Prior of a sequence model, once one was read
     margin_s: float = 0.0
     alarm: SequenceAlarm | None = None  # Of a sequence model
-    windows: dict[str, WindowPresence] = field(default_factory=dict)  # By the source
     read_ns: dict[str, int] = field(default_factory=dict)  # When each source was last read
     # Stamps of the last .3 s with the log-odds that the alarm goes by, by side.
     recent: tuple[tuple[int, tuple[float, ...]], ...] = ()
@@ -218,11 +195,10 @@ class StreetBelief:
     def since(self, since_ns: int) -> "StreetBelief":
         """Return the belief without sources and sensors that were last read before a time."""
         read_ns = {name: ns for name, ns in self.read_ns.items() if ns >= since_ns}
-        windows = {name: one for name, one in self.windows.items() if name in read_ns}
         alone = {name: one for name, one in self.joint.alone.items() if name in read_ns}
         trust = {name: one for name, one in self.joint.trust.items() if one.stamp_ns >= since_ns}
         joint = replace(self.joint, alone=alone, trust=trust)
-        return replace(self, joint=joint, windows=windows, read_ns=read_ns)
+        return replace(self, joint=joint, read_ns=read_ns)
 
     def handed_over(
         self, kept: Mapping[int, float], apart: Collection[int], stamp_ns: int, street: StreetModel
@@ -388,14 +364,9 @@ def _read(
     masked = masked_ns is not None and stamp_ns - masked_ns <= nanoseconds(street.masked_s)
     step_s = seconds(stamp_ns - kept.read_ns[source]) if source in kept.read_ns else math.inf
     if isinstance(reading, SequenceReading):
-        nats = presence_nats(measurement.signature)
-        last = kept.windows.get(source, WindowPresence(nats, stamp_ns))
-        windows = {**kept.windows, source: last.after(nats, stamp_ns, street.window_s)}
         if not kept.has_times:  # The alarm by windows goes by another event
             kept = replace(kept, recent=(), over_ns=(None,) * kept.k)
-        kept = replace(
-            kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm, windows=windows
-        )
+        kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
         kept = _expecting(kept, context, street)
         joint, sides, memory_s = *_sequence(kept, reading, context, street), street.reading_s
     else:
@@ -432,10 +403,7 @@ def _sequence(
     joint = joint_reading(at_prior(reading.groups[rows], share, expected), usual_in_view, street.by_sound)
     # Averaged, hops are surer than each.
     usual = StreetPrior.of(expected, street).by_part
-    joint = usual * (joint / usual) ** street.reading_gain
-    for one in kept.windows.values():
-        joint = joint * noticed(one.nats, len(sides), street)[..., None] ** street.window_gain
-    return joint, sides
+    return usual * (joint / usual) ** street.reading_gain, sides
 
 
 def _watched(kept: StreetBelief, over: BoolArray) -> WatchedHop:
