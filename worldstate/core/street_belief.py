@@ -90,8 +90,6 @@ class StreetBelief:
     read_ns: dict[str, int] = field(default_factory=dict)  # When each source was last read
     # Stamps of the last .3 s with the log-odds that the alarm goes by, by side.
     recent: tuple[tuple[int, tuple[float, ...]], ...] = ()
-    # When what was heard was last masked by a vehicle that came into view, from any side.
-    masked_ns: int | None = None
     stamp_ns: int = 0
     watch: BudgetWatch = field(default_factory=BudgetWatch)  # Over the alarm's budget, and over the chances
 
@@ -184,12 +182,12 @@ class StreetBelief:
 
     def just_emerged(self, street: StreetModel, but: int | None = None) -> bool:
         """Tell whether a vehicle has just come into view, from any side but one."""
-        recent = self.emerged_recently(self.stamp_ns, street)
+        recent = self.emerged_since(self.stamp_ns, street.beside_s)
         return any(is_recent for k, is_recent in enumerate(recent) if k != but)
 
-    def emerged_recently(self, stamp_ns: int, street: StreetModel) -> list[bool]:
-        """Return from which sides a vehicle has just come into view."""
-        since_ns = stamp_ns - nanoseconds(street.beside_s)
+    def emerged_since(self, stamp_ns: int, time_s: float) -> list[bool]:
+        """Return from which sides a vehicle has come into view within so long before a time."""
+        since_ns = stamp_ns - nanoseconds(time_s)
         return [ns is not None and ns >= since_ns for ns in self.emerged_ns]
 
     def since(self, since_ns: int) -> "StreetBelief":
@@ -216,7 +214,6 @@ class StreetBelief:
             self,
             joint=joint,
             emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
-            masked_ns=stamp_ns,
             over_ns=tuple(None if k in kept else ns for k, ns in enumerate(self.over_ns)),
             decided=tuple(_LEAST_NATS if k in kept else one for k, one in enumerate(self.decided)),
             arrivals=tuple(one.with_one_more() if k in kept else one for k, one in enumerate(self.arrivals)),
@@ -259,10 +256,10 @@ class StreetBelief:
         one is hidden on any side, as the paper's statistic is. The last piece is `alarm_nats`.
         """
         before = self._log_odds(JointBelief(self.prior(street).weights))
-        pieces, last = {"prior": before}, before
+        pieces, last, kind = {"prior": before}, before, "sequence" if self.has_times else "window"
         for source, one in sorted(self.joint.alone.items()):
             last = last + (self._log_odds(JointBelief(one)) - before)
-            pieces[_piece(source, self.has_times, len(self.joint.alone))] = last
+            pieces[kind if len(self.joint.alone) == 1 else f"{kind} {source}"] = last
         return pieces | {"looks": self.alarm_nats}
 
     @property
@@ -275,11 +272,6 @@ class StreetBelief:
             soon, rest = (np.maximum(joint.hidden @ of, TINY) for of in (_SOON, ~_SOON))
             return np.asarray(np.log(soon / rest))
         return np.full(self.k, bounded_log_odds(1.0 - joint.none_comes))
-
-
-def _piece(source: str, has_times: bool, sources: int) -> str:
-    kind = "sequence" if has_times else "window"
-    return kind if sources == 1 else f"{kind} {source}"
 
 
 def _usual(context: Context, share: FloatArray | None) -> FloatArray:
@@ -359,9 +351,8 @@ def _read(
 ) -> StreetBelief:
     """Return the belief after what a source has found: the last three seconds, or the last one alone."""
     reading, source, stamp_ns = measurement.sequence, measurement.source, measurement.stamp_ns
-    street, masked_ns = settings.street, kept.masked_ns
     # The sound is that of a vehicle which has just come into view.
-    masked = masked_ns is not None and stamp_ns - masked_ns <= nanoseconds(street.masked_s)
+    street, masked = settings.street, any(kept.emerged_since(stamp_ns, settings.street.masked_s))
     step_s = seconds(stamp_ns - kept.read_ns[source]) if source in kept.read_ns else math.inf
     if isinstance(reading, SequenceReading):
         if not kept.has_times:  # The alarm by windows goes by another event
