@@ -1,11 +1,11 @@
-"""Thresholds of a false-alarm budget: Neyman-Pearson's, and risk control over units not yet seen."""
+"""Thresholds of a false-alarm budget, by Neyman and Pearson."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import TINY, FloatArray, InvalidArgumentError, finite_array, in_range
+from worldstate.ground import TINY, InvalidArgumentError, finite_array, in_range
 
 from .cueing_policy import sustained_statistic
 
@@ -57,24 +57,3 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
     # The next float above the first window that the budget cannot pay for.
     paid, least = int(budget * held.size * (1.0 + TINY)), float(np.finfo(np.float64).min)
     return least if paid >= held.size else max(float(np.nextafter(np.sort(held)[-1 - paid], np.inf)), least)
-
-
-def risk_controlling(losses: FloatArray, alpha: float, largest: float) -> int:
-    r"""Return how many of ever lower thresholds keep the expected loss of a unit not yet seen within alpha.
-
-    .. math:: \max \Big\{ k : \frac{1}{n + 1} \Big( L + \sum_{j=1}^n \max_{i \le k} \min(L_{ji}, L) \Big)
-              \le \alpha \Big\}
-
-    Shapes: losses (n, thresholds), of unit j at threshold i, counted up to the largest, L.
-
-    Source: A. Angelopoulos et al., "Conformal risk control", ICLR 2024, eq. (4).
-
-    Examples
-    --------
-    >>> losses = np.array([[0.0, 1.0, 4.0], [0.0, 0.0, 1.0]])
-    >>> [risk_controlling(losses, alpha, largest=3.0) for alpha in (0.9, 1.0, 1.5, 3.0)]
-    [0, 1, 2, 3]
-    """
-    # Onsets are no monotone loss, since alarms that grow together are one: what counts is the worst so far.
-    worst = np.maximum.accumulate(np.minimum(losses, largest), axis=1)
-    return int(np.sum(worst.sum(axis=0) + largest <= alpha * (len(losses) + 1) * (1.0 + TINY)))

@@ -230,27 +230,6 @@ def _last(rates: FloatArray, most: float) -> int:
     return int(np.searchsorted(rates, most * (1.0 + TINY), side="right")) - 1
 
 
-def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
-    """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
-    within = np.clip(posterior.within()[..., -1], TINY, 1.0 - TINY)
-    log_odds = np.log(within) - np.log1p(-within)
-    recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
-    return np.asarray(log_odds[np.maximum(recent, 0)].mean(axis=1))
-
-
-def held(over: BoolArray, hops: int = HELD_HOPS) -> BoolArray:
-    """Return an alarm that stays for so many hops after the last one above its threshold.
-
-    Examples
-    --------
-    >>> held(np.array([False, True, False, False, False]), hops=2)
-    array([False,  True,  True,  True, False])
-    """
-    at = np.arange(len(over))
-    last = np.maximum.accumulate(np.where(over, at, -hops - 1))
-    return np.asarray(at - last <= hops)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class AlarmCurve:
     r"""From a budget to the threshold, measured on hazard-free streams: points of ever lower thresholds.

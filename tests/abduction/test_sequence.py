@@ -18,8 +18,8 @@ from worldstate.abduction.sequence.sequence_model import (
     BoostedTrees,
     SequenceModel,
     SequencePosterior,
-    smoothed_log_odds,
 )
+from worldstate.commissioning.stream_exam import smoothed_log_odds
 from worldstate.ground.errors import InvalidArgumentError
 
 SEEDS = st.integers(0, 2**32 - 1)

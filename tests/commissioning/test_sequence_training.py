@@ -7,7 +7,7 @@ import pytest
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from worldstate.abduction.sequence.sequence_inputs import sequence_inputs
-from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S, smoothed_log_odds
+from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
 from worldstate.commissioning import commission
 from worldstate.commissioning.sequence_training import (
     Growth,
@@ -17,6 +17,7 @@ from worldstate.commissioning.sequence_training import (
     exported,
     train_sequence,
 )
+from worldstate.commissioning.stream_exam import smoothed_log_odds
 
 
 @pytest.mark.parametrize("seed", [0, 1])

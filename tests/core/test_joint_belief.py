@@ -26,6 +26,7 @@ from worldstate.ground import FloatArray
 
 SEEDS = st.integers(0, 2**32 - 1)
 STREET = StreetModel()
+ALONE = StreetModel(follows=1e-12)  # None comes right behind another one
 CERTAIN = replace(STREET, works=1.0)  # The camera works
 COMING = len(COMING_S)
 
@@ -65,7 +66,7 @@ def every_state(sides: int) -> list[tuple[int, ...]]:
 def test_it_is_what_enumeration_of_all_states_finds(sides: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior = prior_of(rng, sides)
-    belief, by_hand = JointBelief.expected(prior), prior.weights
+    belief, by_hand = JointBelief(prior.weights), prior.weights
     for step_ns in rng.integers(5 * 10**7, 2 * 10**9, 3).tolist():
         told = likelihoods(rng, sides)
         belief = belief.carried(prior, STREET, step_ns).told(told)
@@ -88,9 +89,9 @@ def test_it_is_what_enumeration_of_all_states_finds(sides: int, seed: int) -> No
 def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior, told = prior_of(rng, 3), likelihoods(rng, 3)
-    belief = JointBelief.expected(prior).told(told).carried(prior, STREET, 3 * 10**8)
+    belief = JointBelief(prior.weights).told(told).carried(prior, STREET, 3 * 10**8)
     chains = [prior.chain(axis, STREET, 3 * 10**8) for axis in range(4)]
-    before = JointBelief.expected(prior).told(told).weights
+    before = JointBelief(prior.weights).told(told).weights
     by_hand = np.einsum("abce,ai,bj,ck,em->ijkm", before, *chains, optimize=True)
     for k in range(3):
         own = np.moveaxis(by_hand, k, 0).reshape(PARTS, 2, -1)
@@ -114,7 +115,7 @@ def test_it_is_what_a_factor_graph_infers(seed: int) -> None:
         return " ".join(repr(float(value)) for value in values.ravel())
 
     keys = [[(10 * step + axis, sizes[axis]) for axis in range(3)] for step in range(3)]
-    graph, belief = gtsam.DiscreteFactorGraph(), JointBelief.expected(prior)
+    graph, belief = gtsam.DiscreteFactorGraph(), JointBelief(prior.weights)
     for axis, side in enumerate([one.states for one in prior.sides]):
         graph.add([keys[0][axis]], table(side))
     graph.add([keys[0][2]], table(np.array([1.0 - prior.elsewhere, prior.elsewhere])))
@@ -138,7 +139,7 @@ def test_alone_a_reading_is_believed_as_it_is_whatever_was_believed_before(seed:
     """With all of what is new believed at once, at 1e-9, and each side has its own chances to come."""
     rng = np.random.default_rng(seed)
     prior = prior_of(rng, 2)
-    belief = JointBelief.expected(prior)
+    belief = JointBelief(prior.weights)
     for step_ns in rng.integers(5 * 10**7, 2 * 10**9, 5).tolist():
         groups = groups_of(rng, 2)
         groups[:, GROUPS.index("none")] += 1.0  # Else a vehicle is surer than two sides together allow
@@ -155,7 +156,7 @@ def test_with_readings_of_the_same_chain_it_is_the_exact_filter_of_everything(se
     """A reading is the posterior of the sound alone; what else is told keeps its worth."""
     rng = np.random.default_rng(seed)
     prior = prior_of(rng, 2)
-    belief = sound = exact = JointBelief.expected(prior)
+    belief = sound = exact = JointBelief(prior.weights)
     for step_ns in rng.integers(5 * 10**7, 10**9, 5).tolist():
         heard, message = likelihoods(rng, 2), likelihoods(rng, 2)
         belief, sound, exact = (one.carried(prior, STREET, step_ns) for one in (belief, sound, exact))
@@ -170,7 +171,7 @@ def test_mirrored_evidence_gives_the_mirrored_belief(seed: int) -> None:
     rng = np.random.default_rng(seed)
     one = prior_of(rng, 1).sides[0]
     prior = StreetPrior((one, one), 0.05)
-    here = there = JointBelief.expected(prior)
+    here = there = JointBelief(prior.weights)
     for _ in range(3):
         told, answer = likelihoods(rng, 2), (Absent(0.05), Present(0.05))[rng.integers(2)]
         here, there = here.told(told), there.told(told.transpose(1, 0, 2))
@@ -189,7 +190,7 @@ def read_often(looks_ns: list[int], street: StreetModel, miss: float = 0.05) -> 
     reading[NONE], reading[FIRST_BIN + 3, 0] = (0.05, 0.8), 0.15
     reading = np.maximum(reading, 1e-12) / reading.sum()
     prior = StreetPrior((SidePrior.of(groups[0], 0.3, street),), 0.1)
-    belief = JointBelief.expected(prior).read("ear", reading, prior, (0,))
+    belief = JointBelief(prior.weights).read("ear", reading, prior, (0,))
     for stamp_ns in looks_ns:
         belief = belief.looked("camera", Absent(miss, 0.0), stamp_ns, street)
     return belief
@@ -234,11 +235,11 @@ def test_a_vehicle_of_unknown_side_is_gone_from_the_other_side_and_a_second_one_
     one[FIRST_BIN, NONE, 0] = one[NONE, FIRST_BIN, 0] = 0.5
     two[FIRST_BIN, FIRST_BIN + 1, 0] = 1.0
     for reading, left in ((one, 0.05), (two, 0.95)):
-        before = JointBelief.expected(prior).read("ear", reading / reading.sum(), prior, (0, 1))
-        after = before.emerged(0, 0.02, 0.0, False, STREET)
+        before = JointBelief(prior.weights).read("ear", reading / reading.sum(), prior, (0, 1))
+        after = before.emerged(0, 0.02, False, ALONE)
         assert after.emerged_from[0] > 0.9
         assert (after.hidden[1, FIRST_BIN:].sum() < left) == (reading is one)
-        kept = before.emerged(0, 0.02, 0.0, True, STREET)
+        kept = before.emerged(0, 0.02, True, ALONE)
         np.testing.assert_allclose(kept.hidden[1], before.hidden[1], atol=1e-9)
 
 
@@ -251,11 +252,11 @@ def test_one_seen_on_another_side_than_it_was_heard_on_is_two_as_seldom_as_one_c
     """Heard on side 1, seen on side 0: it is still hidden with the odds (1 - c) p_u to c e^(-t / T_e)."""
     weights = np.zeros((*[STATES] * sides, 2))
     weights[(2 * NONE, 2 * (FIRST_BIN + bin_), *[2 * NONE] * (sides - 2), 0)] = 1.0
-    after = JointBelief(weights).emerged(0, 0.0, 0.0, False, STREET)
+    after = JointBelief(weights).emerged(0, 0.0, False, ALONE)
     confused = STREET.side_confusion / (sides - 1)  # One of the other sides
     one = confused * np.exp(-(0.0, *COMING_S)[bin_] / STREET.emergence_s)
     two = (1.0 - confused) * STREET.unheard
     assert after.hidden[1, FIRST_BIN:].sum() == pytest.approx(two / (one + two))
     assert after.emerged_from[0] == pytest.approx(1.0)
-    apart = JointBelief(weights).emerged(0, 0.0, 0.0, True, STREET)
+    apart = JointBelief(weights).emerged(0, 0.0, True, ALONE)
     assert apart.hidden[1, FIRST_BIN:].sum() == pytest.approx(1.0)

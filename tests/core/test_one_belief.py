@@ -136,22 +136,6 @@ def test_the_alarm_by_windows_goes_by_time_however_often_they_come(nats: float) 
     assert min(onsets_s) > 0.3 and max(onsets_s) - min(onsets_s) < 0.1 + SLACK
 
 
-@given(SEEDS)
-@settings(max_examples=4, deadline=None)
-def test_the_louder_a_hidden_vehicle_is_in_the_last_second_the_higher_is_the_risk(seed: int) -> None:
-    """Whatever the sequence reads of the last three seconds."""
-    rng, nats = np.random.default_rng(seed), np.sort(np.random.default_rng(seed).uniform(-6.0, 6.0, 5))
-    worlds = [WorldFilter() for _ in nats]
-    for number in range(1, 12):
-        heard = replace(hop(rng, number, sequence=True), sightings=(), look=None, co_evidence=Unqueried("-"))
-        windows = (SignatureEvidence(("left", "right"), (one, -9.0), 0.0, 0.0) for one in nats.tolist())
-        worlds = [
-            world.update(replace(heard, signature=said)) for world, said in zip(worlds, windows, strict=True)
-        ]
-        risks = [world.belief.risk for world in worlds]
-        assert risks == sorted(risks) and risks[0] < risks[-1]
-
-
 def both_sides(coming: tuple[float, float], other: tuple[float, float], bin_: str) -> SequenceReading:
     """Return a reading of how likely one comes on each side, and only on the other one."""
     groups = np.full((2, len(GROUPS)), 1e-4)

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 
 import numpy as np
 import pytest
@@ -20,12 +20,12 @@ from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
     SequenceAlarm,
     SequencePosterior,
-    smoothed_log_odds,
 )
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks, born
+from worldstate.commissioning.stream_exam import smoothed_log_odds
 from worldstate.core.memory import first_memory
 from worldstate.core.site_model import site_geometry_of
 from worldstate.core.step import _announced_in_view
@@ -40,8 +40,8 @@ NOBODY = SignatureEvidence(("left", "right"), (-1.0, -1.0), -1.0, 1.0)
 SILENT = NotUsable("not scripted")
 UNASKED = Unqueried("no camera")
 COMING = len(COMING_S)
-# All of a reading is believed at once, the window beside it counts for nothing, and every camera works.
-WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, window_gain=1e-12, works=1.0)
+# All of a reading is believed at once, and every camera works.
+WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, works=1.0)
 EXACT, STREET = FilterSettings(street=WHOLE), StreetModel()
 
 
@@ -392,6 +392,47 @@ def approach(in_view: float = 0.98) -> list[SequenceReading]:
     return [SequenceReading(one / one.sum(axis=1, keepdims=True), SHARE) for one in groups]
 
 
+def passed_by(street: StreetModel) -> list[tuple[float, ...]]:
+    """Return risks, explanations and thresholds while one comes, is seen at its edge, and is heard on."""
+    world, told = WorldFilter(settings=FilterSettings(street=street)), list[tuple[float, ...]]()
+    alarm = SequenceAlarm(0.0, 20.0)
+    for hop, said in enumerate(approach(in_view=0.8), 1):
+        answer = Present(0.04, 0.01) if hop in (31, 32) else Absent(0.04, 0.01)
+        boxes = (Sighting(0.53, 0.02, "car", 0.9),) if hop in (31, 32) else ()
+        look = Look("camera", hop * 10**8, answer)
+        one = replace(heard(hop, replace(said, alarm=alarm), answer), look=look, sightings=boxes)
+        world = world.update(one)
+        cues = world.state.cues
+        told += [(one.risk, *astuple(one.hypotheses), one.evidence.threshold_nats) for one in cues]
+    return told
+
+
+NUMBERS = """
+    passage_s arrival_s far_s leak reading_s reading_gain by_sound look_s works fails_s recovers_s emergence_s
+    unheard side_confusion follows follows_s traffic_like beside_s beside_nats masked_s
+"""
+
+
+@pytest.mark.parametrize("name", NUMBERS.split())
+def test_every_number_of_the_belief_acts_on_a_pass(name: str) -> None:
+    changed = replace(STREET, **{name: 0.2 * getattr(STREET, name)})
+    assert not np.allclose(passed_by(changed), passed_by(STREET), atol=1e-6)
+
+
+@settings(max_examples=8, deadline=None)
+@given(SEEDS)
+def test_for_a_second_and_a_half_after_a_pass_what_is_heard_is_the_vehicle_in_view(seed: int) -> None:
+    said, moved = drawn(np.random.default_rng(seed), 2), list[bool]()
+    before = run(WorldFilter(), [heard(hop, said[0]) for hop in range(8)])[-1]
+    kept = before.memory.belief.handed_over({0: 0.02}, (), before.stamp_ns, STREET)
+    masked = replace(before, memory=replace(before.memory, belief=kept), lag=None)
+    for after_s in (0.1, 1.2, 1.5):
+        at = round(masked.stamp_ns * 1e-8 + 10 * after_s)
+        risks = [masked.update(heard(at, one)).belief.risks for one in said]
+        moved.append(not np.allclose(*risks, atol=1e-9))
+    assert moved == [False, False, True]
+
+
 def test_who_came_into_view_unseen_is_there_as_long_as_it_sounds() -> None:
     """A camera that is dead, or misses most, ends no entity; one that looks and sees nobody does."""
     said = approach(in_view=0.8)
@@ -456,7 +497,7 @@ def test_a_street_on_which_nobody_comes_is_watched_and_expected_to_stay_so() -> 
         nobody = Look("camera", hop * 10**8, Absent(0.04))
         world = world.update(replace(heard(hop, readings[0]), look=nobody))
     watched = world.memory.belief
-    moved = np.log(watched.moved(watched.learned_nats(Context(), STREET)) / watched.usual)
+    moved = np.log(watched.groups / watched.usual)
     assert [one.watched_s for one in watched.arrivals] == pytest.approx([553.0] * 2, abs=5.0)
     assert moved[:, 0] - moved[:, -1] == pytest.approx([-0.5, -0.5], abs=1e-9)
     assert WorldFilter.from_dict(world.to_dict()).state == world.state

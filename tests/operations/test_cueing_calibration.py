@@ -16,6 +16,7 @@ from scipy.stats import poisson
 from worldstate.abduction.co_evidence import Absent, Unqueried
 from worldstate.abduction.cueing.cueing_policy import sustained_statistic
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap, fit_risk_map
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.evidence import SignatureEvidence, statistic
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
@@ -26,6 +27,7 @@ from worldstate.measurement.measurement import Approach, Measurement, Sighting
 from worldstate.operations.calibration.cueing_calibration import (
     CueingSettings,
     calibrate_cueing,
+    correlation_time_hops,
     statistic_at,
 )
 from worldstate.operations.metrics.approach_table import ApproachTable
@@ -215,3 +217,39 @@ def test_bad_input_is_one_line_and_leaves_nothing(name, tmp_path, capsys):
     captured = capsys.readouterr()
     assert name in captured.err
     assert not (tmp_path / "model.json").exists()
+
+
+WINDOWS, PHI = 91, 0.9
+
+
+def autoregressive(rng, recordings, windows=WINDOWS, phi=PHI):
+    """Recordings of a stationary Gaussian AR(1), unit variance; correlation time (1 + phi) / (1 - phi)."""
+    shocks = rng.normal(size=(recordings, windows)) * math.sqrt(1.0 - phi**2)
+    shocks[:, 0] = rng.normal(size=recordings)
+    return lfilter([1.0], [1.0, -phi], shocks, axis=1)
+
+
+# Correlation time of "the last 3 hops of the AR(1) were at or above the (1 - alpha) level", in hops:
+# measured once on 4e6 hops of the law, and held against a shorter run by the test below.
+ALARM_TIME_HOPS = {0.02: 7.7, 0.05: 9.6}
+
+
+@pytest.mark.parametrize("alpha", [0.02, 0.05])
+def test_the_correlation_time_of_the_alarm_is_that_of_the_law(alpha):
+    stream = autoregressive(np.random.default_rng(0), 40, 20_000)
+    held = np.stack([sustained_statistic(s, 3) for s in stream])[:, 2:]
+    alarm = (held >= np.quantile(held, 1.0 - alpha)).astype(float)
+    assert correlation_time_hops(alarm) == pytest.approx(ALARM_TIME_HOPS[alpha], rel=0.1)
+
+
+@given(st.floats(0.0, 0.9))
+@settings(deadline=None, max_examples=15)
+def test_correlation_time_of_an_autoregression(phi):
+    streams = autoregressive(np.random.default_rng(1), 30, 4000, phi)
+    assert correlation_time_hops(streams) == pytest.approx((1 + phi) / (1 - phi), rel=0.15)
+
+
+def test_nothing_is_known_of_no_windows():
+    for of in (lambda: neyman_pearson_threshold([], 0.1), lambda: correlation_time_hops([])):
+        with pytest.raises(InvalidArgumentError, match="window"):
+            of()

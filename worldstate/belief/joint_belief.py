@@ -26,7 +26,7 @@ from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.markov_chain import balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
-from worldstate.ground import CERTAIN_NATS, TINY, BoolArray, FloatArray, seconds
+from worldstate.ground import TINY, BoolArray, FloatArray, seconds
 
 from .street_model import StreetModel
 
@@ -257,28 +257,6 @@ def window_likelihoods(
     return np.asarray(np.maximum(found, TINY))
 
 
-@lru_cache
-def _noticed_shares(noticed_s: float, sides: int) -> FloatArray:
-    """Return P(a window notices a vehicle) of all hidden parts, shape (parts, ..., parts)."""
-    middle_s = 0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1])))
-    own = np.concatenate([[0.0] * FIRST_BIN, 1.0 / (1.0 + (middle_s / noticed_s) ** 4)])
-    shares = own
-    for _ in range(sides - 1):
-        shares = np.maximum(shares[..., None], own)
-    return shares
-
-
-def noticed(nats: float, sides: int, street: StreetModel) -> FloatArray:
-    r"""Return the likelihoods of a window of the hidden parts, against no vehicle: (parts, ..., parts).
-
-    .. math:: \ell = 1 - a(t) + a(t)\, e^{r}, \qquad a(t) = \frac{1}{1 + (t / T_n)^4}
-
-    with the log-odds r of a hidden vehicle by the window, and the time t until the next one comes into view.
-    """
-    shares = _noticed_shares(street.noticed_s, sides)
-    return 1.0 - shares + shares * math.exp(min(max(nats, -CERTAIN_NATS), CERTAIN_NATS))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorTrust:
     """Whether a sensor works, jointly with the state of the street, and its last look."""
@@ -311,11 +289,6 @@ class JointBelief:
     weights: FloatArray  # shape (states, ..., states, 2)
     alone: dict[str, FloatArray] = field(default_factory=dict)  # The same shape, by the source
     trust: dict[str, SensorTrust] = field(default_factory=dict)  # By the sensor
-
-    @classmethod
-    def expected(cls, prior: StreetPrior) -> "JointBelief":
-        """Return the belief before any evidence."""
-        return cls(prior.weights)
 
     def carried(self, prior: StreetPrior, street: StreetModel, step_ns: int) -> "JointBelief":
         """Return the belief a time step later, in which sensors fail and recover."""
@@ -411,9 +384,7 @@ class JointBelief:
         own = SensorTrust(works / after.sum(), stamp_ns, miss, *run[1:])
         return replace(seen, trust={**seen.trust, sensor: own})
 
-    def emerged(
-        self, side: int, residual: float, follows: float, apart: bool, street: StreetModel
-    ) -> "JointBelief":
+    def emerged(self, side: int, residual: float, apart: bool, street: StreetModel) -> "JointBelief":
         r"""Return the belief after a vehicle has come into view past the edge of a side.
 
         .. math:: p' = (1 - r)\, E[p\, e] + r\, p, \qquad e(b) = e^{-t_b / T_e}
@@ -426,7 +397,7 @@ class JointBelief:
         starts_s = np.array((0.0, *COMING_S[:-1]))
         likelihood = np.concatenate([[street.unheard] * FIRST_BIN, np.exp(-starts_s / street.emergence_s)])
         gaps = np.diff(np.minimum((0.0, *COMING_S), street.follows_s)) / street.follows_s
-        behind = np.concatenate([[1.0 - follows], [0.0], follows * gaps])
+        behind = np.concatenate([[1.0 - street.follows], [0.0], street.follows * gaps])
         others = [k for k in range(self.sides) if k != side and not apart]
         if apart:
             likelihood = np.ones(PARTS)

@@ -165,7 +165,7 @@ def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool
     r"""Count the onsets of hazard-free streams and the hops in alarm at ever lower thresholds.
 
     With `elsewhere` the rate of a point is the smallest budget b that a junction not among these may be
-    expected to keep there (conformal risk control, as `risk_controlling`),
+    expected to keep there (A. Angelopoulos et al., "Conformal risk control", ICLR 2024, eq. 4),
 
     .. math:: \frac{1}{J + 1} \Big( L b + \sum_{j=1}^J \min(r_j, L b) \Big) \le b, \qquad L = 3
 

@@ -16,10 +16,10 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (
     HORIZONS_S,
     LONGEST_S,
+    SMOOTHED_HOPS,
     SequencePosterior,
-    smoothed_log_odds,
 )
-from worldstate.ground import BoolArray, FloatArray, wrap_angle
+from worldstate.ground import TINY, BoolArray, FloatArray, wrap_angle
 from worldstate.ground.checks import check_shape
 from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate.operations.metrics.approach_table import (
@@ -85,6 +85,14 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
             )
         )
     return found
+
+
+def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
+    """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
+    within = np.clip(posterior.within()[..., -1], TINY, 1.0 - TINY)
+    log_odds = np.log(within) - np.log1p(-within)
+    recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
+    return np.asarray(log_odds[np.maximum(recent, 0)].mean(axis=1))
 
 
 def _louder(posterior: SequencePosterior) -> FloatArray:

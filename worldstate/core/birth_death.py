@@ -78,7 +78,7 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
 
 def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
     """Return the belief of the sides without a vehicle that has just come into view: it has a track."""
-    sides, found = memory.sides, memory.belief.emerged_recently(memory.stamp_ns, site.street)
+    sides, found = memory.sides, memory.belief.emerged_since(memory.stamp_ns, site.street.beside_s)
     emerged = tuple(0.0 if own else one for own, one in zip(found, sides.emerged, strict=True))
     return replace(sides, emerged=emerged)
 

@@ -122,12 +122,7 @@ def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -
         return "less than a second of sound: no alarm is raised yet"
     if not belief.has_news(memory.stamp_ns):
         return "nothing was measured for a second"
-    context, street = model.context, model.site.street
-    nats, learned = belief.alarm_nats(context, street), belief.read_nats(context, street)[side]
-    threshold = belief.threshold_nats(model.policy, street)
-    if nats[side] < threshold <= nats[side] + learned:
-        return "only by the traffic learned here, which is left out of the alarm"
-    if nats[side] < nats.max():
+    if belief.alarm_nats[side] < belief.alarm_nats.max():
         return "one vehicle is likelier than two, and likelier on the other side"
     if belief.has_times:
         return "it is not sure to come within three seconds, or not for long enough"
@@ -235,11 +230,8 @@ def _evidence(
 
     .. math:: t_j = L_j - L_{j-1}
     """
-    belief, context = memory.belief, model.context
-    after, threshold = (
-        belief.log_odds(context, model.site.street),
-        belief.threshold_nats(model.policy, model.site.street),
-    )
+    belief, street = memory.belief, model.site.street
+    after, threshold = belief.log_odds(street), belief.threshold_nats(model.policy, street)
     terms = np.diff(list(after.values()), axis=0, prepend=0.0).T.tolist()
     hypothesis: Literal["coming", "hidden"] = "coming" if belief.has_times else "hidden"
     heard = [

@@ -102,7 +102,7 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     detection_update(memory, scans, None, scan.stamp_ns, model.site)
     memory.looks[scan.source] = _scan_look(scan)
     if memory.belief is not before:  # Time alone raises no alarm
-        memory.belief = alerted(memory.belief, model.context, model.policy, street)
+        memory.belief = alerted(memory.belief, model.policy, street)
 
 
 def _scan_look(scan: PositionScan) -> CountedLook:

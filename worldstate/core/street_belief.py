@@ -9,7 +9,6 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import MOSTLY_MISSED, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.markov_chain import at_prior, context_prior
 from worldstate.abduction.sequence.sequence_inputs import HOP_S, SIDES
 from worldstate.abduction.sequence.sequence_model import (
@@ -31,7 +30,6 @@ from worldstate.belief.joint_belief import (
     JointBelief,
     StreetPrior,
     joint_reading,
-    noticed,
     usual_groups,
     window_likelihoods,
 )
@@ -70,35 +68,17 @@ def bounded_log_odds(probability: float) -> float:
     return math.log(inside) - math.log1p(-inside)
 
 
-@dataclass(frozen=True, slots=True)
-class WindowPresence:
-    """Log-odds of a hidden vehicle on any side by the windows of a source, averaged over their memory."""
-
-    nats: float
-    stamp_ns: int
-
-    def after(self, nats: float, stamp_ns: int, memory_s: float) -> "WindowPresence":
-        """Return the average after one more window."""
-        new = -math.expm1(-seconds(stamp_ns - self.stamp_ns) / memory_s)
-        return WindowPresence(self.nats + new * (nats - self.nats), stamp_ns)
-
-
-def presence_nats(said: SignatureEvidence) -> float:
-    """Return the log-odds of hidden on any side by a window, against what is in view and nothing."""
-    rest = float(np.logaddexp(said.visible, said.none))
-    ratios = np.array(said.hidden) - rest if said.sides is None else np.array(said.sides.log_ratios)
-    return float(np.logaddexp.reduce(ratios))
-
-
 # No slots: what is derived is computed once, and read by every entity and cue.
 @dataclass(frozen=True, eq=False)
 class StreetBelief:
     """Belief of all sides, and the alarm that goes by it."""
 
     joint: JointBelief
-    # Prior of the groups without what was learned, shape (K, groups); when a vehicle last came into view from
-    # a side; what was last held against the threshold, nats; when each side was last above it.
+    # Prior of the groups by context and model, shape (K, groups), and with the traffic that was seen; when a
+    # vehicle last came into view from a side; what was last held against the threshold, nats; when each side
+    # was last above it.
     usual: FloatArray
+    groups: FloatArray
     emerged_ns: tuple[int | None, ...]
     decided: tuple[float, ...]
     over_ns: tuple[int | None, ...]
@@ -107,12 +87,9 @@ class StreetBelief:
     share: FloatArray | None = None  # shape (groups,): Prior of a sequence model, once one was read
     margin_s: float = 0.0
     alarm: SequenceAlarm | None = None  # Of a sequence model
-    windows: dict[str, WindowPresence] = field(default_factory=dict)  # By the source
     read_ns: dict[str, int] = field(default_factory=dict)  # When each source was last read
     # Stamps of the last .3 s with the log-odds that the alarm goes by, by side.
     recent: tuple[tuple[int, tuple[float, ...]], ...] = ()
-    # When what was heard was last masked by a vehicle that came into view, from any side.
-    masked_ns: int | None = None
     # P(one from a side has come into view and has not gone for long), while no sensor looks, by side.
     shown: tuple[float, ...] = ()
     stamp_ns: int = 0
@@ -122,16 +99,11 @@ class StreetBelief:
     def expected(cls, context: Context, street: StreetModel) -> "StreetBelief":
         """Return the belief of a context before anything is measured."""
         never, k = (None,) * len(context.directions), len(context.directions)
-        first = cls(_NOTHING, np.zeros(()), never, (_LEAST_NATS,) * k, never, (ArrivalRate(),) * k)
-        usual = _usual(context, None)
-        joint = JointBelief.expected(StreetPrior.of(usual, street))
-        return replace(
-            first,
-            joint=joint,
-            usual=usual,
-            shown=(0.0,) * k,
-            watch=BudgetWatch(over_ns=never, emerged_ns=never),
-        )
+        usual, watch = _usual(context, None), BudgetWatch(over_ns=never, emerged_ns=never)
+        joint = JointBelief(StreetPrior.of(usual, street).weights)
+        alarm: tuple[float, ...] = (_LEAST_NATS,) * k
+        first = cls(joint, usual, usual, never, alarm, never, (ArrivalRate(),) * k, watch=watch)
+        return replace(first, shown=(0.0,) * k)
 
     def check(self, directions: int) -> None:
         """Refuse what a file cannot have been written with, for so many approach sides."""
@@ -140,7 +112,8 @@ class StreetBelief:
             f"alone.{key}": one for key, one in self.joint.alone.items()
         }
         every |= {f"trust.{key}": one.works for key, one in self.joint.trust.items()}
-        finite_array(f"{name}.usual", self.usual, (directions, groups))
+        for key in ("usual", "groups"):
+            finite_array(f"{name}.{key}", getattr(self, key), (directions, groups))
         for key, array in every.items():
             if array is None:
                 continue
@@ -211,27 +184,23 @@ class StreetBelief:
             told, emerged, told, 1.0 - self.joint.none_comes, self.joint.explanations, self.both_come
         )
 
-    def since_emerged_ns(self, stamp_ns: int) -> list[float]:
-        """Return how long before a time a vehicle last came into view from each side."""
-        return [math.inf if ns is None else stamp_ns - ns for ns in self.emerged_ns]
-
     def just_emerged(self, street: StreetModel, but: int | None = None) -> bool:
         """Tell whether a vehicle has just come into view, from any side but one."""
-        recent = self.emerged_recently(self.stamp_ns, street)
+        recent = self.emerged_since(self.stamp_ns, street.beside_s)
         return any(is_recent for k, is_recent in enumerate(recent) if k != but)
 
-    def emerged_recently(self, stamp_ns: int, street: StreetModel) -> list[bool]:
-        """Return from which sides a vehicle has just come into view."""
-        return [ns <= nanoseconds(street.beside_s) for ns in self.since_emerged_ns(stamp_ns)]
+    def emerged_since(self, stamp_ns: int, time_s: float) -> list[bool]:
+        """Return from which sides a vehicle has come into view within so long before a time."""
+        since_ns = stamp_ns - nanoseconds(time_s)
+        return [ns is not None and ns >= since_ns for ns in self.emerged_ns]
 
     def since(self, since_ns: int) -> "StreetBelief":
         """Return the belief without sources and sensors that were last read before a time."""
         read_ns = {name: ns for name, ns in self.read_ns.items() if ns >= since_ns}
-        windows = {name: one for name, one in self.windows.items() if name in read_ns}
         alone = {name: one for name, one in self.joint.alone.items() if name in read_ns}
         trust = {name: one for name, one in self.joint.trust.items() if one.stamp_ns >= since_ns}
         joint = replace(self.joint, alone=alone, trust=trust)
-        return replace(self, joint=joint, windows=windows, read_ns=read_ns)
+        return replace(self, joint=joint, read_ns=read_ns)
 
     def handed_over(
         self, kept: Mapping[int, float], apart: Collection[int], stamp_ns: int, street: StreetModel
@@ -244,42 +213,19 @@ class StreetBelief:
         joint, two = self.joint, self.both_come > _TWO
         for k, residual in kept.items():
             is_apart = two or bool((set(kept) | set(apart)) - {k})
-            joint = joint.emerged(k, residual, self.arrivals[k].follower_share(street), is_apart, street)
-        pairs = zip(self.arrivals, self.since_emerged_ns(stamp_ns), strict=True)
+            joint = joint.emerged(k, residual, is_apart, street)
         return replace(
             self,
             joint=joint,
             emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
-            masked_ns=stamp_ns,
             over_ns=tuple(None if k in kept else ns for k, ns in enumerate(self.over_ns)),
             decided=tuple(_LEAST_NATS if k in kept else one for k, one in enumerate(self.decided)),
-            arrivals=tuple(
-                rate.after(gap_ns, street) if k in kept else rate for k, (rate, gap_ns) in enumerate(pairs)
-            ),
+            arrivals=tuple(one.with_one_more() if k in kept else one for k, one in enumerate(self.arrivals)),
         )
 
-    def moved(self, nats: Sequence[float]) -> FloatArray:
-        """Return the prior of the groups with the odds of a vehicle that comes moved so far, by side."""
-        factors = np.where(np.arange(self.usual.shape[1]) < BINS, np.exp(np.array(nats))[:, None], 1.0)
-        moved = self.usual * factors
-        return np.asarray(moved / moved.sum(axis=1, keepdims=True))
-
-    def expected_of(self, nats: Sequence[float], street: StreetModel) -> StreetPrior:
-        """Return the prior of the street with these odds moved."""
-        return StreetPrior.of(self.moved(nats), street)
-
-    def learned_nats(self, context: Context, street: StreetModel) -> list[float]:
-        """Return by how much the log-odds of each side are moved by what was seen; a given prior stands."""
-        given, usual = context.hidden_by_side or {}, self.usual[:, :BINS].sum(axis=1) / COMING_S[-1]
-        pairs = zip(context.directions, self.arrivals, usual.tolist(), strict=True)
-        return [
-            0.0 if context.priors or side in given else rate.shift_nats(hz, street)
-            for side, rate, hz in pairs
-        ]
-
-    def read_nats(self, context: Context, street: StreetModel) -> list[float]:
-        """Return by how much a reading is moved: not at all if it has just heard a vehicle itself."""
-        return [0.0] * self.k if self.just_emerged(street) else self.learned_nats(context, street)
+    def prior(self, street: StreetModel) -> StreetPrior:
+        """Return what is expected of the street without evidence."""
+        return StreetPrior.of(self.groups, street)
 
     def has_news(self, stamp_ns: int) -> bool:
         """Tell whether anything was measured for as long as an alarm holds."""
@@ -307,52 +253,29 @@ class StreetBelief:
         looks = self.joint.trust.values()
         return any(one.miss_rate < miss_rate and stamp_ns - one.stamp_ns <= LOOK_NS for one in looks)
 
-    def log_odds(self, context: Context, street: StreetModel) -> dict[str, FloatArray]:
+    def log_odds(self, street: StreetModel) -> dict[str, FloatArray]:
         """Return the log-odds of what the alarm goes by, shape (K,), after each piece of evidence.
 
         By a sequence model it is that a vehicle comes into view from a side within three seconds, else that
         one is hidden on any side, as the paper's statistic is. The last piece is `alarm_nats`.
         """
-        usual = self.expected_of(self.learned_nats(context, street), street)
-        before = self._log_odds(JointBelief(usual.weights))
-        pieces, last = {"prior": before}, before
+        before = self._log_odds(JointBelief(self.prior(street).weights))
+        pieces, last, kind = {"prior": before}, before, "sequence" if self.has_times else "window"
         for source, one in sorted(self.joint.alone.items()):
             last = last + (self._log_odds(JointBelief(one)) - before)
-            pieces[_piece(source, self.has_times, len(self.joint.alone))] = last
-        pieces["looks"] = self._log_odds(self.joint)
-        if self._moved_by_traffic(context, street):
-            pieces["usual traffic"] = self.alarm_nats(context, street)
-        return pieces
+            pieces[kind if len(self.joint.alone) == 1 else f"{kind} {source}"] = last
+        return pieces | {"looks": self.alarm_nats}
 
-    def alarm_nats(self, context: Context, street: StreetModel) -> FloatArray:
-        """Return the log-odds that the alarm goes by, shape (K,), with the learned traffic taken out again.
-
-        The alarm keeps to its onsets an hour of a usual street. Left in, in busy streets the other side of a
-        single was alarmed in 0.56 of the cases (0.35 without).
-        """
-        if not self._moved_by_traffic(context, street):
-            return self._log_odds(self.joint)
-        nats = np.array(self.read_nats(context, street))
-        return _log_odds(self.joint.hidden * np.exp(-nats[:, None] * COMES), _SOON)
-
-    def _moved_by_traffic(self, context: Context, street: StreetModel) -> bool:
-        return self.has_times and any(self.read_nats(context, street))
+    @property
+    def alarm_nats(self) -> FloatArray:
+        """The log-odds that the alarm goes by, shape (K,)."""
+        return self._log_odds(self.joint)
 
     def _log_odds(self, joint: JointBelief) -> FloatArray:
         if self.has_times:
-            return _log_odds(joint.hidden, _SOON)
+            soon, rest = (np.maximum(joint.hidden @ of, TINY) for of in (_SOON, ~_SOON))
+            return np.asarray(np.log(soon / rest))
         return np.full(self.k, bounded_log_odds(1.0 - joint.none_comes))
-
-
-def _piece(source: str, has_times: bool, sources: int) -> str:
-    kind = "sequence" if has_times else "window"
-    return kind if sources == 1 else f"{kind} {source}"
-
-
-def _log_odds(parts: FloatArray, of: BoolArray) -> FloatArray:
-    """Return the log-odds of some parts, shape (K, parts) to (K,)."""
-    odds = np.maximum(parts @ of, TINY) / np.maximum(parts @ ~of, TINY)
-    return np.asarray(np.log(odds))
 
 
 def _usual(context: Context, share: FloatArray | None) -> FloatArray:
@@ -362,11 +285,11 @@ def _usual(context: Context, share: FloatArray | None) -> FloatArray:
     context's rates.
     """
     priors, given, k = context.priors, context.hidden_by_side or {}, len(context.directions)
-    street = priors or context.rates.priors(k)
+    rates = priors or context.rates.priors(k)
     # Sides are independent: of P(hidden) each has so much that no vehicle is hidden on any has the rest.
-    each = 1.0 - (1.0 - street.hidden) ** (1.0 / k)
+    each = 1.0 - (1.0 - rates.hidden) ** (1.0 / k)
     if share is None:
-        seen = street.visible / max(street.visible + street.none, TINY)
+        seen = rates.visible / max(rates.visible + rates.none, TINY)
         groups = usual_groups([given.get(side, each) for side in context.directions], seen)
     else:
         usual = None if priors is None else each
@@ -376,7 +299,13 @@ def _usual(context: Context, share: FloatArray | None) -> FloatArray:
     return np.asarray(groups / groups.sum(axis=1, keepdims=True))
 
 
-_NOTHING = JointBelief(np.zeros(()))
+def _with_traffic(kept: StreetBelief, context: Context, street: StreetModel) -> FloatArray:
+    """Return the distribution of the groups by the traffic that was seen, too; a given one stands."""
+    groups, given = kept.usual.copy(), context.hidden_by_side or {}
+    for row, side, rate in zip(groups, context.directions, kept.arrivals, strict=True):
+        if context.priors is None and side not in given:
+            row[:BINS] *= math.exp(rate.shift_nats(row[:BINS].sum() / COMING_S[-1], street))
+    return np.asarray(groups / groups.sum(axis=1, keepdims=True))
 
 
 def carried(
@@ -384,22 +313,21 @@ def carried(
 ) -> StreetBelief:
     """Return the belief at a later time, with nothing heard."""
     kept = _expecting(kept, context, street)
-    prior = kept.expected_of(kept.learned_nats(context, street), street)
-    watched = kept.watched(stamp_ns)
-    arrivals = tuple(rate.later(seconds(step_ns), watched, street) for rate in kept.arrivals)
+    joint, arrivals = kept.joint.carried(kept.prior(street), street, step_ns), kept.arrivals
+    if kept.watched(stamp_ns):
+        arrivals = tuple(one.watched_for(seconds(step_ns), street) for one in arrivals)
     gone = math.exp(-seconds(step_ns) / street.passage_s)
     shown = tuple(gone * one for one in kept.shown)
-    joint = kept.joint.carried(prior, street, step_ns)
     return replace(kept, joint=joint, arrivals=arrivals, shown=shown, stamp_ns=stamp_ns)
 
 
 def _expecting(kept: StreetBelief, context: Context, street: StreetModel) -> StreetBelief:
     """Return the belief at the prior of context and model, which may be another one than a step ago."""
     usual = _usual(context, kept.share)
-    if np.array_equal(usual, kept.usual):
-        return kept
-    before, after = (StreetPrior.of(one, street).weights for one in (kept.usual, usual))
-    return replace(kept, joint=kept.joint.at_prior(before, after), usual=usual)
+    if not np.array_equal(usual, kept.usual):
+        before, after = (StreetPrior.of(one, street).weights for one in (kept.usual, usual))
+        kept = replace(kept, joint=kept.joint.at_prior(before, after), usual=usual)
+    return replace(kept, groups=_with_traffic(kept, context, street))
 
 
 def informed(
@@ -421,15 +349,14 @@ def informed(
             joint = joint.looked(look.sensor, look.answer, look.stamp_ns, street)
     if kept is before and joint is kept.joint:  # No news: what is out ends as in silence
         return replace(kept, stamp_ns=measurement.stamp_ns)
-    kept = _shown(replace(kept, joint=joint, stamp_ns=measurement.stamp_ns), street)
-    return alerted(kept, context, policy, street)
+    return alerted(_shown(replace(kept, joint=joint, stamp_ns=measurement.stamp_ns), street), policy, street)
 
 
 def _shown(kept: StreetBelief, street: StreetModel) -> StreetBelief:
     """Return the belief with the vehicles that are in view by their sound alone; a look finds them itself."""
     if kept.watched(kept.stamp_ns):
         return replace(kept, shown=(0.0,) * kept.k)
-    own, now = kept.emerged_recently(kept.stamp_ns, street), kept.joint.emerged_from.tolist()
+    own, now = kept.emerged_since(kept.stamp_ns, street.beside_s), kept.joint.emerged_from.tolist()
     pairs = zip(own, kept.shown, now, strict=True)
     return replace(kept, shown=tuple(0.0 if is_own else max(pair) for is_own, *pair in pairs))
 
@@ -439,19 +366,13 @@ def _read(
 ) -> StreetBelief:
     """Return the belief after what a source has found: the last three seconds, or the last one alone."""
     reading, source, stamp_ns = measurement.sequence, measurement.source, measurement.stamp_ns
-    street, masked_ns = settings.street, kept.masked_ns
     # The sound is that of a vehicle which has just come into view.
-    masked = masked_ns is not None and stamp_ns - masked_ns <= nanoseconds(street.masked_s)
+    street, masked = settings.street, any(kept.emerged_since(stamp_ns, settings.street.masked_s))
     step_s = seconds(stamp_ns - kept.read_ns[source]) if source in kept.read_ns else math.inf
     if isinstance(reading, SequenceReading):
-        nats = presence_nats(measurement.signature)
-        last = kept.windows.get(source, WindowPresence(nats, stamp_ns))
-        windows = {**kept.windows, source: last.after(nats, stamp_ns, street.window_s)}
         if not kept.has_times:  # The alarm by windows goes by another event
             kept = replace(kept, recent=(), over_ns=(None,) * kept.k)
-        kept = replace(
-            kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm, windows=windows
-        )
+        kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
         kept = _expecting(kept, context, street)
         joint, sides, memory_s = *_sequence(kept, reading, context, street), street.reading_s
     else:
@@ -460,7 +381,7 @@ def _read(
         signature = measurement.signature
         found = dict(zip(signature.directions, signature.hidden, strict=True))
         hidden = [found.get(side) for side in context.directions]
-        usual = kept.expected_of(kept.read_nats(context, street), street).by_part
+        usual = kept.prior(street).by_part
         in_view = float(usual[..., 1].sum())
         told = window_likelihoods(hidden, signature.visible, signature.none, in_view)
         if settings.windows == "likelihood":
@@ -473,9 +394,8 @@ def _read(
         return kept
     # Of evidence that overlaps, what is new counts.
     new = -math.expm1(-step_s / memory_s)
-    prior = kept.expected_of(kept.read_nats(context, street), street)
     joint, heard = joint / joint.sum(), measurement.heard.share
-    return replace(kept, joint=kept.joint.read(source, joint, prior, sides, new, heard))
+    return replace(kept, joint=kept.joint.read(source, joint, kept.prior(street), sides, new, heard))
 
 
 def _sequence(
@@ -484,15 +404,12 @@ def _sequence(
     """Return what a sequence makes of the sides that it names, and which they are in the context."""
     sides = [k for k, side in enumerate(context.directions) if side in SIDES]
     rows = [SIDES.index(context.directions[k]) for k in sides]
-    expected, share = kept.moved(kept.read_nats(context, street))[sides], reading.share
+    expected, share = kept.groups[sides], reading.share
     usual_in_view = float(share[BINS] / share[BINS:].sum())
     joint = joint_reading(at_prior(reading.groups[rows], share, expected), usual_in_view, street.by_sound)
     # Averaged, hops are surer than each.
     usual = StreetPrior.of(expected, street).by_part
-    joint = usual * (joint / usual) ** street.reading_gain
-    for one in kept.windows.values():
-        joint = joint * noticed(one.nats, len(sides), street)[..., None] ** street.window_gain
-    return joint, sides
+    return usual * (joint / usual) ** street.reading_gain, sides
 
 
 def _watched(kept: StreetBelief, over: BoolArray) -> WatchedHop:
@@ -502,13 +419,13 @@ def _watched(kept: StreetBelief, over: BoolArray) -> WatchedHop:
     return WatchedHop(kept.stamp_ns, looked, tuple(over.tolist()), kept.emerged_ns, tuple(within))
 
 
-def alerted(kept: StreetBelief, context: Context, policy: CueingPolicy, street: StreetModel) -> StreetBelief:
+def alerted(kept: StreetBelief, policy: CueingPolicy, street: StreetModel) -> StreetBelief:
     """Return the belief with what decides held against the alarm's threshold.
 
     The mean over the last .3 s, or since a vehicle came into view from that side, of the log-odds that the
     alarm goes by, and of a less likely side no more than that two come.
     """
-    nats = kept.alarm_nats(context, street).round(9)  # Rounding must not choose a side
+    nats = kept.alarm_nats.round(9)  # Rounding must not choose a side
     since_ns = kept.stamp_ns - _SMOOTHED_NS + SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, tuple(nats.tolist())))
     # Of each hop the last one: however many measurements there are, time counts.
@@ -520,8 +437,7 @@ def alerted(kept: StreetBelief, context: Context, policy: CueingPolicy, street: 
     elsewhere = np.maximum(1.0 - kept.joint.none_comes, TINY) - kept.comes
     # By windows all sides have the same log-odds.
     rank = decided if kept.has_times else kept.comes.round(9)
-    learned_nats = np.array(kept.read_nats(context, street))
-    decided = of_two(decided, kept.comes, elsewhere, rank, threshold, learned_nats)
+    decided = of_two(decided, kept.comes, elsewhere, rank, threshold)
     over, denied = decided >= threshold, np.array(kept.sides.risks) < street.death
     watch = kept.watch
     if kept.alarm is not None:
@@ -539,12 +455,7 @@ def alerted(kept: StreetBelief, context: Context, policy: CueingPolicy, street: 
 
 
 def of_two(
-    nats: FloatArray,
-    here: FloatArray,
-    elsewhere: FloatArray,
-    rank: FloatArray,
-    threshold: float,
-    learned_nats: FloatArray | float = 0.0,
+    nats: FloatArray, here: FloatArray, elsewhere: FloatArray, rank: FloatArray, threshold: float
 ) -> FloatArray:
     r"""Return what is held against the threshold, nats.
 
@@ -553,8 +464,7 @@ def of_two(
     .. math:: \gamma + \log \frac{P(\text{comes here})}{P(\text{comes on another side, not here})}
 
     If it is not known from which side one vehicle comes, all are likely; how rarely one on another side is
-    believed to come alone shows that two come. `learned_nats` is what was learned of the traffic of a side,
-    which the chances hold and `nats` do not. Shapes: all (K,).
+    believed to come alone shows that two come. Shapes: all (K,).
 
     Examples
     --------
@@ -562,7 +472,7 @@ def of_two(
     >>> of_two(nats, np.array([0.45, 0.45]), np.array([0.45, 0.45]), nats, -1.0).round(3).tolist()
     [0.1, -1.0]
     """
-    apart = np.log(np.maximum(here, TINY)) - np.log(np.maximum(elsewhere, TINY)) - learned_nats
+    apart = np.log(np.maximum(here, TINY)) - np.log(np.maximum(elsewhere, TINY))
     # One that is exactly as likely alone as here is not named.
     least = threshold + np.where(apart > 0.0, apart, np.minimum(apart, -TINY))
     return np.asarray(np.where(rank >= rank.max(), nats, np.minimum(nats, least)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.risk_map import BINS
-from worldstate.abduction.sequence.sequence_model import held
+from worldstate.commissioning.alarm_curve import raised_at
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
@@ -422,7 +422,7 @@ def _counted(trial: Trial, said: Decisions, alarm: BoolArray) -> dict[str, float
 
 def _held(score: FloatArray, threshold: float) -> BoolArray:
     """Return the alarm of a sequence: its score is a mean over .3 s already, and it stays for a second."""
-    return held(score >= threshold)
+    return raised_at((score >= threshold).astype(float), 1.0)
 
 
 def _sustained(hops: int) -> Rule:

@@ -23,8 +23,8 @@ import numpy as np
 from scipy.signal import lfilter, sosfilt
 
 from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
-from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S, held
-from worldstate.commissioning.alarm_curve import measured_curve
+from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.commissioning.alarm_curve import measured_curve, raised_at
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import QUIET_KINDS
 from worldstate.commissioning.stream_exam import (
@@ -234,7 +234,7 @@ def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Fi
     if onsets_per_hour is None:
         return dict.fromkeys(("meter_detected", "meter_lead_missed_as_0_s", "meter_onsets_per_hour"))
     least_db = measured_curve({"": quiet}).default(onsets_per_hour).threshold_nats
-    louder = ((one.heard, held(above_place_db(one.heard) >= least_db)) for one in streams)
+    louder = ((one.heard, raised_at(above_place_db(one.heard), least_db)) for one in streams)
     figures = approach_table([(heard, np.stack([on, on], axis=1)) for heard, on in louder]).loud().figures()
     return {f"meter_{name}": figures[name] for name in ("detected", "lead_missed_as_0_s", "onsets_per_hour")}
 
