@@ -52,14 +52,8 @@ def headlights() -> Iterator[Measurement]:
 
 def settings_by_their_former_names(folder: Path) -> Iterator[str]:
     """Give the filter its thresholds, as the docstring of `FilterSettings` had it."""
-    settings = FilterSettings(
-        look_interval_s=0.4,
-        birth_probability=0.3,
-        death_probability=0.2,
-        delete_existence=0.1,
-        stream="drive",
-    )
-    now = FilterSettings(stream="drive", street=StreetModel(look_s=0.4, birth=0.3, death=0.2))
+    settings = FilterSettings(1.0, 0.4, birth_probability=0.3, death_probability=0.2, delete_existence=0.1)
+    now = FilterSettings(street=StreetModel(look_s=0.4, birth=0.3, death=0.2))
     former, today = WorldFilter(settings=settings), WorldFilter(settings=now)
     for one in headlights():
         former, today = former.update(one), today.update(one)

@@ -42,14 +42,14 @@ class FilterSettings:
     """
 
     window_s: float = 1.0  # Of the published feature
-    stream: str = "worldstate"
-    street: StoredStreet = field(default_factory=StreetModel)
-    windows: Literal["posterior", "likelihood"] = "posterior"
-    # Of 0.3; for one minor version they are taken for the street model's numbers.
+    # Of 0.3, in its order; for one minor version they are taken for the street model's numbers.
     look_interval_s: InitVar[float | None] = None
     birth_probability: InitVar[float | None] = None
     death_probability: InitVar[float | None] = None
     delete_existence: InitVar[float | None] = None
+    stream: str = "worldstate"
+    street: StoredStreet = field(default_factory=StreetModel)
+    windows: Literal["posterior", "likelihood"] = "posterior"
 
     def __post_init__(self, *former: float | None) -> None:
         given = [one for one in zip(_FORMER, former, strict=True) if one[1] is not None]
