@@ -21,6 +21,7 @@ from worldstate_lab.sequences.scores import (
     leads,
     sweep,
 )
+from worldstate_lab.sequences.window_rows import FILTERS
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 
@@ -211,6 +212,27 @@ def test_the_command_scores_a_made_up_corner(tmp_path, capsys) -> None:
     assert "sequences corner" in json.loads((tmp_path / "results.json").read_text())
 
 
+def test_the_filter_that_ships_is_the_product_and_every_way_of_windows_is_another_one(
+    tmp_path, capsys
+) -> None:
+    folder, found = write_corner(tmp_path / "corner", draw()), []
+    for words in (["--windows"], []):
+        assert main(["sequences", str(folder), "--path", "seven", "--json", *words]) == 0
+        found.append(json.loads(capsys.readouterr().out)["seven"])
+    windows, product = found
+    for camera, row in (("with the camera", ""), ("sound alone", ", sound alone")):
+        ships = windows[camera]["sequence"]
+        assert ships["alarms"]["text"] == product["rows"][f"world-state advisory{row}"]["text"]
+        score = product["scores"]["product, with camera" if not row else "product, sound alone"]
+        for lead in ("0.5", "1", "2"):
+            for figure in ("auroc", "auroc_all_hops", "side_auroc"):
+                assert ships["leads"][lead][figure] == score["leads"][lead][figure]
+    assert ships["within_1s"]["brier_skill"] is not None
+    # No way is another one under a second name.
+    first, *others = (windows["sound alone"][one.name]["at_onset"]["threshold"] for one in FILTERS)
+    assert len({first, *others}) == len(FILTERS)
+
+
 def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) -> None:
     folder = write_corner(tmp_path / "corner", draw())
     assert main(["sequences", str(folder), "--boxes", "none", "--start", "1"]) == 0
@@ -227,6 +249,7 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
         (["--features", "a.csv"], "--lists"),
         (["--model", "a.json"], "--path"),
         (["--path", "seven", "--streams", "a.npz"], "every path"),
+        (["--windows", "--streams", "a.npz"], "no --windows"),
         (["--start", "9"], "--start"),
     ],
 )

@@ -11,18 +11,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from mapie.risk_control.methods import find_best_predict_param, get_r_hat_plus
 
-from worldstate import WorldFilter, WorldState
+from worldstate import FilterSettings, Measurement, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.commissioning.alarm_curve import (
-    LOUDEST,
-    UNREACHED,
-    advised,
-    alarm_levels,
-    measured_curve,
-    raised_at,
-)
+from worldstate.adapters.files.model_file import read_model
+from worldstate.belief.street_model import StreetModel
+from worldstate.commissioning import alarm_curve, commission
+from worldstate.commissioning.alarm_curve import LOUDEST, advised, measured_curve, raised_at
 from worldstate.commissioning.heard_stream import (
     CommissionSettings,
     HeardStream,
@@ -279,24 +275,42 @@ def test_a_budget_for_other_junctions_is_kept_by_those_left_out_and_is_that_of_r
     assert curve.default(rate).threshold_nats == curve.threshold_nats[int(kept)]
 
 
-@settings(max_examples=5, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(-2.0, 1.0))
-def test_the_levels_of_a_stream_raise_what_the_filter_advises_of_at_any_threshold(
-    seed: int, threshold_nats: float
+OF_A_MODEL = {
+    "reading_s": st.floats(0.05, 2.0),
+    "reading_gain": st.floats(0.5, 1.5),
+    "death": st.floats(0.01, 0.3),
+}
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-2.0, 1.0), st.fixed_dictionaries(OF_A_MODEL))
+def test_the_levels_of_a_stream_raise_what_the_filter_of_the_model_advises_of_at_any_threshold(
+    seed: int, threshold_nats: float, numbers: dict[str, float]
 ) -> None:
-    rng = np.random.default_rng(seed)
+    rng, of_model = np.random.default_rng(seed), replace(StreetModel(), **numbers)
     groups = np.exp(rng.normal(0.0, 0.4, (150, 2, len(GROUPS))).cumsum(axis=0))
     share = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
-    def states(alarm: SequenceAlarm) -> Iterator[WorldState]:
-        world = WorldFilter()
+    def measured(alarm: SequenceAlarm) -> Iterator[Measurement]:
         for hop, one in enumerate(groups / groups.sum(axis=-1, keepdims=True), 1):
             reading = SequenceReading(one, share, 0.1, alarm)
-            world = world.update(replace(street.heard(hop, None, Unqueried("no camera")), sequence=reading))
+            yield replace(street.heard(hop, None, Unqueried("no camera")), sequence=reading)
+
+    def states(alarm: SequenceAlarm) -> Iterator[WorldState]:
+        world = WorldFilter(settings=FilterSettings(street=of_model))
+        for one in measured(alarm):
+            world = world.update(one)
             yield world.state
 
     told = advised(states(SequenceAlarm(threshold_nats, 20.0))).any(axis=1)
-    np.testing.assert_array_equal(raised_at(alarm_levels(states(UNREACHED)), threshold_nats), told)
+    model = replace(read_model(), street=of_model)
+    with pytest.MonkeyPatch.context() as patch:  # A stream is heard as `measured` has it
+        patch.setattr(commission, "stream_evidence", lambda windows, stream: None)
+        patch.setattr(
+            alarm_curve, "measurements", lambda stream, windows, silent, *_, **__: measured(silent.alarm)
+        )
+        levels = commission.levels_of(model, heard([]))
+    np.testing.assert_array_equal(raised_at(levels, threshold_nats), told)
 
 
 def test_a_curve_that_no_count_has_is_refused() -> None:

@@ -9,8 +9,8 @@ from worldstate.ground import InvalidArgumentError, in_range
 
 from .street_model import StoredStreet, StreetModel
 
-# Names in the street model, in the order of the arguments of 0.3.
-_FORMER = ("look_s", "birth", "death", "delete")
+# Names in the street model, in the order of the arguments of 0.3; one number ends what is seen and heard.
+_FORMER = ("look_s", "birth", "death", "death")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +42,21 @@ class FilterSettings:
     """
 
     window_s: float = 1.0  # Of the published feature
-    stream: str = "worldstate"
-    street: StoredStreet = field(default_factory=StreetModel)
-    windows: Literal["posterior", "likelihood"] = "posterior"
-    # Of 0.3; for one minor version they are taken for the street model's numbers.
+    # Of 0.3, in its order; for one minor version they are taken for the street model's numbers.
     look_interval_s: InitVar[float | None] = None
     birth_probability: InitVar[float | None] = None
     death_probability: InitVar[float | None] = None
     delete_existence: InitVar[float | None] = None
+    stream: str = "worldstate"
+    street: StoredStreet = field(default_factory=StreetModel)
+    windows: Literal["posterior", "likelihood"] = "posterior"
 
     def __post_init__(self, *former: float | None) -> None:
-        given = {name: one for name, one in zip(_FORMER, former, strict=True) if one is not None}
+        given = [one for one in zip(_FORMER, former, strict=True) if one[1] is not None]
         if given:
-            names = ", ".join(given)
+            changed: dict[str, Any] = dict(reversed(given))  # Of both `death_probability` counts
+            names = ", ".join(sorted(changed))
             warnings.warn(f"give {names} to StreetModel, as FilterSettings.street", DeprecationWarning, 3)
-            changed: dict[str, Any] = {**given}
             object.__setattr__(self, "street", replace(self.street, **changed))
         in_range("window_s", self.window_s, 0.0, math.inf, open_low=True, open_high=True)
         if self.windows not in get_args(type(self).__annotations__["windows"]):

@@ -24,6 +24,7 @@ from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import asked_again, beside_foreign
+from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.spectra.sound_character import MEASURES
@@ -118,9 +119,10 @@ def stream_states(
     sequence: SequenceModel,
     evidence: FloatArray,
     guard: DomainGuard | None = None,
+    street: StreetModel | None = None,
 ) -> Iterator[WorldState]:
-    """Yield the snapshot of every hop of a stream without a camera."""
-    world = WorldFilter()
+    """Yield the snapshot of every hop of a stream without a camera, by the numbers of `street`."""
+    world = WorldFilter(settings=FilterSettings(street=street or StreetModel()))
     for measurement in measurements(heard, windows, sequence, evidence, guard=guard):
         world = world.update(measurement)
         yield world.state
@@ -132,18 +134,19 @@ def advised(states: Iterable[WorldState]) -> BoolArray:
     return np.array([[side in sides for side in SIDES] for sides in told])
 
 
-def alarm_levels(states: Iterable[WorldState]) -> FloatArray:
+def alarm_levels(states: Iterable[WorldState], street: StreetModel | None = None) -> FloatArray:
     """Return the threshold up to which the alarm of each side is raised at every hop, shape (n, 2).
 
-    Of states with the alarm `UNREACHED`: the filter's own log-odds, less what raises its threshold just then;
-    minus infinity if too little was heard or the risk denies an alarm.
+    Of states with the alarm `UNREACHED`, by the numbers of `street`: the filter's own log-odds, less what
+    raises its threshold just then; minus infinity if too little was heard or the risk denies an alarm.
     """
-    return np.array([[_level(state, side) for side in SIDES] for state in states])
+    denied = (street or StreetModel()).death
+    return np.array([[_level(state, side, denied) for side in SIDES] for state in states])
 
 
-def _level(state: WorldState, side: str) -> float:
+def _level(state: WorldState, side: str, denied: float) -> float:
     own = (cue for cue in state.cues if cue.direction == side)
-    cue = next((cue for cue in own if (cue.risk or 0.0) >= StreetModel().death), None)
+    cue = next((cue for cue in own if (cue.risk or 0.0) >= denied), None)
     terms = None if cue is None or state.no_sequence is not None else cue.evidence
     if terms is None or terms.hypothesis != "coming":
         return -np.inf

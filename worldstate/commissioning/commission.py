@@ -283,7 +283,8 @@ def levels_of(model: Model, heard: HeardStream) -> FloatArray:
     """Return the `alarm_levels` of a stream by the model as it would be used, shape (hops, 2)."""
     windows, sequence = parts_of(model)
     evidence, silent = stream_evidence(windows, heard), replace(sequence, alarm=UNREACHED)
-    return alarm_levels(stream_states(heard, windows, silent, evidence, model.guard))
+    states = stream_states(heard, windows, silent, evidence, model.guard, model.street)
+    return alarm_levels(states, model.street)
 
 
 def with_curve(model: Model, curve: AlarmCurve, onsets_per_hour: float) -> Model:
@@ -360,7 +361,7 @@ def _examined(model: Model, heard: HeardStream) -> ExaminedStream:
     if sequence.alarm is None:
         raise InvalidArgumentError("model: expected one with an alarm, as `commission` makes")
     evidence = stream_evidence(windows, heard)
-    told = advised(stream_states(heard, windows, sequence, evidence, model.guard))
+    told = advised(stream_states(heard, windows, sequence, evidence, model.guard, model.street))
     return ExaminedStream(heard, stream_truth(heard), sequence.posterior(evidence), told)
 
 

@@ -19,6 +19,8 @@ from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import learn_passes
 from worldstate.adapters.source import street_listener
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.street_model import StreetModel
 from worldstate.commissioning.alarm_curve import measurements
 from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
@@ -179,7 +181,8 @@ def passed_stream(
     """
     street = street_listener(model.domain, None, None) if learns else None
     heard, measured = stream_measurements(path, model, camera, seed, street)
-    world = WorldFilter(Context(), model.policies.for_alpha(alpha))
+    settings = FilterSettings(street=model.street or StreetModel())
+    world = WorldFilter(Context(), model.policies.for_alpha(alpha), settings)
     return PassedStream(heard, stream_truth(heard), followed(world, measured, street))
 
 

@@ -155,7 +155,7 @@ def heard(chain: Chain, recording: CornerRecording) -> Trial:
 
 def _product_row(step: Step) -> tuple[FloatArray, ...]:
     state, measured = step.state, step.measurement
-    cues = [_cue(state, side) for side in SIDES]
+    cues = [cue_of(state, side) for side in SIDES]
     sides, reading = measured.signature.sides, measured.sequence
     history = step.checkpoint.history
     priors = cues[0].hypotheses
@@ -163,7 +163,7 @@ def _product_row(step: Step) -> tuple[FloatArray, ...]:
     return (
         np.array([_LEAST_NATS if one.evidence is None else one.evidence.compared_nats for one in cues]),
         np.array([one.risk for one in cues]),
-        np.array([_chances(one) for one in cues]),
+        np.array([chances(one) for one in cues]),
         np.array([priors.hidden, priors.visible, priors.none]),
         np.array([one.advisory is not None for one in cues]),
         np.full(len(SIDES), np.nan) if sides is None else np.array(sides.log_ratios),
@@ -172,11 +172,12 @@ def _product_row(step: Step) -> tuple[FloatArray, ...]:
     )
 
 
-def _cue(state: WorldState, side: str) -> RiskCue:
+def cue_of(state: WorldState, side: str) -> RiskCue:
+    """Return the cue of a side."""
     return next(one for one in state.cues if one.direction == side)
 
 
-def _chances(cue: RiskCue) -> list[float]:
+def chances(cue: RiskCue) -> list[float]:
     """Return the chances of coming into view by horizon, NaN where nothing is stated."""
     if cue.within is None:
         return [np.nan] * len(HORIZONS_S)

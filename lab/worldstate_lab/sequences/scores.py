@@ -259,12 +259,12 @@ def sweep(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> Mapping[str,
     return found | {"level": levels}
 
 
-def calibration(trials: Sequence[Trial], rng: np.random.Generator) -> Row:
-    """Return how true the chances are that something comes into view within 2 s on a side, and their skill.
+def calibration(trials: Sequence[Trial], rng: np.random.Generator, *, within_s: float = WITHIN_S) -> Row:
+    """Return how true the chances are that something comes into view in time on a side, and their skill.
 
     Of both sides, at hops before T0 of approaches and at all hops of hazard-free recordings.
     """
-    parts = [_chances(one) for one in trials]
+    parts = [_chances(one, within_s) for one in trials]
     if not sum(map(len, parts)):
         return {"ece": None, "brier_skill": None, "base_rate": None, "hops": 0}
     every = np.concatenate(parts)
@@ -283,11 +283,11 @@ def _calibrated(pairs: AnyArray) -> dict[str, float | None]:
     return {"ece": expected_calibration_error(said, true), "brier_skill": brier_skill(said, true)}
 
 
-def _chances(trial: Trial) -> FloatArray:
+def _chances(trial: Trial, within_s: float) -> FloatArray:
     """Return the chance of each side and whether it came true, shape (2 n, 2)."""
-    said = trial.hops.within[:, :, HORIZONS_S.index(WITHIN_S)]
+    said = trial.hops.within[:, :, HORIZONS_S.index(within_s)]
     coming_s = (trial.t0_s - trial.hops.time_s)[:, None] + np.zeros(len(SIDES))
     own = np.array([side == trial.label for side in SIDES])
-    true = own & (coming_s <= WITHIN_S + SLACK_S)
+    true = own & (coming_s <= within_s + SLACK_S)
     scored = np.isfinite(said) & (trial.hazard_free | (coming_s > SLACK_S))
     return np.stack([said[scored], true[scored]], axis=-1)

@@ -19,6 +19,7 @@ Examples
   worldstate-lab sequences ovad-sequences --path seven --jobs 2
   worldstate-lab sequences ovad-sequences --features extracted_features.csv --lists static.csv dynamic.csv
   worldstate-lab sequences ovad-sequences --path pair --boxes none --start 1 --json
+  worldstate-lab sequences ovad-sequences --windows
 """
 
 import argparse
@@ -53,6 +54,7 @@ from worldstate_lab.sequences.path_tables import FOLLOWED, path_lines, scores_ta
 from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
 from worldstate_lab.sequences.summed_scores import LevelReading, summed_scores
 from worldstate_lab.sequences.tracking import tracking_figures
+from worldstate_lab.sequences.window_rows import window_lines, window_rows
 from worldstate_lab.trials.pass_cache import Failed, attempted
 
 PAIR, EXAM = Path("pair"), "exam.json"
@@ -70,6 +72,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--features", type=Path, metavar="CSV", help="windows to train the published classifier on")
     add("--lists", type=Path, nargs="+", default=[], metavar="CSV", help="recordings left out of them")
     add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="of the pair, for the summed rows")
+    add("--windows", action="store_true", help="only what windows are worth by how they enter the filter")
     add("--start", type=float, default=0.0, metavar="S", help="cut off every start (default: %(default)s)")
     add("--seed", type=int, default=1, help="of folds and intervals (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -78,7 +81,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     _check(arguments)
-    arguments.seeds = range(arguments.seed, arguments.seed + SEEDS)
+    arguments.seeds = range(arguments.seed, arguments.seed + (1 if arguments.windows else SEEDS))
     start_s = round(in_range("--start", arguments.start, 0.0, _LONGEST_CUT_S), 1)
     recordings = [one.cut(start_s) for one in read_recordings(arguments.folder)]
     _check_kinds(recordings, "found one kind")
@@ -86,6 +89,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     report: dict[str, Any] = {"start_s": start_s, "boxes": arguments.boxes}
     lines, heard = list[str](), dict[PathName, Heard]()
     for chain in chains:
+        if arguments.windows:
+            report[chain.path] = window_rows(chain, recordings, arguments.seed, arguments.jobs)
+            lines += window_lines(chain.path, report[chain.path])
+            continue
         heard[chain.path], failed = _heard(chain, recordings, arguments.jobs)
         report[chain.path] = _figures(arguments, chain, heard[chain.path]) | {"failed": failed}
         lines += [*path_lines(chain.path, report[chain.path]), ""]
@@ -101,8 +108,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidArgumentError("--features: expected together with --lists, so that none is tested on")
     if arguments.model is not None and arguments.path is None:
         raise InvalidArgumentError("--model: expected --path, which it was made for")
-    if arguments.streams and arguments.path is not None:
-        raise InvalidArgumentError("--streams: expected every path, got one")
+    if arguments.streams and (arguments.path is not None or arguments.windows):
+        raise InvalidArgumentError("--streams: expected every path and no --windows, got one")
 
 
 def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:
