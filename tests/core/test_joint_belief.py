@@ -133,6 +133,26 @@ def test_it_is_what_a_factor_graph_infers(seed: int) -> None:
         )
 
 
+@given(SEEDS, st.sampled_from([1, 2]))
+def test_one_far_off_is_one_vehicle_on_whichever_sides_it_sounds(seed: int, sides: int) -> None:
+    """Counted on each side, it made a vehicle of nothing; and what is in view is not far off as well.
+
+    Of streets in which none comes the explanations are the reading's own groups.
+    """
+    rng = np.random.default_rng(seed)
+    seen, far = 0.5 * rng.random(), 0.5 * rng.random(sides)
+    groups = np.full((sides, len(GROUPS)), 1e-12)
+    groups[:, GROUPS.index("seen")], groups[:, GROUPS.index("rising")] = seen, far
+    groups[:, GROUPS.index("none")] = 1.0 - seen - far
+    joint = joint_reading(groups / groups.sum(axis=1, keepdims=True), 0.2, STREET.by_sound)
+    nothing, in_view = joint[(*[NONE] * sides, 0)], joint[(*[NONE] * sides, 1)]
+    assert nothing == pytest.approx(1.0 - seen - far.max(), abs=1e-9)
+    assert in_view == pytest.approx(seen, abs=1e-9)
+    for k in range(sides):
+        others = tuple(j for j in range(sides + 1) if j != k)
+        assert joint.sum(axis=others)[NONE + 1] == pytest.approx(far[k], abs=1e-9)
+
+
 @given(SEEDS)
 @settings(max_examples=5, deadline=None)
 def test_alone_a_reading_is_believed_as_it_is_whatever_was_believed_before(seed: int) -> None:

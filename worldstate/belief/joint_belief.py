@@ -199,10 +199,11 @@ def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> 
     .. math:: P(\bar C_k, \bar C_j) = \tfrac{1}{2} \sum_k \big(1 - P(C_k) - q_k(other)\big)
 
     within what the two chances allow. Given on which sides vehicles come, the bins of the sides are
-    independent, and each side has its own marginal. P(another one is in view ahead of one that comes) is the
-    mean of that by sound, of the street without it (share `by_sound`), and of the usual one (the rest), but
-    at most the first: a camera that finds what the sound denies is no evidence for a hidden vehicle. Of one
-    side "other" is a street without it.
+    independent, and each side has its own marginal. If none comes, what is far off is one vehicle on
+    whichever sides it sounds, and what is in view is all that sounds. P(another one is in view ahead of one
+    that comes) is the mean of that by sound, of the street without it (share `by_sound`), and of the usual
+    one (the rest), but at most the first: a camera that finds what the sound denies is no evidence for a
+    hidden vehicle. Of one side "other" is a street without it.
 
     Shapes: groups (sides, groups).
     """
@@ -216,17 +217,22 @@ def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> 
     parts[:, 0, NONE], parts[:, 0, DISTANT] = 1.0 - distant, distant
     parts[:, 1, FIRST_BIN:] = coming / np.maximum(comes, TINY)[:, None]
     if len(groups) == 1:
-        alone, beside = (1.0 - comes[0]) * parts[0, 0], comes[0] * parts[0, 1]
+        none, beside = 1.0 - float(comes[0]), comes[0] * parts[0, 1]
     else:
         none = float((1.0 - comes - other).mean())
         none = min(max(none, 1.0 - float(comes.sum()), 0.0), 1.0 - float(comes.max()))
         both = max(float(comes.sum()) - (1.0 - none), 0.0)
         chances = {(0, 1): comes[1] - both, (1, 0): comes[0] - both, (1, 1): both}
-        alone = none * np.outer(*parts[:, 0])
         beside = np.sum([one * np.outer(parts[0, a], parts[1, b]) for (a, b), one in chances.items()], axis=0)
-    joint = np.stack(
-        [alone * (1.0 - seen) + beside * (1.0 - behind), alone * seen + beside * behind], axis=-1
-    )
+    # If none comes: what is in view is all that is heard, and what is far off is as few as explain it.
+    far = np.minimum(distant / max(1.0 - seen, TINY), 1.0)
+    clear, alone = np.zeros((2, *beside.shape))
+    alone.flat[0] = 1.0
+    for heard in np.ndindex(*[2] * len(groups)):
+        on, off = far[np.equal(heard, 1)], far[np.equal(heard, 0)]
+        clear[heard] = max(on.min(initial=1.0) - off.max(initial=0.0), 0.0)
+    joint = none * np.stack([(1.0 - seen) * clear, seen * alone], axis=-1)
+    joint += np.stack([(1.0 - behind) * beside, behind * beside], axis=-1)
     joint = np.maximum(joint, TINY)
     return np.asarray(joint / joint.sum())
 
