@@ -158,7 +158,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
         found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
         apart = np.abs(wrap_angle(tracks.mean[:, AZIMUTH] - tracks.mean[other, AZIMUTH]))
         # The nearest: the first of several would be another one in a mirror.
-        there = [i for i in found if _at_one_place(tracks, i, other, site.street.gate_rad)]
+        there = [i for i in found if _at_one_place(tracks, i, other, site.street.past_std_rad)]
         same = min(there, key=apart.__getitem__, default=None)
         if same is not None:
             first, second = sorted((same, other), key=partial(_age, tracks))
@@ -295,7 +295,7 @@ def surviving(tracks: Tracks, street: StreetModel) -> Tracks:
 
     What a camera would mostly miss is not lost for being missed: its existence says how long it is believed.
     """
-    known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= street.lost_rad**2
+    known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= (2.0 * street.past_std_rad) ** 2
     known |= tracks.miss_rate > MOSTLY_MISSED
     kept = known & (tracks.existence >= street.death) | ~tracks.seen
     return tracks if kept.all() else tracks.taken(kept)
