@@ -6,7 +6,7 @@ from worldstate import WorldState
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 
 SLACK = 1e-9
-LEAST_RISK, HIGH_RISK, HOLDS_NS = 0.1, 0.7, 1_005_000_000
+LEAST_RISK, HIGH_RISK, HOLDS_NS = 0.1, 0.5, 1_005_000_000
 _BUDGET_LOST = {"uncalibrated", "unheard", "budget broken"}
 
 

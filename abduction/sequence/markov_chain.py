@@ -50,7 +50,7 @@ def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
     return np.asarray(moved / moved.sum())
 
 
-def balanced(chain: FloatArray, share: FloatArray, rounds: int = 1000) -> FloatArray:
+def balanced(chain: FloatArray, share: FloatArray, rounds: int = 2000) -> FloatArray:
     r"""Return the chain nearest to another one that leaves a distribution as it is.
 
     .. math:: \pi A = \pi

@@ -329,8 +329,8 @@ def test_one_in_five_is_heard_on_the_wrong_side() -> None:
     hidden = replace(born("left", 0, 0.9, 0, SITE), side=0)
     at_edges = (replace(box_scan(way * 0.56, 0.1).detections, width_rad=np.zeros(1)) for way in (1.0, -1.0))
     here, there = (emergence_density([hidden], one, SITE)[0, 0] for one in at_edges)
-    peak = 1.0 / (0.15 * math.sqrt(2.0 * math.pi))
-    assert (here, there) == pytest.approx((0.8 * peak, 0.2 * peak), rel=1e-6)
+    wrong, peak = SITE.street.side_confusion, 1.0 / (SITE.street.edge_std_rad * math.sqrt(2.0 * math.pi))
+    assert (here, there) == pytest.approx(((1.0 - wrong) * peak, wrong * peak), rel=1e-6)
 
 
 @given(st.floats(-0.5, 0.5), UNIT)

@@ -418,7 +418,7 @@ def test_a_first_box_is_believed_by_its_score_and_the_cameras_clutter(score, clu
     first = measured(1.0, FRONT, box, answer=Present(0.05, clutter))
     world = start(settings=FilterSettings(street=StreetModel(death=1e-9))).update(first)
     (born,) = world.state.entities
-    odds = 0.05 / -math.log1p(-clutter) * score / (1.0 - score)
+    odds = StreetModel().births / -math.log1p(-clutter) * score / (1.0 - score)
     assert born.existence_probability == pytest.approx(odds / (1.0 + odds), rel=1e-6)
     again, gone = (
         world.update(replace(first, stamp_ns=2 * 10**9 - 9 * 10**8, sightings=boxes)).state.entities

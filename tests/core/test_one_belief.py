@@ -16,6 +16,7 @@ from worldstate.abduction.cueing.risk_map import PlattMap
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
+from worldstate.belief.street_model import StreetModel
 from worldstate.ground import LEAST_HEARD
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Heard, Look, Odometry, Position, PositionScan
@@ -318,8 +319,8 @@ def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_tha
     before, after = seen_from_left(both_sides((0.97, 0.01), (0.01, 0.97), "coming_0.5s"))
     assert [event.kind for event in after.events] == ["handed_over"]
     assert cue_of(before, "left").advisory is not None and cue_of(after, "left").advisory is None
-    # One in six has another one behind it.
-    assert cue_of(after, "left").risk == pytest.approx(1.0 / 6.0, abs=0.03)
+    # As many as follow have another one behind them.
+    assert cue_of(after, "left").risk == pytest.approx(StreetModel().follows, abs=0.03)
 
 
 def test_an_advisory_and_what_decided_end_with_the_news_and_with_the_vehicle_wherever_it_comes_from() -> None:

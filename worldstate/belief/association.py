@@ -226,7 +226,7 @@ def _azimuth_density(
     variance = own + detections.std_rad[:, None] ** 2
     squares = residual**2 / variance
     density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
-    farthest_rad = math.pi if detections.positions else site.street.gate_rad
+    farthest_rad = math.pi if detections.positions else site.street.past_std_rad
     return np.where((squares > GATE) | (np.abs(residual) > farthest_rad), FORBIDDEN, density)
 
 

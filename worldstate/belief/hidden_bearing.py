@@ -5,9 +5,7 @@ at azimuth a and speed v, it stands t seconds before line of sight at
 
 .. math:: \tan\theta(t) = \tan a + \frac{v}{d}\, t
 
-Metres are not in the sound, but the time to visible is; the mean is taken over its distribution and over
-what is not known of v / d. Of the variance a fifth is the place's: what is heard is how far behind the edge
-a vehicle is, and most of what is not known of the time is at which pace it comes.
+Metres are not in the sound, but the time to visible is: mean and variance are taken over its distribution.
 
 A hidden road user with a place p and a velocity w over ground comes into view when it passes the line from
 the ego vehicle, which drives along e(t), past the corner c of its occluder:
@@ -33,9 +31,7 @@ from worldstate.ground import TINY, FloatArray, wrap_angle
 from .site_geometry import USUAL_EDGE_STD, SideGeometry, SiteGeometry
 from .track import Tracks
 
-# What is not known of v / d: two points of a normal distribution, by Gauss and Hermite.
-_POINTS = np.array([-1.0, 1.0])
-_MIDDLE_S = (0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1]))))[:, None]
+_MIDDLE_S = 0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1])))
 # Beyond, the street ahead ends or bends.
 _FARTHEST_RAD = math.radians(80.0)
 _STEPS = 51  # Of the times until which a line of sight is passed: between them it is interpolated
@@ -56,22 +52,15 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     """
     along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
     sign, edge_rad = math.copysign(1.0, along_rad), abs(along_rad)
-    slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * (
-        _MIDDLE_S * np.exp(side.street.pace_spread * _POINTS)
-    )
+    slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * _MIDDLE_S
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
-    weight = np.repeat(coming[:, None], len(_POINTS), axis=1) + TINY
-    weight = weight / weight.sum()
-    mean = float((weight * azimuth).sum())
+    weight = (coming + TINY) / (coming + TINY).sum()
+    mean = float(weight @ azimuth)
     # The five degrees of the usual edge hold more than the edge, from which five junctions deviate by 2.6:
     # errors of the time, which a known edge does not end. Half of their variance stays: likeliest on exam
     # seed 1 with learned edges; without it squared errors are 1.42 of the variance.
     edge = 0.5 * (side.edge_std_rad**2 + max(side.edge_std_rad, USUAL_EDGE_STD) ** 2)
-    variance = (
-        edge
-        + side.street.extent_rad**2
-        + side.street.place_share * float((weight * (azimuth - mean) ** 2).sum())
-    )
+    variance = edge + side.street.extent_rad**2 + float(weight @ (azimuth - mean) ** 2)
     return wrap_angle(sign * mean - side.yaw_rad), math.sqrt(variance)
 
 

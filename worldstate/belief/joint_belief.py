@@ -393,15 +393,14 @@ class JointBelief:
     def emerged(self, side: int, residual: float, apart: bool, street: StreetModel) -> "JointBelief":
         r"""Return the belief after a vehicle has come into view past the edge of a side.
 
-        .. math:: p' = (1 - r)\, E[p\, e] + r\, p, \qquad e(b) = e^{-t_b / T_e}
+        .. math:: p' = (1 - r)\, E[p\, e] + r\, p, \qquad e(b) = 1 \text{ if one comes, else } p_u
 
         with the chance r that it was another vehicle than the one believed there, and E, which puts it in
         view and another one behind it as often as vehicles follow. It may have been believed on another side,
         which the sound has confused with this one. If one was believed `apart` on another side, its
         marginal stays: two vehicles are not one of unknown side.
         """
-        starts_s = np.array((0.0, *COMING_S[:-1]))
-        likelihood = np.concatenate([[street.unheard] * FIRST_BIN, np.exp(-starts_s / street.emergence_s)])
+        likelihood = np.where(COMES, 1.0, street.unheard)
         gaps = np.diff(np.minimum((0.0, *COMING_S), street.follows_s)) / street.follows_s
         behind = np.concatenate([[1.0 - street.follows], [0.0], street.follows * gaps])
         others = [k for k in range(self.sides) if k != side and not apart]

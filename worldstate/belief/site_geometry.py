@@ -74,7 +74,8 @@ class SideGeometry:
 @lru_cache
 def _hidden_motion(azimuth_rad: float, std_rad: float, street: StreetModel) -> MotionBelief:
     mean = azimuth_rad, 0.0, -street.closing_hz, math.log(street.range_m)
-    spread = std_rad, street.closing_std_hz, street.closing_std_hz, street.range_spread
+    # Give or take as much again.
+    spread = std_rad, street.closing_hz, street.closing_hz, street.range_spread
     return MotionBelief.around(mean, spread)
 
 

@@ -26,7 +26,7 @@ from .memory import MOST_BOXES, Memory
 # After a hand-over no birth on its side: the window still holds the sound from before it.
 _REARM_NS = nanoseconds(1.0)
 _MASKED = 0.5  # Of the existence below which a hidden entity ends, beside a vehicle just come into view
-HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
+HIDDEN = 0.5  # Likelier than not: P(hidden | exists) of an entity that is hidden, and P(hidden) of a birth
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
 
@@ -110,7 +110,7 @@ def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry)
 
 def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> int | None:
     """Return the side on which a hidden entity is born, if one is: of one vehicle the likelier one."""
-    tracks, sides, least = memory.tracks, memory.sides, site.street.birth
+    tracks, sides, least = memory.tracks, memory.sides, HIDDEN
     heard, rearmed, every = _heard_rows(tracks), _rearmed(memory), range(len(site.sides))
     taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
     if heard and (len(heard) > 1 or sides.both < least):
@@ -154,7 +154,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
     """
     tracks, stamp_ns, into, ended = memory.tracks, memory.stamp_ns, dict[str, str](), list[int]()
     heard = _heard_rows(tracks)
-    least = site.street.birth * min((tracks.existence[i] for i in heard), default=0.0)
+    least = HIDDEN * min((tracks.existence[i] for i in heard), default=0.0)
     # Beside the less likely one the other one would not be born.
     if len(heard) > 1 and memory.sides.both < least:
         first, second, *_ = sorted(heard, key=lambda i: (-tracks.existence[i], *_age(tracks, i)))
@@ -165,7 +165,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
         found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
         apart = np.abs(wrap_angle(tracks.mean[:, AZIMUTH] - tracks.mean[other, AZIMUTH]))
         # The nearest: the first of several would be another one in a mirror.
-        there = [i for i in found if _at_one_place(tracks, i, other, site.street.gate_rad)]
+        there = [i for i in found if _at_one_place(tracks, i, other, site.street.past_std_rad)]
         same = min(there, key=apart.__getitem__, default=None)
         if same is not None:
             first, second = sorted((same, other), key=partial(_age, tracks))
@@ -302,7 +302,7 @@ def surviving(tracks: Tracks, street: StreetModel) -> Tracks:
 
     What a camera would mostly miss is not lost for being missed: its existence says how long it is believed.
     """
-    known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= street.lost_rad**2
+    known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= (2.0 * street.past_std_rad) ** 2
     known |= tracks.miss_rate > MOSTLY_MISSED
     kept = known & (tracks.existence >= street.death) | ~tracks.seen
     return tracks if kept.all() else tracks.taken(kept)

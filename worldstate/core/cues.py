@@ -19,7 +19,7 @@ from worldstate.ground import TINY
 from worldstate.measurement import Measurement
 from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
 
-from .birth_death import hidden_on
+from .birth_death import HIDDEN, hidden_on
 from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceState
 from .side_update import heard_beside
 from .site_model import FilterModel, published_belief
@@ -114,8 +114,8 @@ def _announced_ends_ns(memory: Memory, side: int) -> int:
 
 
 def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -> str | None:
-    """Return why a side of high risk has no advisory; None if its risk is below 0.7."""
-    if sides.risks[side] <= model.site.street.high_risk:
+    """Return why a side of high risk has no advisory; None if it is likelier that none comes."""
+    if sides.risks[side] <= HIDDEN:
         return None
     belief = memory.belief
     if memory.last.no_sequence == TOO_FEW:

@@ -221,7 +221,7 @@ class RiskCue:
     held : Held or None
         Given where the advisory stands below its threshold, with what for and until when.
     not_advised : str or None
-        If the risk is above 0.7 and no advisory is out, why; or that no source distinguishes this side.
+        If the risk is above 0.5 and no advisory is out, why; or that no source distinguishes this side.
     usable : bool
         Whether the cue, its advisory included, may be acted on: exactly if `why_not` is empty.
     why_not : tuple of str

@@ -34,6 +34,7 @@ STUDIES = {
         "four",
         "kinds",
         "place",
+        "street",
     )
 }
 CORNER = {name: f"worldstate_lab.cli.corner.{name}" for name in ("sequences", "junctions", "staged")}
