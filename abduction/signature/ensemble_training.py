@@ -166,12 +166,12 @@ class SiteEnsembleClassifier:
         (windows, learned), empty = ensemble.split_reference(inputs), codes == NONE
         prior_s = ensemble.PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
         real = _with_mirror_images(windows, learned, codes)
-        home = ensemble.SiteReference.from_row(real[1].mean(axis=0))
+        home = real[1].mean(axis=0)
         silence = real[0][real[2] == NONE].mean(axis=0)
         ones = np.ones(len(real[2]))
         rows = [(*real, ones)]
         if heard is not None:
-            again = np.array([one.beside(home, silence, prior_s).row for one in heard])
+            again = np.array([one.beside(home, silence, prior_s) for one in heard])
             more = _with_mirror_images(windows, again, codes)
             rows = [(*real, (1.0 - HEARD_PART) * ones), (*more, HEARD_PART * ones)]
         if self.simulated is not None and sites is not None:
@@ -234,11 +234,11 @@ def _with_mirror_images(
 
 
 def _simulated_rows(
-    windows: SimulatedWindows, home: ensemble.SiteReference
+    windows: SimulatedWindows, home: FloatArray
 ) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
     """Return log-levels, references, classes and weights, hazards of the other side behind the windows."""
     levels, reference = ensemble.split_reference(windows.X)
-    reference = np.where(np.isnan(reference), home.row, reference)
+    reference = np.where(np.isnan(reference), home, reference)
     codes = _codes(windows.y)
     other = _mirrored(codes)
     hidden = other != codes
