@@ -369,7 +369,7 @@ def neutral(evidence: SignatureEvidence, margin: float) -> SignatureEvidence:
     sides = evidence.sides
     if sides is not None:
         sides = replace(sides, log_ratios=tuple(beyond(np.array(sides.log_ratios), margin).tolist()))
-    return SignatureEvidence(evidence.directions, hidden, evidence.visible, evidence.none, sides)
+    return replace(evidence, hidden=hidden, sides=sides)
 
 
 def beyond(ratios: FloatArray, margin: float) -> FloatArray:
