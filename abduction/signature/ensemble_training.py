@@ -165,10 +165,8 @@ class SiteEnsembleClassifier:
         sites = None if groups is None else np.asarray(groups)
         (windows, learned), empty = ensemble.split_reference(inputs), codes == NONE
         prior_s = ensemble.PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
-        real = _with_mirror_images(windows, learned, codes)
-        home = real[1].mean(axis=0)
-        silence = real[0][real[2] == NONE].mean(axis=0)
-        ones = np.ones(len(real[2]))
+        real, ones = _with_mirror_images(windows, learned, codes), np.ones(2 * len(codes))
+        home, silence = real[1].mean(axis=0), real[0][real[2] == NONE].mean(axis=0)
         rows = [(*real, ones)]
         if heard is not None:
             again = np.array([one.beside(home, silence, prior_s) for one in heard])
@@ -241,13 +239,11 @@ def _simulated_rows(
     reference = np.where(np.isnan(reference), home, reference)
     codes = _codes(windows.y)
     other = _mirrored(codes)
-    hidden = other != codes
-    rows = np.concatenate([np.arange(len(codes)), np.flatnonzero(hidden)])
-    part = np.where(hidden, windows.other_side, 0.0)
-    shares = np.concatenate([1.0 - part, part[hidden]])
-    sides = np.concatenate([codes, other[hidden]])
-    mirrored = _with_mirror_images(levels[rows], reference[rows], sides)
-    return (*mirrored, np.tile(shares * windows.weights[rows], 2))
+    hidden = np.flatnonzero(other != codes)
+    part = np.where(other != codes, windows.other_side, 0.0)
+    rows, sides = np.r_[: len(codes), hidden], np.r_[codes, other[hidden]]
+    weights = np.r_[1.0 - part, part[hidden]] * windows.weights[rows]
+    return (*_with_mirror_images(levels[rows], reference[rows], sides), np.tile(weights, 2))
 
 
 def _codes(labels: TextArray) -> IndexArray:
