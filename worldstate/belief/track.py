@@ -225,11 +225,10 @@ def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
 
 def predict_tracks(tracks: Tracks, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
-    polar = np.ones(len(tracks), bool)
     tracks.existence[tracks.seen] *= math.exp(-step_s / site.street.unseen_s)
     if tracks.placed.any():
         _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
-        polar = ~tracks.placed  # Those that have just lost their place, too
+    polar = ~tracks.placed  # Those that have just lost their place, too
     if polar.any():
         # All of them are read and written where they stand.
         _relax(tracks, slice(None) if polar.all() else polar, step_s, site)

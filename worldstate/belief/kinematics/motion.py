@@ -28,8 +28,8 @@ import numpy as np
 from worldstate.ground import TINY, FloatArray, InvalidArgumentError, wrap_angle
 from worldstate.ground.serialisation import Via
 
-_DIMENSIONS = 4
-AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(_DIMENSIONS)
+DIMENSIONS = 4
+AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(DIMENSIONS)
 
 _Numbers: TypeAlias = float | FloatArray  # Of one belief, or of each of many
 
@@ -70,25 +70,27 @@ def white_acceleration(step_s: float) -> FloatArray:
 
 @lru_cache
 def _unit_noise(step_s: float) -> FloatArray:
-    (twice, once), (_, rate) = white_acceleration(step_s).tolist()
-    return np.array(
-        [[twice, once, 0.0, 0.0], [once, rate, 0.0, 0.0], [0.0, 0.0, rate, once], [0.0, 0.0, once, twice]]
-    )
+    noise, unit = np.zeros((DIMENSIONS, DIMENSIONS)), white_acceleration(step_s)
+    noise[:RADIAL_RATE, :RADIAL_RATE], noise[RADIAL_RATE:, RADIAL_RATE:] = unit, unit[::-1, ::-1]
+    return noise
 
 
 def _checked_covariance(row: FloatArray) -> FloatArray:
     """Return the covariance that a checkpoint holds as one row."""
-    covariance = row.reshape(_DIMENSIONS, _DIMENSIONS)
+    covariance = row.reshape(DIMENSIONS, DIMENSIONS)
     if not (covariance == covariance.T).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise InvalidArgumentError("expected it symmetric and positive definite")
     return covariance
 
 
+# No sensor knows a bearing to .006 degrees or an approach rate to 1e-4 1/s. Deviations below make a
+# covariance singular to rounding, and its checkpoint is refused; a hundred radians say nothing.
+LEAST_STD, LARGEST_STD = 1e-4, 1e2
 # Of the largest variance, what every one has at least, so that rounding, 1e-16 of it, leaves none below zero.
 _CONDITION = 0.1 * TINY
 
 
-def conditioned(covariance: FloatArray, largest_std: float) -> FloatArray:
+def conditioned(covariance: FloatArray, largest_std: float = LARGEST_STD) -> FloatArray:
     r"""Return a covariance symmetric and positive definite, whatever rounding has left of it.
 
     .. math:: P \leftarrow S P S + \kappa \max_i (S P S)_{ii}\, I, \qquad
@@ -116,16 +118,14 @@ class GaussianBelief:
     entities: with twenty a step takes half the time when all are predicted and updated at once.
     """
 
-    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(_DIMENSIONS))]
+    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(DIMENSIONS))]
     covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, _checked_covariance)]
 
     @classmethod
     def stacked(cls, beliefs: Sequence[Self]) -> Self:
         """Return many beliefs, or none, as one with a leading axis."""
-        mean, covariance = ([one.mean for one in beliefs], [one.covariance for one in beliefs])
-        return cls(
-            np.reshape(mean, (-1, _DIMENSIONS)), np.reshape(covariance, (-1, _DIMENSIONS, _DIMENSIONS))
-        )
+        covariance = np.reshape([one.covariance for one in beliefs], (-1, DIMENSIONS, DIMENSIONS))
+        return cls(np.reshape([one.mean for one in beliefs], (-1, DIMENSIONS)), covariance)
 
     def each(self) -> list[Self]:
         """Return the beliefs that were stacked."""
@@ -139,9 +139,6 @@ _LOG_NEAREST, _LOG_FARTHEST = math.log(NEAREST_M), math.log(FARTHEST_M)
 # Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
 # array.
 _CLOSEST_SHARE = 0.5
-# No sensor knows a bearing to .006 degrees or an approach rate to 1e-4 1/s. Deviations below make a
-# covariance singular to rounding, and its checkpoint is refused; a hundred radians say nothing.
-LEAST_STD, LARGEST_STD = 1e-4, 1e2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,4 +252,4 @@ def _outer(column: FloatArray, row: FloatArray) -> FloatArray:
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> MotionBelief:
     mean[..., AZIMUTH] = wrap_angle(mean[..., AZIMUTH])
-    return MotionBelief(mean, conditioned(covariance, LARGEST_STD))
+    return MotionBelief(mean, conditioned(covariance))
