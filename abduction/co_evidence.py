@@ -253,10 +253,13 @@ class MissRateTable:
     def __post_init__(self) -> None:
         _check_axis("azimuth_deg", self.azimuth_deg, math.degrees(math.pi))
         _check_axis("degradation", self.degradation, 1.0)
-        shape = (len(self.azimuth_deg), len(self.degradation))
-        _check_rates("beta", self.beta, shape)
-        for label, rows in self.per_class.items():
-            _check_rates(f"beta of {label}", rows, shape)
+        for label, rows in {"beta": self.beta, **self.per_class}.items():
+            rates = finite_array(label, rows, (len(self.azimuth_deg), len(self.degradation)))
+            if not ((rates >= 0.0) & (rates <= 1.0)).all():
+                raise InvalidArgumentError(f"{label}: expected miss rates in [0, 1]")
+            if (np.diff(rates, axis=0) < 0.0).any() or (np.diff(rates, axis=1) < 0.0).any():
+                problem = "expected miss rates that never fall with azimuth or degradation"
+                raise InvalidArgumentError(f"{label}: {problem}")
 
     def __call__(self, azimuth_rad: float, degradation: float = 0.0, label: str | None = None) -> float:
         """Return beta at one azimuth (radians, any sign) and degradation in [0, 1]."""
@@ -298,14 +301,6 @@ def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:
     axis = finite_array(name, values, (None,))
     if axis.size < 2 or axis[0] != 0.0 or axis[-1] > limit or (np.diff(axis) <= 0).any():
         raise InvalidArgumentError(f"{name}: expected numbers that increase from 0 to at most {limit}")
-
-
-def _check_rates(name: str, rows: Rows, shape: tuple[int, int]) -> None:
-    rates: FloatArray = finite_array(name, rows, shape)
-    if not ((rates >= 0.0) & (rates <= 1.0)).all():
-        raise InvalidArgumentError(f"{name}: expected miss rates in [0, 1]")
-    if (np.diff(rates, axis=0) < 0).any() or (np.diff(rates, axis=1) < 0).any():
-        raise InvalidArgumentError(f"{name}: expected miss rates that never fall with azimuth or degradation")
 
 
 # Far below the resolution of any miss rate that is counted.

@@ -380,8 +380,7 @@ def _checked_log_prior(log_prior: ArrayLike, directions: int) -> list[float]:
     check_shape("log_prior", prior.shape, (directions + 2,))
     if not np.isfinite(prior.max()):
         raise InvalidArgumentError(f"log_prior: expected logs with some mass, got {prior.tolist()}")
-    checked: list[float] = prior.tolist()
-    return checked
+    return list(map(float, prior))
 
 
 # Of a handful of explanations: arrays of so few numbers take ten times as long.

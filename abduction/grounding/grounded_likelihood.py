@@ -128,19 +128,6 @@ class Descriptor:
         if len(set(names)) != len(names):
             raise InvalidArgumentError(f"couplings: expected each observable once, got {names}")
 
-    def log_speed_prior(self, radial_speed_m_s: FloatArray) -> FloatArray:
-        r"""Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats.
-
-        .. math:: P(v_i) \propto \exp\big(-\tfrac12 (v_i - \mu)^2 / \sigma^2\big), \qquad \sum_i P(v_i) = 1
-
-        Parameters
-        ----------
-        radial_speed_m_s : ndarray, shape (n,)
-            Grid of v_r, m/s.
-        """
-        log_weight = -0.5 * ((radial_speed_m_s - self.speed_mean_m_s) / self.speed_std_m_s) ** 2
-        return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
-
 
 def engine_line(std_hz: float = 4.0) -> Coupling:
     r"""Spacing of the engine's harmonics over speed, one curve a gear.
@@ -400,15 +387,13 @@ def ground(
     if not names or len(set(names)) != len(names):
         raise InvalidArgumentError(f"descriptors: expected one or more with different names, got {names}")
     without = settings.without if settings else frozenset[str]()
-    weights, approach = [one.weight for one in descriptors], _log_approach(observation, without)
-    per_speed = [
-        np.log(one.weight / sum(weights))
-        + one.log_speed_prior(_SPEEDS_M_S)
-        + _log_couplings(observation, one, without)
-        + approach
-        for one in descriptors
-    ]
-    over_speed = np.stack(per_speed)
+    approach, weights = _log_approach(observation, without), [one.weight for one in descriptors]
+    couplings = np.stack([_log_couplings(observation, one, without) for one in descriptors])
+    # P(c) and P(v_r | c), a normal law on the grid, of every class in a row.
+    mean, std = np.array([(one.speed_mean_m_s, one.speed_std_m_s) for one in descriptors]).T[..., None]
+    prior = -0.5 * ((_SPEEDS_M_S - mean) / std) ** 2
+    prior -= np.logaddexp.reduce(prior, axis=1, keepdims=True)
+    over_speed = np.log(weights / np.sum(weights))[:, None] + prior + couplings + approach
     stds_rad = _HIDDEN_STD_RAD, _VISIBLE_STD_RAD
     hidden_azimuth, visible_azimuth = (_over_azimuth(observation.bearing_rad, one) for one in stds_rad)
     per_class = np.logaddexp.reduce(over_speed, axis=1)

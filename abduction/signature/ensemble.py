@@ -11,7 +11,6 @@ are their own mirror images: see `window_classes`.
 """
 
 import math
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import ClassVar
@@ -170,8 +169,8 @@ class Expert:
         return np.asarray((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
 
 
-def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
-    r"""Return the views, each of shape (n, inputs); parts that several share are computed once.
+def expert_views(levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
+    r"""Return all views, each of shape (n, inputs).
 
     .. math:: v = x - r \text{ (mean, median, quiet)}, \qquad v = \phi(x) \text{ (shape)}, \qquad
               v = \phi(x) - \phi(r_{median}) \text{ (change)}
@@ -181,15 +180,11 @@ def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatAr
     Shapes: levels (n, features), reference (n, 3 * features).
     """
     summaries = dict(zip(KINDS, np.split(reference, len(KINDS), axis=1), strict=True))
-    views = {kind: levels - summary for kind, summary in summaries.items() if kind in wanted}
-    if SHAPE_CHANGE in wanted:
-        # One call for both: of a single window most of it is what calls cost.
-        shapes = shape_features(np.concatenate([levels, summaries["median"]]))
-        views[SHAPE], of_site = shapes[: len(levels)], shapes[len(levels) :]
-        views[SHAPE_CHANGE] = views[SHAPE] - of_site
-    elif SHAPE in wanted:
-        views[SHAPE] = shape_features(levels)
-    return views
+    views = {kind: levels - summary for kind, summary in summaries.items()}
+    # One call for both: of a single window most of it is what calls cost.
+    shapes = shape_features(np.concatenate([levels, summaries["median"]]))
+    views[SHAPE], of_site = shapes[: len(levels)], shapes[len(levels) :]
+    return views | {SHAPE_CHANGE: views[SHAPE] - of_site}
 
 
 def log_softmax(sums: FloatArray) -> FloatArray:
@@ -298,7 +293,7 @@ class EnsembleModel:
         if self.n_features % SEGMENTS or self.n_features < _PARTS * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of {_PARTS} or more directions")
         in_range("prior_s", self.prior_s, 0.0, math.inf)
-        views = expert_views(VIEWS, self.empty[None], self.home[None])
+        views = expert_views(self.empty[None], self.home[None])
         for expert in self.experts:
             inputs = views[expert.view].shape[1]
             if expert.mean.size != inputs:
@@ -385,9 +380,8 @@ class EnsembleModel:
             inputs = np.hstack([inputs, np.tile(self.home, (len(inputs), 1))])
         check_shape("X, with a reference", inputs.shape, (None, self.n_features * (1 + len(KINDS))))
         levels, reference = split_reference(inputs)
-        n, wanted = len(levels), {expert.view for expert in self.experts}
+        n = len(levels)
         views = expert_views(
-            wanted,
             np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
             np.concatenate([reference, mirror_features(reference, SEGMENTS * len(KINDS))]),
         )

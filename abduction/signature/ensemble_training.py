@@ -177,7 +177,7 @@ class SiteEnsembleClassifier:
         levels, reference, codes, weights = map(np.concatenate, zip(*rows, strict=True))
         # The four of the data, and what else there are windows of; scikit-learn sorts its columns the same.
         known = np.union1d(np.arange(len(CLASSES)), codes)
-        views = ensemble.expert_views({recipe.view for recipe in self.recipes}, levels, reference)
+        views = ensemble.expert_views(levels, reference)
         self.model_ = ensemble.EnsembleModel(
             tuple(_fit_expert(recipe, views[recipe.view], codes, weights) for recipe in self.recipes),
             np.bincount(codes, weights)[known] / weights.sum(),

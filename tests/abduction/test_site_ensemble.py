@@ -228,7 +228,7 @@ def test_the_coefficients_are_the_optimum_of_the_penalised_likelihood(trained):
     both = np.vstack([X, mirrored(X)])
     codes = np.concatenate([codes, np.array([0, 3, 2, 1])[codes]])
     for recipe, expert in zip(RECIPES, model.experts, strict=True):
-        seen = expert_views([expert.view], log_levels(both[:, :60]), both[:, 60:])[expert.view]
+        seen = expert_views(log_levels(both[:, :60]), both[:, 60:])[expert.view]
         standard = (seen - expert.mean) / expert.scale
 
         def loss(weights, standard=standard, expert=expert, ridge=recipe.ridge):

@@ -3,9 +3,9 @@
 import math
 import warnings
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.checks import in_range, one_of
 
 from .street_model import StoredStreet, StreetModel
 
@@ -52,12 +52,11 @@ class FilterSettings:
     delete_existence: InitVar[float | None] = None
 
     def __post_init__(self, *former: float | None) -> None:
-        given = {name: one for name, one in zip(_FORMER, former, strict=True) if one is not None}
+        pairs = zip(_FORMER, former, strict=True)
+        given: dict[str, Any] = {name: one for name, one in pairs if one is not None}
         if given:
             names = ", ".join(given)
             warnings.warn(f"give {names} to StreetModel, as FilterSettings.street", DeprecationWarning, 3)
-            changed: dict[str, Any] = {**given}
-            object.__setattr__(self, "street", replace(self.street, **changed))
-        in_range("window_s", self.window_s, 0.0, math.inf, open_low=True, open_high=True)
-        if self.windows not in get_args(type(self).__annotations__["windows"]):
-            raise InvalidArgumentError(f"windows: expected posterior or likelihood, got {self.windows!r:.40}")
+            object.__setattr__(self, "street", replace(self.street, **given))
+        in_range("window_s", self.window_s, 0.0, math.inf, open_low=True)
+        one_of("windows", self.windows, ("posterior", "likelihood"))

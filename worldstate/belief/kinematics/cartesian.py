@@ -213,12 +213,11 @@ def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
 
 def corrected(ego: EgoBelief | None, told: Odometry) -> EgoBelief:
     """Return the ego vehicle as odometry has it: its twist, and its pose where that was told."""
-    pose, covariance = (
-        (np.zeros(_POSE), np.zeros((_POSE, _POSE))) if ego is None else (ego.pose, ego.covariance)
-    )
+    before = ego or EgoBelief(np.zeros(_POSE), np.zeros((_POSE, _POSE)), 0.0, 0.0, 0.0, 0.0)
+    pose, covariance = before.pose, before.covariance
     if told.pose is not None:
         at = told.pose
         pose = np.array([*at.position_m, at.yaw_rad])
         covariance = np.diag([at.position_std_m**2] * 2 + [at.yaw_std_rad**2])
     twist = told.speed_mps, told.yaw_rate_rad_s, told.speed_std_mps, told.yaw_rate_std_rad_s
-    return EgoBelief(pose, covariance, *twist, told.pose is not None or (ego is not None and ego.localised))
+    return EgoBelief(pose, covariance, *twist, before.localised or told.pose is not None)
