@@ -60,7 +60,7 @@ class SideEvidence:
     visible: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "log_ratios", _of_each("log_ratios", self.log_ratios, self.directions))
+        object.__setattr__(self, "log_ratios", _nats("log_ratios", self.log_ratios, len(self.directions)))
         check_fields(self, both=(0.0, 1.0), direct=(0.0, 1.0), visible=_NATS)
 
 
@@ -108,9 +108,10 @@ class SignatureEvidence:
         labels = all_of("directions", self.directions, str)
         if not labels or len(set(labels)) != len(labels):
             raise InvalidArgumentError(f"directions: expected different labels, got {labels!r}")
-        object.__setattr__(self, "directions", labels)
-        object.__setattr__(self, "hidden", _of_each("hidden", self.hidden, labels))
-        check_fields(self, visible=_NATS, none=_NATS)
+        hidden = _nats("hidden", self.hidden, len(labels))
+        (visible,), (none,) = _nats("visible", (self.visible,), 1), _nats("none", (self.none,), 1)
+        for name, value in (("directions", labels), ("hidden", hidden), ("visible", visible), ("none", none)):
+            object.__setattr__(self, name, value)
 
     @property
     def log_likelihoods(self) -> np.ndarray:
@@ -127,11 +128,14 @@ class SignatureEvidence:
         return "left" if left > right else "right"
 
 
-def _of_each(name: str, values: object, directions: Sequence[str]) -> tuple[float, ...]:
+def _nats(name: str, values: object, size: int) -> tuple[float, ...]:
     """Return log-likelihoods as floats; refuse what is none or too large, or another number of them."""
-    if not isinstance(values, Sequence | np.ndarray) or len(values) != len(directions):
+    if not isinstance(values, Sequence | np.ndarray) or len(values) != size:
         raise InvalidArgumentError(f"{name}: expected one of each direction, got {values!r:.80}")
-    return tuple(in_range(name, one, *_NATS) for one in values)
+    # Whole numbers among them would make arrays that no likelihood can be added to.
+    return tuple(
+        one if type(one) is float and abs(one) <= MOST_NATS else in_range(name, one, *_NATS) for one in values
+    )
 
 
 _IMAGE = 0.02  # Chance that the peak is an image after all

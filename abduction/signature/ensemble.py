@@ -332,8 +332,28 @@ class EnsembleModel:
         C. Genest and J. V. Zidek, "Combining probability distributions: a critique and an annotated
         bibliography", Statist. Sci. 1, 1986 (the logarithmic pool).
         """
-        posteriors = np.maximum(np.exp(self._log_posteriors(X)), SMALLEST_PROBABILITY)
-        return np.asarray(posteriors / total(posteriors))
+        inputs = finite_array("X", X, (None, None))
+        if inputs.shape[1] == self.n_features:
+            inputs = np.hstack([inputs, np.tile(self.home, (len(inputs), 1))])
+        check_shape("X, with a reference", inputs.shape, (None, self.n_features * (1 + len(KINDS))))
+        return self.posteriors(*split_reference(inputs))
+
+    def posteriors(self, levels: FloatArray, reference: FloatArray) -> FloatArray:
+        """Return what `predict_proba` does for log-levels, shape (n, features), and references."""
+        n = len(levels)
+        views = expert_views(
+            np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
+            np.concatenate([reference, mirror_features(reference, SEGMENTS * len(KINDS))]),
+        )
+        told = [(expert, views[expert.view]) for expert in self.experts]
+        sums = [expert.sums(half) for expert, seen in told for half in (seen[:n], seen[n:])]
+        # One call for all experts: of a single window most of it is what calls cost.
+        both = log_softmax(np.concatenate(sums)).reshape(len(told), 2, n, -1)
+        # Added to each other first: the sum of two does not depend on which is the mirror image.
+        pairs = both[:, 0] + both[:, 1][..., mirrored_classes(len(self.classes))]
+        mean = log_softmax(pairs.sum(axis=0) / (2 * len(told)))
+        shares = np.maximum(np.exp(mean), SMALLEST_PROBABILITY)
+        return np.asarray(shares / total(shares))
 
     def explain(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of front, left, none and right alone, shape (n, 4).
@@ -373,25 +393,6 @@ class EnsembleModel:
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         return window_evidence(self.predict_proba(np.atleast_2d(feature)), self.classes, self.class_prior)
-
-    def _log_posteriors(self, X: ArrayLike) -> FloatArray:
-        inputs = finite_array("X", X, (None, None))
-        if inputs.shape[1] == self.n_features:
-            inputs = np.hstack([inputs, np.tile(self.home, (len(inputs), 1))])
-        check_shape("X, with a reference", inputs.shape, (None, self.n_features * (1 + len(KINDS))))
-        levels, reference = split_reference(inputs)
-        n = len(levels)
-        views = expert_views(
-            np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
-            np.concatenate([reference, mirror_features(reference, SEGMENTS * len(KINDS))]),
-        )
-        told = [(expert, views[expert.view]) for expert in self.experts]
-        sums = [expert.sums(half) for expert, seen in told for half in (seen[:n], seen[n:])]
-        # One call for all experts: of a single window most of it is what calls cost.
-        both = log_softmax(np.concatenate(sums)).reshape(len(told), 2, n, -1)
-        # Added to each other first: the sum of two does not depend on which is the mirror image.
-        pairs = both[:, 0] + both[:, 1][..., mirrored_classes(len(self.classes))]
-        return log_softmax(pairs.sum(axis=0) / (2 * len(told)))
 
 
 AnySignature = SignatureModel | EnsembleModel

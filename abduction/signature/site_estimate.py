@@ -30,6 +30,7 @@ from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in
 from worldstate.ground.serialisation import Check
 
 from .ensemble import KINDS, EnsembleModel, log_levels
+from .window_classes import window_evidence
 
 # Share of the difference in level that is carried over; all of the pattern is.
 _LEVEL_GAIN = 0.25
@@ -208,4 +209,5 @@ class SiteSignature:
         window = finite_array("feature", feature, (self._model.n_features,))
         reference = self.estimate.reference(self._model)
         self.estimate = self.estimate.updated(window, HOP_S, self._settings)
-        return self._model.evidence(np.concatenate([window, reference]))
+        posteriors = self._model.posteriors(log_levels(window)[None], reference[None])
+        return window_evidence(posteriors, self._model.classes, self._model.class_prior)

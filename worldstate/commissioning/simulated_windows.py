@@ -166,7 +166,7 @@ def posteriors_along(model: EnsembleModel, features: FloatArray) -> FloatArray:
     for row, feature in enumerate(np.asarray(features, np.float64)):
         references[row] = estimate.reference(model)
         estimate = estimate.updated(feature, HOP_S, chosen)
-    return model.predict_proba(np.hstack([features, references]))
+    return model.posteriors(log_levels(features), references)
 
 
 # 180 windows at a weight of .1 took the other side, named with p > .5, from .39 of the windows to .03
