@@ -94,8 +94,6 @@ def predict_place(
     mean[..., :2] -= chord
     strength = np.asarray(acceleration_psd)[..., None, None]
     covariance = flow @ belief.covariance @ flow.T + strength * noise
-    if not turned:
-        return _belief(mean, covariance)
     cosine, sine = math.cos(turned), math.sin(turned)
     turn = np.kron(np.eye(2), [[cosine, sine], [-sine, cosine]])
     return _belief(mean @ turn.T, turn @ covariance @ turn.T)

@@ -180,8 +180,7 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: _Numbers) -> 
     .. math:: m \leftarrow f(m), \quad P \leftarrow F P F^T + Q
     """
     start = belief.mean.copy()
-    if step_s > 0.0:
-        start[..., RADIAL_RATE] = np.maximum(start[..., RADIAL_RATE], -_CLOSEST_SHARE / step_s)
+    start[..., RADIAL_RATE] = np.maximum(start[..., RADIAL_RATE], -_CLOSEST_SHARE / max(step_s, TINY))
     # Clipped before exp: approach rates that contradict each other drive log r, which is not measured, so far
     # that exp overflows.
     range_m = np.exp(np.minimum(np.maximum(belief.mean[..., LOG_RANGE], _LOG_NEAREST), _LOG_FARTHEST))
@@ -219,12 +218,11 @@ def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: _N
 
 
 def update(
-    belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weight: _Numbers | None = None
+    belief: MotionBelief, row: int, value: _Numbers, std: _Numbers, weight: _Numbers = 1.0
 ) -> MotionBelief:
     r"""Return the belief after one component was measured, of this entity with probability w.
 
-    Probabilistic data association, of a certain one where no weight is given: a bearing is one of AZIMUTH, an
-    approach rate -1/TTA one of RADIAL_RATE.
+    Probabilistic data association: a bearing is one of AZIMUTH, an approach rate -1/TTA one of RADIAL_RATE.
 
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
@@ -239,8 +237,6 @@ def update(
     swept = belief.covariance - _outer(gain, belief.covariance[..., row])
     updated = swept - _outer(swept[..., row], gain) + noise[..., None] * _outer(gain, gain)
     step = gain * np.asarray(residual)[..., None]
-    if weight is None:
-        return _belief(belief.mean + step, updated)
     w = np.asarray(weight)[..., None]
     covariance = w[..., None] * updated + (1.0 - w)[..., None] * belief.covariance
     return _belief(belief.mean + w * step, covariance + (w * (1.0 - w))[..., None] * _outer(step, step))
