@@ -23,16 +23,8 @@ from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.checks import check_shape, freeze_arrays, in_range, one_of
 from worldstate.ground.serialisation import ADDED, Layout
 
+from . import window_classes
 from .published_signature import ModelDomain, SignatureModel
-from .window_classes import (
-    CLASSES,
-    EXPLANATION_COLUMNS,
-    SMALLEST_PROBABILITY,
-    checked_classes,
-    explained,
-    mirrored_classes,
-    window_evidence,
-)
 
 SMALLEST_LEVEL = 1e-4
 QUIET_SHARE = 0.35
@@ -280,12 +272,12 @@ class EnsembleModel:
     empty: FloatArray
     domain: ModelDomain | None = field(default=None, metadata=ADDED)
     prior_s: float = field(default=PRIOR_S, metadata=ADDED)
-    classes: tuple[str, ...] = CLASSES
+    classes: tuple[str, ...] = window_classes.CLASSES
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:
             raise InvalidArgumentError(f"experts: expected 1 to {MOST_EXPERTS}, got {len(self.experts)}")
-        known = (len(checked_classes(self.classes)),)
+        known = (len(window_classes.checked_classes(self.classes)),)
         freeze_arrays(self, class_prior=known, empty=(None,))
         freeze_arrays(self, home=(len(KINDS) * self.n_features,))
         if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0):
@@ -308,8 +300,8 @@ class EnsembleModel:
     @property
     def reference_prior(self) -> tuple[float, ...]:
         """Training prior in the order of the explanations (left, right, visible, none)."""
-        prior = explained(self.class_prior[None], self.classes, self.class_prior)[0]
-        return tuple(prior[list(EXPLANATION_COLUMNS)].tolist())
+        prior = window_classes.explained(self.class_prior[None], self.classes, self.class_prior)[0]
+        return tuple(prior[list(window_classes.EXPLANATION_COLUMNS)].tolist())
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of the model's classes at the training prior, shape (n, classes).
@@ -350,9 +342,9 @@ class EnsembleModel:
         # One call for all experts: of a single window most of it is what calls cost.
         both = log_softmax(np.concatenate(sums)).reshape(len(told), 2, n, -1)
         # Added to each other first: the sum of two does not depend on which is the mirror image.
-        pairs = both[:, 0] + both[:, 1][..., mirrored_classes(len(self.classes))]
+        pairs = both[:, 0] + both[:, 1][..., window_classes.mirrored_classes(len(self.classes))]
         mean = log_softmax(pairs.sum(axis=0) / (2 * len(told)))
-        shares = np.maximum(np.exp(mean), SMALLEST_PROBABILITY)
+        shares = np.maximum(np.exp(mean), window_classes.SMALLEST_PROBABILITY)
         return np.asarray(shares / total(shares))
 
     def explain(self, X: ArrayLike) -> FloatArray:
@@ -371,7 +363,7 @@ class EnsembleModel:
         ----------
         Derived here: see the head of `worldstate.abduction.signature.window_classes`.
         """
-        return explained(self.predict_proba(X), self.classes, self.class_prior)
+        return window_classes.explained(self.predict_proba(X), self.classes, self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         r"""Return the log-likelihoods of one window, shape (features,) or (4 * features,).
@@ -392,7 +384,9 @@ class EnsembleModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        return window_evidence(self.predict_proba(np.atleast_2d(feature)), self.classes, self.class_prior)
+        return window_classes.window_evidence(
+            self.predict_proba(np.atleast_2d(feature)), self.classes, self.class_prior
+        )
 
 
 AnySignature = SignatureModel | EnsembleModel
