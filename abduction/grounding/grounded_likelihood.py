@@ -150,9 +150,13 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
     """
-    at = np.maximum(np.abs(_SPEEDS_M_S), LOWEST_SPEED_M_S)
-    low = _octave_db(at, rolling=(85.7, 41.5), propulsion=(89.2, 7.2))
-    high = _octave_db(at, rolling=(97.3, 32.5), propulsion=(84.2, 8.0))
+    # A_R, B_R, A_P and B_P of category 1 at 125 Hz and at 1 kHz, dB.
+    octaves_db = np.array([[85.7, 41.5, 89.2, 7.2], [97.3, 32.5, 84.2, 8.0]])
+    a_rolling, b_rolling, a_propulsion, b_propulsion = octaves_db.T[..., None]
+    ratio = np.maximum(np.abs(_SPEEDS_M_S), LOWEST_SPEED_M_S) / REFERENCE_SPEED_M_S
+    rolling_db = a_rolling + b_rolling * np.log10(ratio)
+    propulsion_db = a_propulsion + b_propulsion * (ratio - 1.0)
+    low, high = _DECIBELS * np.logaddexp(rolling_db / _DECIBELS, propulsion_db / _DECIBELS)
     return Coupling("tyre_shape_db", _SPEEDS_M_S, (high - low)[None], std_db)
 
 
@@ -202,15 +206,6 @@ def motorcycle() -> Descriptor:
     usual = car()
     open_gearing = ("motorcycle",), 1.0 - usual.weight, usual.speed_mean_m_s, usual.speed_std_m_s
     return Descriptor("motorcycle", *open_gearing, (doppler_trajectory(),))
-
-
-def _octave_db(
-    speed_m_s: FloatArray, rolling: tuple[float, float], propulsion: tuple[float, float]
-) -> FloatArray:
-    ratio = speed_m_s / REFERENCE_SPEED_M_S
-    rolling_db = rolling[0] + rolling[1] * np.log10(ratio)
-    propulsion_db = propulsion[0] + propulsion[1] * (ratio - 1.0)
-    return np.asarray(_DECIBELS * np.logaddexp(rolling_db / _DECIBELS, propulsion_db / _DECIBELS))
 
 
 @dataclass(frozen=True, slots=True)

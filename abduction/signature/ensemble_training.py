@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import starmap
 from typing import Self
 
 import numpy as np
@@ -19,7 +20,6 @@ from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, m
 # to 3 and parts from .15 to .35 the areas of real junctions left out stay within .002 and the side within
 # .03; without such a part the side is right in .85 of the windows instead of .93, with half of it in .84.
 SIMULATED_WEIGHT, OTHER_SIDE = 1.0, 0.25
-_RIDGE = 1e-3
 # Part of a real window's weight that is compared with what was heard of its site before it: more of it costs
 # the worst junction of a standing ego .01 of its AUROC, none leaves a moving one .01 lower.
 HEARD_PART = 0.25
@@ -39,13 +39,8 @@ class Recipe:
 
 
 # Chosen on eight junctions, every choice judged on a junction it was not made on: lab/NOTES.md.
-RECIPES = (
-    Recipe("mean", _RIDGE),
-    Recipe("median", _RIDGE),
-    Recipe("quiet", _RIDGE),
-    Recipe(ensemble.SHAPE, 1e-1),
-    Recipe(ensemble.SHAPE_CHANGE, 1e-2),
-)
+_RIDGES = dict.fromkeys(ensemble.KINDS, 0.001) | {ensemble.SHAPE: 1e-1, ensemble.SHAPE_CHANGE: 1e-2}
+RECIPES = tuple(starmap(Recipe, _RIDGES.items()))
 # Of an ego that moves: its own noise covers the level, which a ridge favours; the pattern above the site's
 # reference is left, and is held back less.
 MOVING_RECIPES = tuple(

@@ -67,9 +67,8 @@ class Detections:
         """Return the detections if new objects are only found in line of sight."""
         in_sight = self.line_of_sight(site)
         total = 1.0 - self.existence * (1.0 - in_sight)
-        return replace(
-            self, existence=self.existence * in_sight / total, log_new=self.log_new + np.log(total)
-        )
+        existence, log_new = self.existence * in_sight / total, self.log_new + np.log(total)
+        return replace(self, existence=existence, log_new=log_new)
 
     def __len__(self) -> int:
         return len(self.classes)

@@ -55,9 +55,8 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     """
     along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
     sign, edge_rad = math.copysign(1.0, along_rad), abs(along_rad)
-    slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * (
-        _MIDDLE_S * np.exp(side.street.pace_spread * _POINTS)
-    )
+    paces = np.exp(side.street.pace_spread * _POINTS)
+    slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * (_MIDDLE_S * paces)
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
     weight = np.repeat(coming[:, None], len(_POINTS), axis=1) + TINY
     weight = weight / weight.sum()
@@ -66,11 +65,8 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     # errors of the time, which a known edge does not end. Half of their variance stays: likeliest on exam
     # seed 1 with learned edges; without it squared errors are 1.42 of the variance.
     edge = 0.5 * (side.edge_std_rad**2 + max(side.edge_std_rad, USUAL_EDGE_STD) ** 2)
-    variance = (
-        edge
-        + side.street.extent_rad**2
-        + side.street.place_share * float((weight * (azimuth - mean) ** 2).sum())
-    )
+    scatter = float((weight * (azimuth - mean) ** 2).sum())
+    variance = edge + side.street.extent_rad**2 + side.street.place_share * scatter
     return wrap_angle(sign * mean - side.yaw_rad), math.sqrt(variance)
 
 
