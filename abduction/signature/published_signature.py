@@ -18,13 +18,7 @@ from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import finite_array, freeze_arrays, in_range
 from worldstate.ground.serialisation import ADDED, Layout
 
-from .window_classes import (
-    CLASSES,
-    EXPLANATION_COLUMNS,
-    SMALLEST_PROBABILITY,
-    evidence_of,
-    explanation_ratios,
-)
+from .window_classes import CLASSES, EXPLANATION_COLUMNS, SMALLEST_PROBABILITY, evidence_of
 
 EgoMotion = Literal["standing", "moving", "any"]
 
@@ -218,8 +212,7 @@ class SignatureModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        posteriors = self.predict_proba(np.atleast_2d(feature))
-        return evidence_of(explanation_ratios(posteriors, self.class_prior)[0])
+        return evidence_of(self.predict_proba(np.atleast_2d(feature)), self.class_prior)
 
 
 def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
