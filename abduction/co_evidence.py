@@ -293,8 +293,9 @@ def default_miss_rates() -> MissRateTable:
     """
     # What the paper measured on clean frames: .04 at boresight, .14 at 25 deg, and on at that slope over the
     # half plane, for a view ends by the camera's own angle; .97 under the harshest noise, linear in between.
-    abeam_deg = math.degrees(0.5 * math.pi)
-    return MissRateTable((0.0, abeam_deg), (0.0, 1.0), tuple((rate, 0.97) for rate in (0.04, 0.4)))
+    boresight, abeam_deg = 0.04, math.degrees(0.5 * math.pi)
+    clean = boresight, boresight + boresight / 10.0 * abeam_deg
+    return MissRateTable((0.0, abeam_deg), (0.0, 1.0), tuple((rate, 0.97) for rate in clean))
 
 
 def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:
