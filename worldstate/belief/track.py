@@ -177,10 +177,6 @@ class Tracks:
             self.placed[row] = True
             self.place_mean[row], self.place_covariance[row] = belief.mean, belief.covariance
 
-    def unseen_ns(self, stamp_ns: int) -> FloatArray:
-        """Return how long before a time each was last seen; infinite where it never was."""
-        return np.where(self.last_seen_ns == NEVER_NS, np.inf, stamp_ns - self.last_seen_ns)
-
 
 _BELIEFS = ("mean", "covariance", "placed", "place_mean", "place_covariance")
 _UNKNOWN = {"last_seen_ns": NEVER_NS, "miss_rate": math.nan}  # What columns hold for None
