@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground import TINY, FloatArray, InvalidArgumentError, finite_array, wrap_angle
-from worldstate.ground.checks import check_fields, in_range
+from worldstate.ground.checks import ABOVE_ZERO, BELOW_ONE, check_fields
 from worldstate.ground.serialisation import Layout
 
 
@@ -95,9 +95,7 @@ class Absent:
     clutter_rate: float = 0.0
 
     def __post_init__(self) -> None:
-        check_fields(self, miss_rate=(0.0, 1.0))
-        clutter = in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_high=True)
-        object.__setattr__(self, "clutter_rate", clutter)
+        check_fields(self, miss_rate=(0.0, 1.0), clutter_rate=(0.0, BELOW_ONE))
 
     def log_likelihoods(self) -> np.ndarray:
         r"""Log p(absent | hidden, visible, none), shape (3,), nats; -inf where impossible.
@@ -143,9 +141,7 @@ class Present:
     clutter_rate: float = 0.01
 
     def __post_init__(self) -> None:
-        check_fields(self, miss_rate=(0.0, 1.0))
-        clutter = in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
-        object.__setattr__(self, "clutter_rate", clutter)
+        check_fields(self, miss_rate=(0.0, 1.0), clutter_rate=(ABOVE_ZERO, BELOW_ONE))
 
     def log_likelihoods(self) -> np.ndarray:
         r"""Log p(present | hidden, visible, none), shape (3,), nats.
@@ -210,11 +206,6 @@ CoEvidence = Absent | Present | Unqueried
 
 Rows = tuple[tuple[float, ...], ...]
 
-# What the paper measured on clean frames: .04 at boresight, .14 at 20-30 deg; .97 under the harshest noise.
-BORESIGHT_MISS_RATE = 0.04
-MISS_RATE_PER_DEG = BORESIGHT_MISS_RATE / 10.0
-_ABEAM_DEG = 90.0
-HARSHEST_MISS_RATE = 0.97
 # A look that misses more watches nothing: one in view would be counted as none.
 MOSTLY_MISSED = 0.5
 
@@ -260,12 +251,15 @@ class MissRateTable:
     per_class: Mapping[str, Rows] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_axis("azimuth_deg", self.azimuth_deg, 2.0 * _ABEAM_DEG)
+        _check_axis("azimuth_deg", self.azimuth_deg, math.degrees(math.pi))
         _check_axis("degradation", self.degradation, 1.0)
-        shape = (len(self.azimuth_deg), len(self.degradation))
-        _check_rates("beta", self.beta, shape)
-        for label, rows in self.per_class.items():
-            _check_rates(f"beta of {label}", rows, shape)
+        for label, rows in {"beta": self.beta, **self.per_class}.items():
+            rates = finite_array(label, rows, (len(self.azimuth_deg), len(self.degradation)))
+            if not ((rates >= 0.0) & (rates <= 1.0)).all():
+                raise InvalidArgumentError(f"{label}: expected miss rates in [0, 1]")
+            if (np.diff(rates, axis=0) < 0.0).any() or (np.diff(rates, axis=1) < 0.0).any():
+                problem = "expected miss rates that never fall with azimuth or degradation"
+                raise InvalidArgumentError(f"{label}: {problem}")
 
     def __call__(self, azimuth_rad: float, degradation: float = 0.0, label: str | None = None) -> float:
         """Return beta at one azimuth (radians, any sign) and degradation in [0, 1]."""
@@ -297,24 +291,17 @@ def default_miss_rates() -> MissRateTable:
     >>> round(table(0.0), 2), round(table(np.radians(-25.0)), 2), round(table(0.0, 1.0), 2), table(1.6)
     (0.04, 0.14, 0.97, 1.0)
     """
-    # Clean frames: .04 at boresight, .14 at 25 deg and on at that slope over the half plane, for a view ends
-    # by the camera's own angle; from there linearly in d to .97 everywhere.
-    clean = BORESIGHT_MISS_RATE, BORESIGHT_MISS_RATE + MISS_RATE_PER_DEG * _ABEAM_DEG
-    return MissRateTable((0.0, _ABEAM_DEG), (0.0, 1.0), tuple((rate, HARSHEST_MISS_RATE) for rate in clean))
+    # What the paper measured on clean frames: .04 at boresight, .14 at 25 deg, and on at that slope over the
+    # half plane, for a view ends by the camera's own angle; .97 under the harshest noise, linear in between.
+    boresight, abeam_deg = 0.04, math.degrees(0.5 * math.pi)
+    clean = boresight, boresight + boresight / 10.0 * abeam_deg
+    return MissRateTable((0.0, abeam_deg), (0.0, 1.0), tuple((rate, 0.97) for rate in clean))
 
 
 def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:
     axis = finite_array(name, values, (None,))
     if axis.size < 2 or axis[0] != 0.0 or axis[-1] > limit or (np.diff(axis) <= 0).any():
         raise InvalidArgumentError(f"{name}: expected numbers that increase from 0 to at most {limit}")
-
-
-def _check_rates(name: str, rows: Rows, shape: tuple[int, int]) -> None:
-    rates: FloatArray = finite_array(name, rows, shape)
-    if (rates < 0).any() or (rates > 1).any():
-        raise InvalidArgumentError(f"{name}: expected miss rates in [0, 1]")
-    if (np.diff(rates, axis=0) < 0).any() or (np.diff(rates, axis=1) < 0).any():
-        raise InvalidArgumentError(f"{name}: expected miss rates that never fall with azimuth or degradation")
 
 
 # Far below the resolution of any miss rate that is counted.

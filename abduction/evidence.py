@@ -21,6 +21,7 @@ from .co_evidence import CoEvidence
 # A window of a second differs by tens of nats between explanations; beyond this, sums lose the digits that
 # probabilities consist of.
 MOST_NATS = 1000.0
+_NATS = (-MOST_NATS, MOST_NATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +60,8 @@ class SideEvidence:
     visible: float
 
     def __post_init__(self) -> None:
-        _check_each("log_ratios", self.log_ratios, self.directions)
-        *ratios, visible = _nats(log_ratios=self.log_ratios, visible=(self.visible,))
-        object.__setattr__(self, "log_ratios", tuple(ratios))
-        object.__setattr__(self, "visible", visible)
-        check_fields(self, both=(0.0, 1.0), direct=(0.0, 1.0))
+        object.__setattr__(self, "log_ratios", _nats("log_ratios", self.log_ratios, len(self.directions)))
+        check_fields(self, both=(0.0, 1.0), direct=(0.0, 1.0), visible=_NATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +108,10 @@ class SignatureEvidence:
         labels = all_of("directions", self.directions, str)
         if not labels or len(set(labels)) != len(labels):
             raise InvalidArgumentError(f"directions: expected different labels, got {labels!r}")
-        _check_each("hidden", self.hidden, self.directions)
-        *hidden, visible, none = _nats(hidden=self.hidden, visible=(self.visible,), none=(self.none,))
-        object.__setattr__(self, "directions", labels)
-        # Whole numbers among them would make arrays that no likelihood can be added to.
-        object.__setattr__(self, "hidden", tuple(hidden))
-        object.__setattr__(self, "visible", visible)
-        object.__setattr__(self, "none", none)
+        hidden = _nats("hidden", self.hidden, len(labels))
+        (visible,), (none,) = _nats("visible", (self.visible,), 1), _nats("none", (self.none,), 1)
+        for name, value in (("directions", labels), ("hidden", hidden), ("visible", visible), ("none", none)):
+            object.__setattr__(self, name, value)
 
     @property
     def log_likelihoods(self) -> np.ndarray:
@@ -133,22 +128,17 @@ class SignatureEvidence:
         return "left" if left > right else "right"
 
 
-def _check_each(name: str, values: object, directions: Sequence[str]) -> None:
-    if not isinstance(values, Sequence | np.ndarray) or len(values) != len(directions):
+def _nats(name: str, values: object, size: int) -> tuple[float, ...]:
+    """Return log-likelihoods as floats; refuse what is none or too large, or another number of them."""
+    if not isinstance(values, Sequence | np.ndarray) or len(values) != size:
         raise InvalidArgumentError(f"{name}: expected one of each direction, got {values!r:.80}")
+    # Whole numbers among them would make arrays that no likelihood can be added to.
+    return tuple(
+        one if type(one) is float and abs(one) <= MOST_NATS else in_range(name, one, *_NATS) for one in values
+    )
 
 
-def _nats(**named: Sequence[float]) -> list[float]:
-    """Return log-likelihoods by name in a row; refuse what is none or too large."""
-    return [
-        one if type(one) is float and abs(one) <= MOST_NATS else in_range(name, one, -MOST_NATS, MOST_NATS)
-        for name, values in named.items()
-        for one in values
-    ]
-
-
-# Chance that the peak is an image after all, and the least probability of direct sound that counts.
-_IMAGE, _LEAST = 0.02, 0.01
+_IMAGE = 0.02  # Chance that the peak is an image after all
 
 
 def with_bearing_vote(
@@ -171,7 +161,8 @@ def with_bearing_vote(
     >>> [round(value, 1) for value in voted.hidden], with_bearing_vote(wrong, 0.7, 0.1, 0.0) == wrong
     ([0.7, -3.9], True)
     """
-    if direct < _LEAST or set(evidence.directions) != {"left", "right"}:
+    # A sound that is less often direct than the peak is an image of the other side has no vote.
+    if direct < 0.5 * _IMAGE or set(evidence.directions) != {"left", "right"}:
         return evidence
     hidden = np.array(evidence.hidden)
     total = float(np.logaddexp(*hidden))
@@ -393,8 +384,7 @@ def _checked_log_prior(log_prior: ArrayLike, directions: int) -> list[float]:
     check_shape("log_prior", prior.shape, (directions + 2,))
     if not np.isfinite(prior.max()):
         raise InvalidArgumentError(f"log_prior: expected logs with some mass, got {prior.tolist()}")
-    checked: list[float] = prior.tolist()
-    return checked
+    return list(map(float, prior))
 
 
 # Of a handful of explanations: arrays of so few numbers take ten times as long.

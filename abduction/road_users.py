@@ -15,6 +15,7 @@ signal where the log-odds of signals over all that is foreign exceed a second th
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from math import exp
 from typing import ClassVar, TypeAlias
 
@@ -167,13 +168,9 @@ def likeliest(shares: Iterable[tuple[str, float]], mass: float) -> frozenset[str
     >>> sorted(likeliest((("car", 0.7), ("truck", 0.1), ("van", 0.2)), mass=0.85))
     ['car', 'van']
     """
-    total, names = 0.0, set()
-    for name, share in sorted(shares, key=lambda one: -one[1]):
-        if total >= mass:
-            break
-        names.add(name)
-        total += share
-    return frozenset(names)
+    ranked = sorted(shares, key=lambda one: -one[1])
+    before = accumulate((share for _, share in ranked), initial=0.0)
+    return frozenset(name for (name, _), total in zip(ranked, before, strict=False) if total < mass)
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,7 +366,7 @@ def neutral(evidence: SignatureEvidence, margin: float) -> SignatureEvidence:
     sides = evidence.sides
     if sides is not None:
         sides = replace(sides, log_ratios=tuple(beyond(np.array(sides.log_ratios), margin).tolist()))
-    return SignatureEvidence(evidence.directions, hidden, evidence.visible, evidence.none, sides)
+    return replace(evidence, hidden=hidden, sides=sides)
 
 
 def beyond(ratios: FloatArray, margin: float) -> FloatArray:

@@ -9,15 +9,16 @@ radial speed. All densities are relative to those of a spurious signature, whose
 nothing beside the feature was measured, the classifier's evidence is handed on unchanged.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from math import pi
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import hypot, pi
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import MOST_NATS, SignatureEvidence
-from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, in_range
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable
+from worldstate.ground.checks import ABOVE_ZERO, MOST, check_fields, freeze_arrays
 
 LINE_SPACING = "line_spacing_hz"
 SPEED_OF_SOUND_M_S = 343.0
@@ -35,7 +36,7 @@ _SPEEDS_M_S = np.arange(-5.0, 30.0 + _SPEED_CELL_M_S, _SPEED_CELL_M_S)
 _DECIBELS = 10.0 / np.log(10.0)  # A neper of power
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Coupling:
     r"""An observable that depends on the radial speed.
 
@@ -49,19 +50,18 @@ class Coupling:
     """
 
     observable: str  # Its name, unit included
-    speed_m_s: tuple[float, ...]  # Knots, rising; speed towards the listener is positive
-    # Values at the knots, linear between and constant beyond; several where one of them holds but not known
-    # which, such as the gear, all equally likely.
-    curves: tuple[tuple[float, ...], ...]
+    speed_m_s: FloatArray  # Knots, rising, shape (n,); speed towards the listener is positive
+    # Values at the knots, linear between and constant beyond, shape (curves, n); several if one of them holds
+    # but not known which, such as the gear, all equally likely.
+    curves: FloatArray
     std: float  # How far a source of this class scatters about its curve, in the observable's unit, > 0
 
     def __post_init__(self) -> None:
-        knots = finite_array("speed_m_s", self.speed_m_s, (None,))
-        if not knots.size or (np.diff(knots) <= 0).any() or not self.curves:
+        freeze_arrays(self, speed_m_s=(None,))
+        freeze_arrays(self, curves=(None, self.speed_m_s.size))
+        if not self.curves.size or (np.diff(self.speed_m_s) <= 0).any():
             raise InvalidArgumentError("coupling: expected rising speeds and at least one curve")
-        for curve in self.curves:
-            finite_array("curves", curve, (knots.size,))
-        in_range("std", self.std, 0.0, np.inf, open_low=True, open_high=True)
+        check_fields(self, std=(ABOVE_ZERO, MOST))
 
     def expected(self, radial_speed_m_s: ArrayLike) -> FloatArray:
         r"""Return the value on every curve, shape (curves, n).
@@ -81,10 +81,9 @@ class Coupling:
 
         Shapes: radial_speed_m_s (n,).
         """
-        expected = self.expected(radial_speed_m_s)
-        variance = self.std**2 + value_std**2
-        log_density = -0.5 * ((value - expected) ** 2 / variance + np.log(2 * pi * variance))
-        return np.asarray(np.logaddexp.reduce(log_density, axis=0) - np.log(len(expected)))
+        seen = Observable(value, hypot(self.std, value_std))
+        log_density = _log_normal(seen, self.expected(radial_speed_m_s), 0.0)
+        return np.asarray(np.logaddexp.reduce(log_density, axis=0) - np.log(len(log_density)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,25 +122,11 @@ class Descriptor:
     couplings: tuple[Coupling, ...] = ()
 
     def __post_init__(self) -> None:
-        in_range("weight", self.weight, 0.0, np.inf, open_low=True, open_high=True)
-        finite_array("speed_mean_m_s", self.speed_mean_m_s, ())
-        in_range("speed_std_m_s", self.speed_std_m_s, 0.0, np.inf, open_low=True, open_high=True)
+        above_zero = (ABOVE_ZERO, MOST)
+        check_fields(self, weight=above_zero, speed_mean_m_s=(-MOST, MOST), speed_std_m_s=above_zero)
         names = [coupling.observable for coupling in self.couplings]
         if len(set(names)) != len(names):
             raise InvalidArgumentError(f"couplings: expected each observable once, got {names}")
-
-    def log_speed_prior(self, radial_speed_m_s: FloatArray) -> FloatArray:
-        r"""Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats.
-
-        .. math:: P(v_i) \propto \exp\big(-\tfrac12 (v_i - \mu)^2 / \sigma^2\big), \qquad \sum_i P(v_i) = 1
-
-        Parameters
-        ----------
-        radial_speed_m_s : ndarray, shape (n,)
-            Grid of v_r, m/s.
-        """
-        log_weight = -0.5 * ((radial_speed_m_s - self.speed_mean_m_s) / self.speed_std_m_s) ** 2
-        return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
 
 
 def engine_line(std_hz: float = 4.0) -> Coupling:
@@ -153,7 +138,7 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
     """
     per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
     curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(_SPEEDS_M_S)) for ratio in GEAR_RATIOS]
-    return _coupling(LINE_SPACING, curves, std_hz)
+    return Coupling(LINE_SPACING, _SPEEDS_M_S, np.array(curves), std_hz)
 
 
 def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
@@ -165,10 +150,14 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
     """
-    at = np.maximum(np.abs(_SPEEDS_M_S), LOWEST_SPEED_M_S)
-    low = _octave_db(at, rolling=(85.7, 41.5), propulsion=(89.2, 7.2))
-    high = _octave_db(at, rolling=(97.3, 32.5), propulsion=(84.2, 8.0))
-    return _coupling("tyre_shape_db", [high - low], std_db)
+    # A_R, B_R, A_P and B_P of category 1 at 125 Hz and at 1 kHz, dB.
+    octaves_db = np.array([[85.7, 41.5, 89.2, 7.2], [97.3, 32.5, 84.2, 8.0]])
+    a_rolling, b_rolling, a_propulsion, b_propulsion = octaves_db.T[..., None]
+    ratio = np.maximum(np.abs(_SPEEDS_M_S), LOWEST_SPEED_M_S) / REFERENCE_SPEED_M_S
+    rolling_db = a_rolling + b_rolling * np.log10(ratio)
+    propulsion_db = a_propulsion + b_propulsion * (ratio - 1.0)
+    low, high = _DECIBELS * np.logaddexp(rolling_db / _DECIBELS, propulsion_db / _DECIBELS)
+    return Coupling("tyre_shape_db", _SPEEDS_M_S, (high - low)[None], std_db)
 
 
 def doppler_trajectory(std: float = 0.01) -> Coupling:
@@ -186,7 +175,7 @@ def doppler_trajectory(std: float = 0.01) -> Coupling:
     array([[1.06]])
     """
     ratio = (SPEED_OF_SOUND_M_S + _SPEEDS_M_S) / (SPEED_OF_SOUND_M_S - _SPEEDS_M_S)
-    return _coupling("doppler_ratio", [ratio], std)
+    return Coupling("doppler_ratio", _SPEEDS_M_S, ratio[None], std)
 
 
 def car() -> Descriptor:
@@ -214,23 +203,9 @@ def motorcycle() -> Descriptor:
     Descriptor
         With the Doppler coupling only.
     """
-    labels, couplings = ("motorcycle",), (doppler_trajectory(),)
-    return replace(car(), name="motorcycle", labels=labels, weight=0.1, couplings=couplings)
-
-
-def _octave_db(
-    speed_m_s: FloatArray, rolling: tuple[float, float], propulsion: tuple[float, float]
-) -> FloatArray:
-    ratio = speed_m_s / REFERENCE_SPEED_M_S
-    rolling_db = rolling[0] + rolling[1] * np.log10(ratio)
-    propulsion_db = propulsion[0] + propulsion[1] * (ratio - 1.0)
-    total = np.logaddexp(rolling_db / _DECIBELS, propulsion_db / _DECIBELS)
-    return np.asarray(_DECIBELS * total)
-
-
-def _coupling(observable: str, curves: Sequence[FloatArray], std: float) -> Coupling:
-    knots, *rows = (tuple(values.tolist()) for values in (_SPEEDS_M_S, *curves))
-    return Coupling(observable, knots, tuple(rows), std)
+    usual = car()
+    open_gearing = ("motorcycle",), 1.0 - usual.weight, usual.speed_mean_m_s, usual.speed_std_m_s
+    return Descriptor("motorcycle", *open_gearing, (doppler_trajectory(),))
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,8 +216,7 @@ class Observable:
     std: float  # Of the estimate, >= 0
 
     def __post_init__(self) -> None:
-        finite_array("value", self.value, ())
-        in_range("std", self.std, 0.0, float("inf"), open_high=True)
+        check_fields(self, value=(-MOST, MOST), std=(0.0, MOST))
 
 
 NOT_MEASURED = NotUsable("not measured")
@@ -404,11 +378,17 @@ def ground(
     >>> answer.best.direction, answer.best.radial_speed_m_s, answer.evidence.hidden[0] > 1.0
     ('left', 8.0, True)
     """
-    chosen = settings or GroundedSettings()
     names = [descriptor.name for descriptor in descriptors]
     if not names or len(set(names)) != len(names):
         raise InvalidArgumentError(f"descriptors: expected one or more with different names, got {names}")
-    over_speed = _over_speed(observation, descriptors, chosen)
+    without = settings.without if settings else frozenset[str]()
+    approach, weights = _log_approach(observation, without), [one.weight for one in descriptors]
+    couplings = np.stack([_log_couplings(observation, one, without) for one in descriptors])
+    # P(c) and P(v_r | c), a normal law on the grid, of every class in a row.
+    mean, std = np.array([(one.speed_mean_m_s, one.speed_std_m_s) for one in descriptors]).T[..., None]
+    prior = -0.5 * ((_SPEEDS_M_S - mean) / std) ** 2
+    prior -= np.logaddexp.reduce(prior, axis=1, keepdims=True)
+    over_speed = np.log(weights / np.sum(weights))[:, None] + prior + couplings + approach
     stds_rad = _HIDDEN_STD_RAD, _VISIBLE_STD_RAD
     hidden_azimuth, visible_azimuth = (_over_azimuth(observation.bearing_rad, one) for one in stds_rad)
     per_class = np.logaddexp.reduce(over_speed, axis=1)
@@ -418,48 +398,37 @@ def ground(
     # What no descriptor explains is unlikely without bound.
     *hidden, visible = np.clip([*hidden, visible], -MOST_NATS, MOST_NATS).tolist()
     grounded = SignatureEvidence(evidence.directions, tuple(hidden), visible, evidence.none)
-    best = _best(evidence, descriptors, over_speed, hidden_azimuth)
-    return GroundedAnswer(grounded, best, dict(zip(names, np.exp(per_class - moving).tolist(), strict=True)))
-
-
-def _over_speed(
-    observation: GroundedObservation, descriptors: Sequence[Descriptor], settings: GroundedSettings
-) -> FloatArray:
-    """Log of P(c) P(v_r | c) p(o | c, v_r) p(v | v_r) over the background, shape (classes, speeds)."""
-    weights = np.log([descriptor.weight for descriptor in descriptors])
-    weights -= np.logaddexp.reduce(weights)
-    approach = _log_approach(observation, settings)
-    rows = [
-        weight + d.log_speed_prior(_SPEEDS_M_S) + _log_couplings(observation, d, settings) + approach
-        for weight, d in zip(weights, descriptors, strict=True)
-    ]
-    return np.stack(rows)
+    # The arg max over the hidden state: its factors part, so each is taken by itself.
+    entity, speed = divmod(int(over_speed.argmax()), _SPEEDS_M_S.size)
+    best, direction = descriptors[entity], evidence.directions[int(np.argmax(evidence.hidden))]
+    at = float(_AZIMUTHS_RAD[hidden_azimuth.argmax()]), float(_SPEEDS_M_S[speed])
+    classes = dict(zip(names, np.exp(per_class - moving).tolist(), strict=True))
+    return GroundedAnswer(grounded, HiddenState(direction, best.name, best.labels, *at), classes)
 
 
 def _log_couplings(
-    observation: GroundedObservation, descriptor: Descriptor, settings: GroundedSettings
+    observation: GroundedObservation, descriptor: Descriptor, without: Collection[str]
 ) -> FloatArray:
     """Log of p(o | c, v_r) over the background; an observable that a class leaves open adds nothing."""
     total = np.zeros(_SPEEDS_M_S.size)
     for coupling in descriptor.couplings:
         seen = observation.signature.get(coupling.observable)
-        if seen is not None and coupling.observable not in settings.without:
-            background = _log_normal(BACKGROUNDS[coupling.observable], seen.value, 0.0)
-            total += coupling.log_likelihood(seen.value, seen.std, _SPEEDS_M_S) - background
+        if seen is not None and coupling.observable not in without:
+            density = coupling.log_likelihood(seen.value, seen.std, _SPEEDS_M_S)
+            total += density - _log_background(coupling.observable, seen)
     return total
 
 
-def _log_approach(observation: GroundedObservation, settings: GroundedSettings) -> FloatArray:
+def _log_approach(observation: GroundedObservation, without: Collection[str]) -> FloatArray:
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
-    if isinstance(speed, Observable) and "radial_speed_m_s" not in settings.without:
-        background = _log_normal(BACKGROUNDS["radial_speed_m_s"], speed.value, 0.0)
-        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - background
-    if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in settings.without:
-        background = _log_normal(BACKGROUNDS["inverse_tta_hz"], inverse_tta.value, 0.0)
-        ranges = _SPEED_CELL_M_S / _RANGES_M
-        over_range = _log_normal(inverse_tta, _SPEEDS_M_S[:, None] / _RANGES_M, ranges)
-        return np.asarray(np.logaddexp.reduce(over_range, axis=1) - np.log(_RANGES_M.size) - background)
+    if isinstance(speed, Observable) and "radial_speed_m_s" not in without:
+        return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - _log_background("radial_speed_m_s", speed)
+    if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in without:
+        rates_hz, cells_hz = (one / _RANGES_M for one in (_SPEEDS_M_S[:, None], _SPEED_CELL_M_S))
+        over_range = _log_normal(inverse_tta, rates_hz, cells_hz) - np.log(_RANGES_M.size)
+        density = np.logaddexp.reduce(over_range, axis=1)
+        return np.asarray(density - _log_background("inverse_tta_hz", inverse_tta))
     return np.zeros(_SPEEDS_M_S.size)
 
 
@@ -473,27 +442,14 @@ def _over_azimuth(bearing: Observable | NotUsable, std_rad: float) -> FloatArray
     return np.asarray(prior + fit - np.logaddexp.reduce(fit - np.log(fit.size)))
 
 
+def _log_background(name: str, seen: Observable) -> FloatArray:
+    return _log_normal(BACKGROUNDS[name], seen.value, 0.0)
+
+
 def _log_normal(seen: Observable, expected: FloatArray | float, cell: FloatArray | float) -> FloatArray:
     """Log density of what was seen; a spread below half a cell of the grid is held there."""
     std = np.maximum(seen.std, np.asarray(cell) / 2.0)
     return np.asarray(-0.5 * ((seen.value - expected) / std) ** 2 - np.log(std * np.sqrt(2 * pi)))
-
-
-def _best(
-    evidence: SignatureEvidence,
-    descriptors: Sequence[Descriptor],
-    over_speed: FloatArray,
-    over_azimuth: FloatArray,
-) -> HiddenState:
-    """Return arg max of p(k, c, theta, v_r | y, hidden): its factors part, so each is taken by itself."""
-    entity, speed = divmod(int(over_speed.argmax()), over_speed.shape[1])
-    return HiddenState(
-        direction=evidence.directions[int(np.argmax(evidence.hidden))],
-        entity_class=descriptors[entity].name,
-        labels=descriptors[entity].labels,
-        azimuth_rad=float(_AZIMUTHS_RAD[over_azimuth.argmax()]),
-        radial_speed_m_s=float(_SPEEDS_M_S[speed]),
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,9 @@ are their own mirror images: see `window_classes`.
 """
 
 import math
-from collections.abc import Collection
 from dataclasses import dataclass, field
-from operator import attrgetter
-from typing import Annotated, ClassVar
+from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,63 +21,14 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.checks import check_shape, freeze_arrays, in_range, one_of
-from worldstate.ground.serialisation import ADDED, Layout, Via
+from worldstate.ground.serialisation import ADDED, Layout
 
+from . import window_classes
 from .published_signature import ModelDomain, SignatureModel
-from .window_classes import (
-    CLASSES,
-    EXPLANATION_COLUMNS,
-    SMALLEST_PROBABILITY,
-    checked_classes,
-    explained,
-    mirrored_classes,
-    window_evidence,
-)
 
 SMALLEST_LEVEL = 1e-4
 QUIET_SHARE = 0.35
 KINDS = ("mean", "median", "quiet")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SiteReference:
-    """Three unlabelled summaries of the log-levels at one site.
-
-    Examples
-    --------
-    >>> site_reference(np.log([[1.0, 2.0], [1.0, 4.0], [1.0, 8.0]])).median.round(2)
-    array([0.  , 1.39])
-    """
-
-    mean: FloatArray  # shape (features,): Over all windows
-    median: FloatArray
-    # shape (features,): Mean over the 35 % of the windows whose loudest feature is the least: close to what
-    # the site is like while no vehicle comes, whatever share of the windows that is.
-    quiet: FloatArray
-
-    @property
-    def row(self) -> FloatArray:
-        """The three summaries one after the other, shape (3 * features,): what stands behind a window."""
-        return np.concatenate([getattr(self, kind) for kind in KINDS])
-
-    @classmethod
-    def from_row(cls, row: ArrayLike) -> "SiteReference":
-        """Return the reference whose `row` this is.
-
-        Shapes: row (3 * features,).
-        """
-        values = finite_array("reference", row, (None,))
-        if values.size % len(KINDS):
-            raise InvalidArgumentError(f"reference: expected a multiple of three numbers, got {values.size}")
-        return cls(*values.reshape(len(KINDS), -1))
-
-    def shifted(self, offset: ArrayLike) -> "SiteReference":
-        """Return the reference of a site whose log-levels are higher by `offset`, shape (features,).
-
-        Shapes: offset (features,).
-        """
-        # `r' = r + offset` for each of the three.
-        return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
 
 
 def log_levels(X: ArrayLike) -> FloatArray:
@@ -94,17 +44,20 @@ def log_levels(X: ArrayLike) -> FloatArray:
     return np.log(np.maximum(np.asarray(X, dtype=np.float64), SMALLEST_LEVEL))
 
 
-def site_reference(levels: ArrayLike) -> SiteReference:
-    r"""Return the reference of a site from its windows, shape (windows, features), natural logarithms.
+def site_reference(levels: ArrayLike) -> FloatArray:
+    r"""Return three unlabelled summaries of a site from its windows, one after the other: its reference.
 
     .. math:: r = \big(\langle x \rangle,\; \mathrm{median}\, x,\;
               \langle x \mid \max_a x_a \le q_{0.35} \rangle\big)
 
-    Shapes: levels (windows, features).
+    The last is the mean over the 35 % of the windows whose loudest feature is the least: close to what the
+    site is like while no vehicle comes, whatever share of the windows that is.
+
+    Shapes: levels (windows, features), natural logarithms; returns (3 * features,).
 
     Examples
     --------
-    >>> site_reference(np.array([[0.0, 1.0], [2.0, 3.0]])).row
+    >>> site_reference(np.array([[0.0, 1.0], [2.0, 3.0]]))
     array([1., 2., 1., 2., 0., 1.])
     """
     windows = finite_array("levels", levels, (None, None))
@@ -112,7 +65,7 @@ def site_reference(levels: ArrayLike) -> SiteReference:
         raise InvalidArgumentError("levels: expected at least one window")
     loudest = windows.max(axis=1)
     quiet = windows[loudest <= np.quantile(loudest, QUIET_SHARE)]
-    return SiteReference(windows.mean(axis=0), np.median(windows, axis=0), quiet.mean(axis=0))
+    return np.concatenate([windows.mean(axis=0), np.median(windows, axis=0), quiet.mean(axis=0)])
 
 
 SEGMENTS = 2
@@ -129,53 +82,44 @@ def mirror_features(X: FloatArray, segments: int = SEGMENTS) -> FloatArray:
 
 
 _SHARPNESS = 4.0
+_PARTS = 3  # Of the directions of a segment: left, centre and right
 
 
-def shape_features(levels: FloatArray, segments: int = 2) -> FloatArray:
+def shape_features(levels: FloatArray) -> FloatArray:
     r"""Return peaks, sides, widths and changes of log-levels over directions, shape (n, 13 * segments + 5).
 
     .. math:: p = \sum_a w_a u_a, \qquad \sigma^2 = \sum_a w_a u_a^2 - p^2, \qquad
               w_a \propto e^{4 (x_a - \max x)}, \quad \sum_a w_a = 1
 
+    are side and width, u running from -1 to 1; the others are extremes, means, deviations and differences.
+
     Shapes: levels (n, segments * directions).
     """
-    # are side and width, u running from -1 to 1; the others are extremes, means, deviations and differences.
-    #
     # Mirroring the directions exchanges the sides and changes the sign of what points to one.
-    stretches = levels.reshape(len(levels), segments, -1)
+    stretches = levels.reshape(len(levels), SEGMENTS, -1)
+    first, last = stretches[:, 0], stretches[:, -1]
+    change, peak = last - first, last.max(axis=1) - first.max(axis=1)
+    changes = [change.max(axis=1), change.min(axis=1), change.mean(axis=1), peak, change.std(axis=1)]
     by_segment = np.stack(_columns(stretches), axis=2).reshape(len(levels), -1)
-    change = np.stack(_change(stretches[:, 0], stretches[:, -1]), axis=1)
-    return np.concatenate([by_segment, change], axis=1)
+    return np.concatenate([by_segment, np.stack(changes, axis=1)], axis=1)
 
 
 def _columns(levels: FloatArray) -> list[FloatArray]:
     """Numbers of each stretch, every one of shape (n, segments)."""
     n_directions = levels.shape[2]
     peak, middle = levels.max(axis=2), np.median(levels, axis=2)
-    third = n_directions // 3
-    first = levels[:, :, :third].max(axis=2)
-    centre = levels[:, :, third : n_directions - third].max(axis=2)
-    last = levels[:, :, n_directions - third :].max(axis=2)
-    position, width = _centroid(levels)
-    heights = [peak, middle, levels.min(axis=2), peak - middle]
-    sides = [first, centre, last, first - last, position, np.abs(position)]
-    return [*heights, *sides, levels.std(axis=2), width, np.diff(levels, axis=2).std(axis=2)]
-
-
-def _centroid(levels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and spread of the direction, on [-1, 1], weighted by the levels above their peak's foot."""
-    direction = np.linspace(-1.0, 1.0, levels.shape[2])
-    weights = np.exp(_SHARPNESS * (levels - levels.max(axis=2, keepdims=True)))
+    third = n_directions // _PARTS
+    ends = [0, third, n_directions - third, n_directions]
+    first, centre, last = (levels[:, :, a:b].max(axis=2) for a, b in pairwise(ends))
+    direction = np.linspace(-1.0, 1.0, n_directions)
+    weights = np.exp(_SHARPNESS * (levels - peak[..., None]))
     weights /= weights.sum(axis=2, keepdims=True)
     # Sums, not products of matrices: a row then comes out to the bit the same among whatever others.
     position, square = (weights * direction).sum(axis=2), (weights * direction**2).sum(axis=2)
-    return position, np.sqrt(np.maximum(square - position**2, 0.0))
-
-
-def _change(first: FloatArray, last: FloatArray) -> list[FloatArray]:
-    change = last - first
-    peak = last.max(axis=1) - first.max(axis=1)
-    return [change.max(axis=1), change.min(axis=1), change.mean(axis=1), peak, change.std(axis=1)]
+    width = np.sqrt(np.maximum(square - position**2, 0.0))
+    heights = [peak, middle, levels.min(axis=2), peak - middle]
+    sides = [first, centre, last, first - last, position, np.abs(position)]
+    return [*heights, *sides, levels.std(axis=2), width, np.diff(levels, axis=2).std(axis=2)]
 
 
 SHAPE, SHAPE_CHANGE = "shape", "shape_change"
@@ -217,8 +161,8 @@ class Expert:
         return np.asarray((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
 
 
-def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
-    r"""Return the views, each of shape (n, inputs); parts that several share are computed once.
+def expert_views(levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
+    r"""Return all views, each of shape (n, inputs).
 
     .. math:: v = x - r \text{ (mean, median, quiet)}, \qquad v = \phi(x) \text{ (shape)}, \qquad
               v = \phi(x) - \phi(r_{median}) \text{ (change)}
@@ -228,15 +172,11 @@ def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatAr
     Shapes: levels (n, features), reference (n, 3 * features).
     """
     summaries = dict(zip(KINDS, np.split(reference, len(KINDS), axis=1), strict=True))
-    views = {kind: levels - summary for kind, summary in summaries.items() if kind in wanted}
-    if SHAPE_CHANGE in wanted:
-        # One call for both: of a single window most of it is what calls cost.
-        shapes = shape_features(np.concatenate([levels, summaries["median"]]), SEGMENTS)
-        views[SHAPE], of_site = shapes[: len(levels)], shapes[len(levels) :]
-        views[SHAPE_CHANGE] = views[SHAPE] - of_site
-    elif SHAPE in wanted:
-        views[SHAPE] = shape_features(levels, SEGMENTS)
-    return views
+    views = {kind: levels - summary for kind, summary in summaries.items()}
+    # One call for both: of a single window most of it is what calls cost.
+    shapes = shape_features(np.concatenate([levels, summaries["median"]]))
+    views[SHAPE], of_site = shapes[: len(levels)], shapes[len(levels) :]
+    return views | {SHAPE_CHANGE: views[SHAPE] - of_site}
 
 
 def log_softmax(sums: FloatArray) -> FloatArray:
@@ -296,7 +236,7 @@ class EnsembleModel:
         At least one.
     class_prior : ndarray, shape (classes,)
         Class frequencies of the training set, mirrored rows included.
-    home : SiteReference
+    home : ndarray, shape (3 * features,)
         Mean reference of the training sites, mirrored ones included: stands in where no site is known.
     empty : ndarray, shape (features,)
         Mean log-levels of the training windows without any source: what a stream that is mostly empty is
@@ -317,7 +257,7 @@ class EnsembleModel:
     Examples
     --------
     >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
-    >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))), np.zeros(6))
+    >>> model = EnsembleModel((expert,), np.full(4, 0.25), np.zeros(18), np.zeros(6))
     >>> model.predict_proba(np.ones((1, 6)))
     array([[0.25, 0.25, 0.25, 0.25]])
     """
@@ -328,26 +268,24 @@ class EnsembleModel:
 
     experts: tuple[Expert, ...]
     class_prior: FloatArray
-    home: Annotated[SiteReference, Via(FloatArray, attrgetter("row"), SiteReference.from_row)]
+    home: FloatArray
     empty: FloatArray
     domain: ModelDomain | None = field(default=None, metadata=ADDED)
     prior_s: float = field(default=PRIOR_S, metadata=ADDED)
-    classes: tuple[str, ...] = CLASSES
+    classes: tuple[str, ...] = window_classes.CLASSES
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:
             raise InvalidArgumentError(f"experts: expected 1 to {MOST_EXPERTS}, got {len(self.experts)}")
-        known = (len(checked_classes(self.classes)),)
-        freeze_arrays(self, class_prior=known, empty=(self.n_features,))
+        known = (len(window_classes.checked_classes(self.classes)),)
+        freeze_arrays(self, class_prior=known, empty=(None,))
+        freeze_arrays(self, home=(len(KINDS) * self.n_features,))
         if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0):
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
-        if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
-            raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
-        in_range("prior_s", self.prior_s, 0.0, math.inf, open_high=True)
-        home = finite_array("home", self.home.row, (len(KINDS) * self.n_features,))
-        home.flags.writeable = False
-        object.__setattr__(self, "home", SiteReference.from_row(home))
-        views = expert_views(VIEWS, self.home.mean[None], self.home.row[None])
+        if self.n_features % SEGMENTS or self.n_features < _PARTS * SEGMENTS:
+            raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of {_PARTS} or more directions")
+        in_range("prior_s", self.prior_s, 0.0, math.inf)
+        views = expert_views(self.empty[None], self.home[None])
         for expert in self.experts:
             inputs = views[expert.view].shape[1]
             if expert.mean.size != inputs:
@@ -357,13 +295,13 @@ class EnsembleModel:
     @property
     def n_features(self) -> int:
         """Length of the feature vector of one window."""
-        return int(self.home.mean.size)
+        return int(self.empty.size)
 
     @property
     def reference_prior(self) -> tuple[float, ...]:
         """Training prior in the order of the explanations (left, right, visible, none)."""
-        prior = explained(self.class_prior[None], self.classes, self.class_prior)[0]
-        return tuple(prior[list(EXPLANATION_COLUMNS)].tolist())
+        prior = window_classes.explained(self.class_prior[None], self.classes, self.class_prior)[0]
+        return tuple(prior[list(window_classes.EXPLANATION_COLUMNS)].tolist())
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of the model's classes at the training prior, shape (n, classes).
@@ -386,12 +324,28 @@ class EnsembleModel:
         C. Genest and J. V. Zidek, "Combining probability distributions: a critique and an annotated
         bibliography", Statist. Sci. 1, 1986 (the logarithmic pool).
         """
-        return self.posteriors(*self._split(X))
+        inputs = finite_array("X", X, (None, None))
+        if inputs.shape[1] == self.n_features:
+            inputs = np.hstack([inputs, np.tile(self.home, (len(inputs), 1))])
+        check_shape("X, with a reference", inputs.shape, (None, self.n_features * (1 + len(KINDS))))
+        return self.posteriors(*split_reference(inputs))
 
     def posteriors(self, levels: FloatArray, reference: FloatArray) -> FloatArray:
-        """Return what `predict_proba` does for log-levels, shape (n, features), and rows of references."""
-        posteriors = np.maximum(np.exp(self._log_posteriors(levels, reference)), SMALLEST_PROBABILITY)
-        return np.asarray(posteriors / total(posteriors))
+        """Return what `predict_proba` does for log-levels, shape (n, features), and references."""
+        n = len(levels)
+        views = expert_views(
+            np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
+            np.concatenate([reference, mirror_features(reference, SEGMENTS * len(KINDS))]),
+        )
+        told = [(expert, views[expert.view]) for expert in self.experts]
+        sums = [expert.sums(half) for expert, seen in told for half in (seen[:n], seen[n:])]
+        # One call for all experts: of a single window most of it is what calls cost.
+        both = log_softmax(np.concatenate(sums)).reshape(len(told), 2, n, -1)
+        # Added to each other first: the sum of two does not depend on which is the mirror image.
+        pairs = both[:, 0] + both[:, 1][..., window_classes.mirrored_classes(len(self.classes))]
+        mean = log_softmax(pairs.sum(axis=0) / (2 * len(told)))
+        shares = np.maximum(np.exp(mean), window_classes.SMALLEST_PROBABILITY)
+        return np.asarray(shares / total(shares))
 
     def explain(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of front, left, none and right alone, shape (n, 4).
@@ -409,7 +363,7 @@ class EnsembleModel:
         ----------
         Derived here: see the head of `worldstate.abduction.signature.window_classes`.
         """
-        return explained(self.predict_proba(X), self.classes, self.class_prior)
+        return window_classes.explained(self.predict_proba(X), self.classes, self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         r"""Return the log-likelihoods of one window, shape (features,) or (4 * features,).
@@ -430,37 +384,9 @@ class EnsembleModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        return self.answer(*self._split(np.atleast_2d(feature)))
-
-    def answer(self, levels: FloatArray, reference: FloatArray) -> SignatureEvidence:
-        """Return what `evidence` does for log-levels, shape (1, features), and the row of a reference."""
-        return window_evidence(self.posteriors(levels, reference), self.classes, self.class_prior)
-
-    def _split(self, X: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        n_features = self.n_features
-        inputs = finite_array("X", X, (None, None))
-        with_reference = n_features * (1 + len(KINDS))
-        if inputs.shape[1] == with_reference:
-            return split_reference(inputs)
-        if inputs.shape[1] != n_features:
-            expected = f"{n_features} features or {with_reference} with a reference"
-            raise InvalidArgumentError(f"X: expected {expected}, got shape {inputs.shape}")
-        return log_levels(inputs), np.broadcast_to(self.home.row, (len(inputs), self.home.row.size))
-
-    def _log_posteriors(self, levels: FloatArray, reference: FloatArray) -> FloatArray:
-        n, wanted = len(levels), {expert.view for expert in self.experts}
-        views = expert_views(
-            wanted,
-            np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
-            np.concatenate([reference, mirror_features(reference, SEGMENTS * len(KINDS))]),
+        return window_classes.window_evidence(
+            self.predict_proba(np.atleast_2d(feature)), self.classes, self.class_prior
         )
-        told = [(expert, views[expert.view]) for expert in self.experts]
-        sums = [expert.sums(half) for expert, seen in told for half in (seen[:n], seen[n:])]
-        # One call for all experts: of a single window most of it is what calls cost.
-        both = log_softmax(np.concatenate(sums)).reshape(len(told), 2, n, -1)
-        # Added to each other first: the sum of two does not depend on which is the mirror image.
-        pairs = both[:, 0] + both[:, 1][..., mirrored_classes(len(self.classes))]
-        return log_softmax(pairs.sum(axis=0) / (2 * len(told)))
 
 
 AnySignature = SignatureModel | EnsembleModel

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import starmap
 from typing import Self
 
 import numpy as np
@@ -19,7 +20,6 @@ from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, m
 # to 3 and parts from .15 to .35 the areas of real junctions left out stay within .002 and the side within
 # .03; without such a part the side is right in .85 of the windows instead of .93, with half of it in .84.
 SIMULATED_WEIGHT, OTHER_SIDE = 1.0, 0.25
-_RIDGE = 1e-3
 # Part of a real window's weight that is compared with what was heard of its site before it: more of it costs
 # the worst junction of a standing ego .01 of its AUROC, none leaves a moving one .01 lower.
 HEARD_PART = 0.25
@@ -39,13 +39,8 @@ class Recipe:
 
 
 # Chosen on eight junctions, every choice judged on a junction it was not made on: lab/NOTES.md.
-RECIPES = (
-    Recipe("mean", _RIDGE),
-    Recipe("median", _RIDGE),
-    Recipe("quiet", _RIDGE),
-    Recipe(ensemble.SHAPE, 1e-1),
-    Recipe(ensemble.SHAPE_CHANGE, 1e-2),
-)
+_RIDGES = dict.fromkeys(ensemble.KINDS, 0.001) | {ensemble.SHAPE: 1e-1, ensemble.SHAPE_CHANGE: 1e-2}
+RECIPES = tuple(starmap(Recipe, _RIDGES.items()))
 # Of an ego that moves: its own noise covers the level, which a ridge favours; the pattern above the site's
 # reference is left, and is held back less.
 MOVING_RECIPES = tuple(
@@ -165,13 +160,11 @@ class SiteEnsembleClassifier:
         sites = None if groups is None else np.asarray(groups)
         (windows, learned), empty = ensemble.split_reference(inputs), codes == NONE
         prior_s = ensemble.PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
-        real = _with_mirror_images(windows, learned, codes)
-        home = ensemble.SiteReference.from_row(real[1].mean(axis=0))
-        silence = real[0][real[2] == NONE].mean(axis=0)
-        ones = np.ones(len(real[2]))
+        real, ones = _with_mirror_images(windows, learned, codes), np.ones(2 * len(codes))
+        home, silence = real[1].mean(axis=0), real[0][real[2] == NONE].mean(axis=0)
         rows = [(*real, ones)]
         if heard is not None:
-            again = np.array([one.beside(home, silence, prior_s).row for one in heard])
+            again = np.array([one.beside(home, silence, prior_s) for one in heard])
             more = _with_mirror_images(windows, again, codes)
             rows = [(*real, (1.0 - HEARD_PART) * ones), (*more, HEARD_PART * ones)]
         if self.simulated is not None and sites is not None:
@@ -179,7 +172,7 @@ class SiteEnsembleClassifier:
         levels, reference, codes, weights = map(np.concatenate, zip(*rows, strict=True))
         # The four of the data, and what else there are windows of; scikit-learn sorts its columns the same.
         known = np.union1d(np.arange(len(CLASSES)), codes)
-        views = ensemble.expert_views({recipe.view for recipe in self.recipes}, levels, reference)
+        views = ensemble.expert_views(levels, reference)
         self.model_ = ensemble.EnsembleModel(
             tuple(_fit_expert(recipe, views[recipe.view], codes, weights) for recipe in self.recipes),
             np.bincount(codes, weights)[known] / weights.sum(),
@@ -234,20 +227,18 @@ def _with_mirror_images(
 
 
 def _simulated_rows(
-    windows: SimulatedWindows, home: ensemble.SiteReference
+    windows: SimulatedWindows, home: FloatArray
 ) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
     """Return log-levels, references, classes and weights, hazards of the other side behind the windows."""
     levels, reference = ensemble.split_reference(windows.X)
-    reference = np.where(np.isnan(reference), home.row, reference)
+    reference = np.where(np.isnan(reference), home, reference)
     codes = _codes(windows.y)
     other = _mirrored(codes)
-    hidden = other != codes
-    rows = np.concatenate([np.arange(len(codes)), np.flatnonzero(hidden)])
-    part = np.where(hidden, windows.other_side, 0.0)
-    shares = np.concatenate([1.0 - part, part[hidden]])
-    sides = np.concatenate([codes, other[hidden]])
-    mirrored = _with_mirror_images(levels[rows], reference[rows], sides)
-    return (*mirrored, np.tile(shares * windows.weights[rows], 2))
+    hidden = np.flatnonzero(other != codes)
+    part = np.where(other != codes, windows.other_side, 0.0)
+    rows, sides = np.r_[: len(codes), hidden], np.r_[codes, other[hidden]]
+    weights = np.r_[1.0 - part, part[hidden]] * windows.weights[rows]
+    return (*_with_mirror_images(levels[rows], reference[rows], sides), np.tile(weights, 2))
 
 
 def _codes(labels: TextArray) -> IndexArray:

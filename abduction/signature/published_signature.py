@@ -18,13 +18,7 @@ from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import finite_array, freeze_arrays, in_range
 from worldstate.ground.serialisation import ADDED, Layout
 
-from .window_classes import (
-    CLASSES,
-    EXPLANATION_COLUMNS,
-    SMALLEST_PROBABILITY,
-    evidence_of,
-    explanation_ratios,
-)
+from .window_classes import CLASSES, EXPLANATION_COLUMNS, SMALLEST_PROBABILITY, evidence_of
 
 EgoMotion = Literal["standing", "moving", "any"]
 
@@ -218,8 +212,7 @@ class SignatureModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        posteriors = self.predict_proba(np.atleast_2d(feature))
-        return evidence_of(explanation_ratios(posteriors, self.class_prior)[0])
+        return evidence_of(self.predict_proba(np.atleast_2d(feature)), self.class_prior)
 
 
 def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
@@ -236,23 +229,14 @@ def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
     Source: Wu, Lin, Weng, "Probability estimates for multi-class classification by pairwise coupling", 2004,
     second method.
     """
-    bounded = np.clip(pairwise, SMALLEST_PROBABILITY, 1.0 - SMALLEST_PROBABILITY)
-    right_side = np.zeros((n_classes + 1, 1))
-    right_side[n_classes] = 1.0
-    solution = np.linalg.solve(_optimality_matrix(bounded, n_classes), right_side)[:, :n_classes, 0]
-    positive = np.maximum(solution, SMALLEST_PROBABILITY)
+    first, second = np.triu_indices(n_classes, 1)
+    r = np.zeros((len(pairwise), n_classes, n_classes))
+    r[:, first, second] = np.clip(pairwise, SMALLEST_PROBABILITY, 1.0 - SMALLEST_PROBABILITY)
+    r[:, second, first] = 1.0 - r[:, first, second]
+    # The quadratic form Q and the sum, bordered: [[Q, 1], [1', 0]].
+    matrix = np.ones((len(r), n_classes + 1, n_classes + 1))
+    matrix[:, :-1, :-1] = (r**2).sum(axis=1)[:, None] * np.eye(n_classes) - r * r.mT
+    matrix[:, -1, -1] = 0.0
+    right_side = np.eye(n_classes + 1)[:, -1:]
+    positive = np.maximum(np.linalg.solve(matrix, right_side)[:, :-1, 0], SMALLEST_PROBABILITY)
     return np.asarray(positive / positive.sum(axis=1, keepdims=True))
-
-
-def _optimality_matrix(pairwise: FloatArray, n_classes: int) -> FloatArray:
-    """Bordered quadratic form [[Q, 1], [1', 0]], shape (n, classes + 1, classes + 1)."""
-    matrix = np.zeros((len(pairwise), n_classes + 1, n_classes + 1))
-    matrix[:, :n_classes, n_classes] = matrix[:, n_classes, :n_classes] = 1.0
-    for column, (i, j) in enumerate(combinations(range(n_classes), 2)):
-        first = pairwise[:, column]
-        second = 1.0 - first
-        matrix[:, i, i] += second**2
-        matrix[:, j, j] += first**2
-        matrix[:, i, j] -= first * second
-        matrix[:, j, i] -= first * second
-    return matrix

@@ -25,10 +25,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
 
-from .ensemble import EnsembleModel, SiteReference, log_levels
+from .ensemble import KINDS, EnsembleModel, log_levels
+from .window_classes import window_evidence
 
 # Share of the difference in level that is carried over; all of the pattern is.
 _LEVEL_GAIN = 0.25
@@ -112,7 +114,7 @@ class SiteEstimate:
         heard_s = self.heard_s * math.exp(-dt_s / settings.forgetting_s) + dt_s
         return SiteEstimate(self.level + dt_s / heard_s * (levels - self.level), heard_s)
 
-    def reference(self, model: EnsembleModel) -> SiteReference:
+    def reference(self, model: EnsembleModel) -> FloatArray:
         r"""Return what windows are to be compared with; that of the training sites before anything was heard.
 
         .. math:: r = r_{home} + \frac{h}{h + h_0} \big( \tfrac{1}{4} \langle d \rangle
@@ -135,10 +137,10 @@ class SiteEstimate:
         """
         return self.beside(model.home, model.empty, model.prior_s)
 
-    def beside(self, home: SiteReference, empty: FloatArray, prior_s: float) -> SiteReference:
+    def beside(self, home: FloatArray, empty: FloatArray, prior_s: float) -> FloatArray:
         """Return the reference beside training sites, before there is a model of them: as `reference`.
 
-        Shapes: empty (features,).
+        Shapes: home (3 * features,), empty (features,).
         """
         if self.level.shape != empty.shape:
             raise InvalidArgumentError(f"model: expected {self.level.size} features, got {empty.size}")
@@ -147,10 +149,7 @@ class SiteEstimate:
         difference = self.level - empty
         level = difference.mean()
         offset = _LEVEL_GAIN * level + (difference - level)
-        return home.shifted(self.heard_s / (self.heard_s + prior_s) * offset)
-
-
-HOP_S = 0.1
+        return np.asarray(home + np.tile(self.heard_s / (self.heard_s + prior_s) * offset, len(KINDS)))
 
 
 class SiteSignature:
@@ -180,9 +179,8 @@ class SiteSignature:
     Examples
     --------
     >>> from worldstate.abduction.signature.ensemble import Expert
-    >>> from worldstate.abduction.signature.ensemble import SiteReference
     >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
-    >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))), np.zeros(6))
+    >>> model = EnsembleModel((expert,), np.full(4, 0.25), np.zeros(18), np.zeros(6))
     >>> signature = SiteSignature(model)
     >>> signature.evidence(np.ones(6)).none, signature.estimate.heard_s
     (0.0, 0.1)
@@ -211,4 +209,5 @@ class SiteSignature:
         window = finite_array("feature", feature, (self._model.n_features,))
         reference = self.estimate.reference(self._model)
         self.estimate = self.estimate.updated(window, HOP_S, self._settings)
-        return self._model.answer(log_levels(window)[None], reference.row[None])
+        posteriors = self._model.posteriors(log_levels(window)[None], reference[None])
+        return window_evidence(posteriors, self._model.classes, self._model.class_prior)

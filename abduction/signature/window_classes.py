@@ -42,12 +42,14 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatA
     return np.asarray(hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE]))
 
 
-def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatArray:
-    r"""Return log-likelihoods of left, right, visible, none by window, shape (n, 4), nats.
+def evidence_of(
+    posteriors: FloatArray, class_prior: FloatArray, sides: SideEvidence | None = None
+) -> SignatureEvidence:
+    r"""Return the log-likelihoods of one window from its posteriors at the training prior.
 
     .. math:: \log \ell_c = \log P_c - \log \pi_c
 
-    Shapes: posteriors (n, 4), class_prior (4,).
+    Shapes: posteriors (1, 4), class_prior (4,).
 
     References
     ----------
@@ -55,24 +57,11 @@ def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatA
 
     Examples
     --------
-    >>> explanation_ratios(np.array([[0.1, 0.4, 0.4, 0.1]]), [0.25, 0.25, 0.25, 0.25]).round(2)
-    array([[ 0.47, -0.92, -0.92,  0.47]])
+    >>> [round(one, 2) for one in evidence_of(np.array([[0.1, 0.4, 0.4, 0.1]]), np.full(4, 0.25)).hidden]
+    [0.47, -0.92]
     """
     ratios = np.log(posteriors) - np.log(class_prior)
-    return np.asarray(ratios[:, EXPLANATION_COLUMNS])
-
-
-def evidence_of(log_likelihoods: FloatArray, sides: SideEvidence | None = None) -> SignatureEvidence:
-    """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence.
-
-    Shapes: log_likelihoods (4,).
-
-    Examples
-    --------
-    >>> evidence_of(np.array([0.5, -1.0, -0.9, 0.4])).hidden
-    (0.5, -1.0)
-    """
-    left, right, visible, none = log_likelihoods.tolist()
+    left, right, visible, none = ratios[0, list(EXPLANATION_COLUMNS)].tolist()
     return SignatureEvidence(DIRECTIONS, (left, right), visible, none, sides)
 
 
@@ -167,7 +156,7 @@ def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: Flo
     visible = visible_ratios(posteriors, prior).item()
     _, both, direct = _six(posteriors, classes)
     sides = SideEvidence(DIRECTIONS, (left, right), both.item(), direct.item(), visible)
-    return evidence_of(explanation_ratios(seen, known[0])[0], sides)
+    return evidence_of(seen, known[0], sides)
 
 
 def _six(shares: FloatArray, classes: tuple[str, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:

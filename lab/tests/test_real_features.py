@@ -93,7 +93,7 @@ def test_the_model_that_ships_holds_on_the_official_test_recordings():
 def test_no_row_of_the_data_ships():
     model = read_model().signature
     stored = [row for expert in model.experts for row in (*expert.weights, expert.mean, expert.scale)]
-    stored += [model.empty, *np.split(model.home.row, 3)]
+    stored += [model.empty, *np.split(model.home, 3)]
     numbers = {round(number, 6) for row in stored for number in row.tolist()}
     table = read_features(FOLDER / TABLE)
     for row in np.concatenate([table.features, np.log(table.features)]):

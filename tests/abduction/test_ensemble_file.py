@@ -136,6 +136,6 @@ def test_experts_that_do_not_fit_are_refused(default):
     many = replaced(default, ("signature", "experts"), default["signature"]["experts"] * 20)
     short = replaced(default, ("signature", "home"), default["signature"]["home"][:-6])
     unknown = replaced(default, ("signature", "experts", 0, "view"), "colour")
-    for data, problem in ((many, "experts"), (short, "empty"), (unknown, "view")):
+    for data, problem in ((many, "experts"), (short, "home"), (unknown, "view")):
         with pytest.raises(InputFileError, match=problem):
             read(data)

@@ -31,7 +31,7 @@ def model():
     azimuth = np.tile(np.linspace(-1, 1, 30), 2)
     shape = {"front": 1 + azimuth**2, "none": 0 * azimuth, "left": 0.7 - azimuth, "right": 0.7 + azimuth}
     levels = np.stack([shape[label] for label in labels]) + 0.5 * rng.normal(size=(160, 60))
-    X = np.hstack([np.exp(levels), np.tile(site_reference(levels).row, (160, 1))])
+    X = np.hstack([np.exp(levels), np.tile(site_reference(levels), (160, 1))])
     return SiteEnsembleClassifier().fit(X, labels).model_
 
 
@@ -55,7 +55,7 @@ def test_it_is_the_exponentially_weighted_mean(n, dt_s, forgetting_s):
 def test_nothing_heard_changes_nothing_and_an_empty_training_site_neither(model):
     assert SiteEstimate.start(60).reference(model) is model.home
     at_home = listened(np.tile(np.exp(model.empty), (50, 1)))
-    np.testing.assert_allclose(at_home.reference(model).row, model.home.row, atol=1e-9)
+    np.testing.assert_allclose(at_home.reference(model), model.home, atol=1e-9)
 
 
 @given(st.floats(-1.0, 1.0), st.integers(0, 100))
@@ -63,13 +63,13 @@ def test_some_of_the_level_and_all_of_the_pattern_are_carried_over(model, level,
     pattern = np.random.default_rng(seed).normal(size=60)
     pattern -= pattern.mean()
     estimate = SiteEstimate(model.empty + level + pattern, heard_s=10.0)
-    shift = estimate.reference(replace(model, prior_s=0.0)).row - model.home.row
+    shift = estimate.reference(replace(model, prior_s=0.0)) - model.home
     np.testing.assert_allclose(shift, np.tile(0.25 * level + pattern, 3), atol=1e-9)
 
 
 def test_the_mirrored_street_mirrors_the_reference(model):
     windows = np.random.default_rng(1).uniform(0.1, 1.0, (20, 60))
-    there, back = (listened(w).reference(model).row for w in (windows, mirror_features(windows)))
+    there, back = (listened(w).reference(model) for w in (windows, mirror_features(windows)))
     np.testing.assert_allclose(mirror_features(there[None], 6)[0], back, atol=1e-9)
 
 
@@ -126,9 +126,9 @@ def rates(table, prepared, train, here, rng):
     estimate, decisions = SiteEstimate.start(60), []
     rows = stream_of(table, here, rng)
     for row in rows:
-        reference = estimate.reference(model).row
+        reference = estimate.reference(model)
         window = table.features[row]
-        both = np.stack([np.concatenate([window, r]) for r in (reference, model.home.row)])
+        both = np.stack([np.concatenate([window, r]) for r in (reference, model.home)])
         decisions.append(hazard_statistic(model.predict_proba(both), 0.0) >= gamma)
         # A window of a second that comes every second; a hop a tenth of it.
         estimate = estimate.updated(window, 1.0, SETTINGS)

@@ -18,7 +18,7 @@ from worldstate.abduction.road_users import neutral
 from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
 from worldstate.abduction.sequence.sequence_model import AlarmCurve, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.abduction.signature.ensemble import EnsembleModel, Expert, SiteReference
+from worldstate.abduction.signature.ensemble import EnsembleModel, Expert
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
 from worldstate.adapters.acoustic import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
@@ -48,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     soundfile.write(place / "sound.wav", swelling * sound, RATE_HZ)
     expert = Expert("mean", np.zeros(60), np.ones(60), 0.2 * rng.normal(size=(6, 60)), np.zeros(6))
     windows = EnsembleModel(
-        *((expert,), np.full(6, 1 / 6), SiteReference(*np.zeros((3, 60))), np.zeros(60)),
+        *((expert,), np.full(6, 1 / 6), np.zeros(180), np.zeros(60)),
         domain=domain_of(ARRAY, [RATE_HZ], ["S1"]),
         classes=WINDOW_CLASSES,
     )

@@ -40,7 +40,7 @@ def made_up_sites(rng, n_sites=6, n=80):
     for _ in range(n_sites):
         labels = rng.permutation(np.repeat(CLASSES, n // 4))
         levels = windows(rng, labels, street(rng))
-        X.append(np.hstack([np.exp(levels), np.tile(site_reference(levels).row, (n, 1))]))
+        X.append(np.hstack([np.exp(levels), np.tile(site_reference(levels), (n, 1))]))
         y.append(labels)
     return np.vstack(X), np.concatenate(y)
 

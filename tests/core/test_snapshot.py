@@ -19,7 +19,7 @@ from snapshot_laws import broken_laws
 from watched_street import START_NS, false_alarms, heard
 
 from worldstate import Sighting, WorldFilter
-from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.road_users import Familiar, Foreign
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
@@ -351,6 +351,20 @@ def test_a_cue_with_a_fault_is_not_usable_and_never_absent(world, expected):
         (side, expected, not expected) for side in ("left", "right")
     ]
     assert broken_laws(state) == []
+
+
+@pytest.mark.parametrize(
+    ("moving", "later_s", "masks"),
+    [(True, 0.1, True), (True, 1.9, True), (True, 2.1, False), (False, 0.1, False), (False, 1.9, False)],
+)
+def test_what_moves_in_view_masks_until_two_seconds_after_it_was_seen(moving, later_s, masks):
+    seen = [replace(one, sequence=None, sightings=(replace(BOX, moving=moving),)) for one in IN_VIEW]
+    dark = replace(QUIET, sequence=None, co_evidence=Unqueried("dark"), heard=LOUD)
+    ages_ns = (round(age_s * 1e9) for age_s in (0.5 * later_s, later_s))
+    unseen = [replace(dark, stamp_ns=IN_VIEW[-1].stamp_ns + age_ns) for age_ns in ages_ns]
+    (hearing,) = reduce(WorldFilter.update, (*seen, *unseen), STREET).state.heard
+    assert hearing.reason == (MASKED if masks else None)
+    assert (hearing.share < 1.0) == masks
 
 
 def hears(*pairs: tuple[float, str | None]) -> tuple[Hearing, ...]:

@@ -222,7 +222,8 @@ def _azimuth_density(
     """Return the log density of every detection's azimuth, 1/rad, FORBIDDEN outside the gate of a box."""
     residual = wrap_angle(detections.azimuth_rad[:, None] - tracks.mean[:, AZIMUTH])
     # The sound of a hidden one may come from the edge instead.
-    own = tracks.covariance[:, AZIMUTH, AZIMUTH] + ~detected * site.bias_std_rad[tracks.side] ** 2
+    biases_rad = np.array([side.bias_std_rad for side in site.sides])
+    own = tracks.covariance[:, AZIMUTH, AZIMUTH] + ~detected * biases_rad[tracks.side] ** 2
     variance = own + detections.std_rad[:, None] ** 2
     squares = residual**2 / variance
     density = -0.5 * (squares + np.log(2.0 * math.pi * variance))
@@ -242,11 +243,8 @@ def _alike(tracks: Tracks, detected: BoolArray, detections: Detections, site: Si
     squares = (logs[0][:, None] - logs[1]) ** 2
     alike += np.where(known, 0.5 * (math.log(others / own) - squares * (1.0 / own - 1.0 / others)), 0.0)
     for i in np.flatnonzero(~detected).tolist():
-        labels = tracks.labels[i]
-        classes = [
-            math.log(_shared_class(labels, shares[0][0], site.street.misread))
-            for shares in detections.classes
-        ]
+        labels, seen_as = tracks.labels[i], (shares[0][0] for shares in detections.classes)
+        classes = [math.log(_shared_class(labels, label, site.street.misread)) for label in seen_as]
         alike[:, i] = np.where(moving[:, 0], classes, FORBIDDEN)
     return alike
 
@@ -310,13 +308,11 @@ def reached_edge(track: Track, site: SiteGeometry) -> float:
 
 def emergence_density(tracks: Sequence[Track], detections: Detections, site: SiteGeometry) -> FloatArray:
     """Return the density of first sightings of hidden entities, 1/rad, shape (sightings, tracks)."""
-    widths_rad = np.nan_to_num(detections.width_rad).tolist()
-    ends = list(zip(detections.azimuth_rad.tolist(), widths_rad, strict=True))
-    from_edge_rad = [[side.distance_rad(*end) for side in site.sides] for end in ends]
+    azimuth_rad, widths_rad = detections.azimuth_rad, np.nan_to_num(detections.width_rad)
+    from_edge_rad = np.stack([side.distance_rad(azimuth_rad, widths_rad) for side in site.sides], axis=1)
     spread_rad, confused = site.street.edge_std_rad, site.street.side_confusion
-    deviations = np.array(from_edge_rad) / spread_rad
     # Of first sightings about the edge that they come past, 1/rad.
-    near = np.exp(-0.5 * deviations**2) / (spread_rad * math.sqrt(2.0 * math.pi))
+    near = np.exp(-0.5 * (from_edge_rad / spread_rad) ** 2) / (spread_rad * math.sqrt(2.0 * math.pi))
     heard = np.empty_like(near)
     for side in range(len(site.sides)):
         others = np.delete(near, side, axis=1).max(axis=1) if len(site.sides) > 1 else near[:, side]

@@ -3,9 +3,10 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from operator import attrgetter, methodcaller
+from operator import attrgetter
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
@@ -46,16 +47,14 @@ class Detections:
     @classmethod
     def of(
         cls,
-        rows: Sequence[tuple[float, ...]],
+        rows: ArrayLike,
         classes: tuple[ClassShares, ...],
         positions: tuple[Position, ...] = (),
         in_sight: bool = True,
     ) -> "Detections":
         """Return detections by their numbers, a row each, and what else is told of them."""
-        azimuth, std, width, moving, existence, log_new, found = (
-            np.array(rows, float).reshape(-1, len(_NUMBERS)).T
-        )
-        return cls(azimuth, std, width, moving, existence, log_new, found, classes, positions, in_sight)
+        columns = zip(_NUMBERS, np.array(rows, float).reshape(-1, len(_NUMBERS)).T, strict=True)
+        return cls(**dict(columns), classes=classes, positions=positions, in_sight=in_sight)
 
     def line_of_sight(self, site: SiteGeometry) -> FloatArray:
         """Return P(no occluder stands before what is detected there): a box is proof of it."""
@@ -68,9 +67,8 @@ class Detections:
         """Return the detections if new objects are only found in line of sight."""
         in_sight = self.line_of_sight(site)
         total = 1.0 - self.existence * (1.0 - in_sight)
-        return replace(
-            self, existence=self.existence * in_sight / total, log_new=self.log_new + np.log(total)
-        )
+        existence, log_new = self.existence * in_sight / total, self.log_new + np.log(total)
+        return replace(self, existence=existence, log_new=log_new)
 
     def __len__(self) -> int:
         return len(self.classes)
@@ -194,21 +192,21 @@ def fused(scans: Sequence[Scan]) -> tuple[Detections, FloatArray]:
 
 def _in_order(every: Sequence[Detections]) -> tuple[Detections, list[int]]:
     """Return all boxes of several looks in the order of what they are, and which look each is of."""
-    boxes = [
-        (azimuth_rad, std_rad, classes, number, rest)
-        for number, one in enumerate(every)
-        for azimuth_rad, std_rad, *rest, classes in zip(
-            *map(_values, _COLUMNS(one)), one.classes, strict=True
-        )
-    ]
-    boxes.sort(key=lambda box: (box[0], box[1], box[2], *box[-1]))
-    rows = [(azimuth_rad, std_rad, *rest) for azimuth_rad, std_rad, _, _, rest in boxes]
-    return Detections.of(rows, tuple(box[2] for box in boxes)), [box[-2] for box in boxes]
+    classes = [shares for one in every for shares in one.classes]
+    looks = [number for number, one in enumerate(every) for _ in one.classes]
+    rows = np.concatenate([_rows(one) for one in every])
+    keys = [(*row[:2], shares, *row[2:]) for row, shares in zip(rows.tolist(), classes, strict=True)]
+    order = sorted(range(len(keys)), key=keys.__getitem__)
+    boxes = Detections.of(rows[order], tuple(classes[i] for i in order))
+    return boxes, [looks[i] for i in order]
 
 
-_values = methodcaller("tolist")
 _NUMBERS = [one.name for one in fields(Detections) if one.type is FloatArray]
-_COLUMNS = attrgetter(*_NUMBERS)
+
+
+def _rows(boxes: Detections) -> FloatArray:
+    """Return the numbers of every box, shape (n, 7)."""
+    return np.stack([getattr(boxes, name) for name in _NUMBERS], axis=1)
 
 
 def _near_pairs(boxes: Detections) -> list[tuple[int, int]]:
@@ -225,16 +223,16 @@ def _joined(boxes: Detections, groups: Sequence[list[int]]) -> Detections:
     """Return one detection of every group of boxes."""
     # Of two scores alike the label decides: the order of azimuths would turn with a mirrored world.
     best = [max(group, key=lambda i: boxes.classes[i][0][::-1]) for group in groups]
-    azimuth, std, width, moving, existence, log_new, found = (one[best] for one in _COLUMNS(boxes))
+    joined = Detections.of(_rows(boxes)[best], tuple(boxes.classes[i] for i in best))
     for at, group in enumerate(groups):
         if len(group) > 1:
             weights = 1.0 / np.square(boxes.std_rad[group])
             middle_rad = float(boxes.azimuth_rad[best[at]])
             offsets = wrap_angle(boxes.azimuth_rad[group] - middle_rad)
-            azimuth[at] = wrap_angle(middle_rad + float(weights @ offsets / weights.sum()))
-            std[at], width[at] = 1.0 / math.sqrt(weights.sum()), boxes.width_rad[group].max()
-            log_new[at] = boxes.log_new[group].max()
-            existence[at] = 1.0 - (1.0 - boxes.existence[group]).prod()
-            found[at] = 1.0 - (1.0 - boxes.found[group]).prod()
-    classes = tuple(boxes.classes[i] for i in best)
-    return Detections(azimuth, std, width, moving, existence, log_new, found, classes)
+            joined.azimuth_rad[at] = wrap_angle(middle_rad + float(weights @ offsets / weights.sum()))
+            joined.std_rad[at] = 1.0 / math.sqrt(weights.sum())
+            joined.width_rad[at] = boxes.width_rad[group].max()
+            joined.log_new[at] = boxes.log_new[group].max()
+            joined.existence[at] = 1.0 - (1.0 - boxes.existence[group]).prod()
+            joined.found[at] = 1.0 - (1.0 - boxes.found[group]).prod()
+    return joined

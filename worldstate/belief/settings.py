@@ -3,9 +3,9 @@
 import math
 import warnings
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground.checks import in_range, one_of
 
 from .street_model import StoredStreet, StreetModel
 
@@ -58,6 +58,5 @@ class FilterSettings:
             names = ", ".join(sorted(changed))
             warnings.warn(f"give {names} to StreetModel, as FilterSettings.street", DeprecationWarning, 3)
             object.__setattr__(self, "street", replace(self.street, **changed))
-        in_range("window_s", self.window_s, 0.0, math.inf, open_low=True, open_high=True)
-        if self.windows not in get_args(type(self).__annotations__["windows"]):
-            raise InvalidArgumentError(f"windows: expected posterior or likelihood, got {self.windows!r:.40}")
+        in_range("window_s", self.window_s, 0.0, math.inf, open_low=True)
+        one_of("windows", self.windows, ("posterior", "likelihood"))

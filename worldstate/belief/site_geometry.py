@@ -7,6 +7,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.belief.kinematics.cartesian import NumbersT
 from worldstate.belief.kinematics.motion import LEAST_STD, MotionBelief
 from worldstate.ground import FloatArray, wrap_angle
 from worldstate.measurement import CameraLook, Look, Sector
@@ -62,7 +63,7 @@ class SideGeometry:
         """Error of the azimuth of hidden sound that averaging does not remove: half of where vehicles are."""
         return 0.5 * self.std_rad
 
-    def distance_rad(self, azimuth_rad: float, width_rad: float = 0.0) -> float:
+    def distance_rad(self, azimuth_rad: NumbersT, width_rad: NumbersT | float = 0.0) -> NumbersT:
         """Return the angle, >= 0, between the occluder's edge and the end of a box that leads past it."""
         return abs(wrap_angle(azimuth_rad - 0.5 * self.outwards * width_rad - self.edge_azimuth_rad))
 
@@ -114,11 +115,6 @@ class SiteGeometry:
         past = outwards * wrap_angle(azimuth_rad[:, None] - edge_rad)
         chances = normal_shares(past / std_rad) - normal_shares((past - _WIDEST_RAD) / std_rad)
         return np.asarray(chances * [one.hides for one in self.sides] * (beside_m > wall_m))
-
-    @cached_property
-    def bias_std_rad(self) -> FloatArray:
-        """Error of the azimuth of hidden sound that averaging does not remove, by side, shape (K,)."""
-        return np.array([one.bias_std_rad for one in self.sides])
 
     @cached_property
     def _edges(self) -> FloatArray:

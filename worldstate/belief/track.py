@@ -1,7 +1,7 @@
 """The belief of the entities: each by itself, and all of them in columns, as a step reads and writes them."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import starmap
 from operator import attrgetter
@@ -32,8 +32,6 @@ from .street_model import StreetModel
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
-# White acceleration, m^2/s^3: a parked one must not drift with its boxes, but stay updatable.
-_PARKED_ACCELERATION = LEAST_STD
 NEVER_NS = np.iinfo(np.int64).min  # Of what was never seen
 
 
@@ -113,32 +111,25 @@ class Tracks:
         """Return the columns of some entities."""
         motion = MotionBelief.stacked([one.motion for one in rows])
         place = CartesianBelief.stacked([one.place or _NOWHERE for one in rows])
-        told: dict[str, Iterable[Any]] = {
-            "last_seen_ns": (NEVER_NS if one.last_seen_ns is None else one.last_seen_ns for one in rows),
-            "miss_rate": (math.nan if one.miss_rate is None else one.miss_rate for one in rows),
-            "placed": (one.place is not None for one in rows),
-        }
-        columns: dict[str, Any] = {
-            name: np.fromiter(told.get(name) or map(attrgetter(name), rows), kind, len(rows))
-            for name, kind in _COLUMNS.items()
-        }
-        beliefs = motion.mean, motion.covariance, place.mean, place.covariance
-        return cls(**columns | dict(zip(_BELIEFS, beliefs, strict=True)))
+        placed = np.array([one.place is not None for one in rows], bool)
+        beliefs = motion.mean, motion.covariance, placed, place.mean, place.covariance
+        columns: dict[str, Any] = dict(zip(_BELIEFS, beliefs, strict=True))
+        for name, kind in _COLUMNS.items():
+            values = (_UNKNOWN[name] if one is None else one for one in map(attrgetter(name), rows))
+            columns[name] = np.fromiter(values, kind, len(rows))
+        return cls(**columns)
 
     def rows(self) -> tuple[Track, ...]:
         """Return the entities one by one."""
-        columns = {name: one.tolist() for name, one in vars(self).items() if name in _COLUMNS}
-        placed, last_ns, rates = columns.pop("placed"), columns["last_seen_ns"], columns["miss_rate"]
-        columns["last_seen_ns"] = [None if ns == NEVER_NS else ns for ns in last_ns]
-        columns["miss_rate"] = [None if math.isnan(rate) else rate for rate in rates]
-        columns["motion"] = self.motion.each()
-        columns["place"] = [self.place(row) if is_placed else None for row, is_placed in enumerate(placed)]
+        columns = {name: getattr(self, name).tolist() for name in _COLUMNS}
+        columns["last_seen_ns"] = [None if ns == NEVER_NS else ns for ns in columns["last_seen_ns"]]
+        columns["miss_rate"] = [None if math.isnan(rate) else rate for rate in columns["miss_rate"]]
+        columns["motion"], columns["place"] = self.motion.each(), list(map(self.place, range(len(self))))
         return tuple(starmap(Track, zip(*(columns[name] for name in Track.__slots__), strict=True)))
 
     def row(self, number: int) -> Track:
         """Return one of the entities by itself."""
-        (one,) = self.taken([number]).rows()
-        return one
+        return self.taken([number]).rows()[0]
 
     def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":
         """Return the columns of some of them."""
@@ -186,12 +177,9 @@ class Tracks:
             self.placed[row] = True
             self.place_mean[row], self.place_covariance[row] = belief.mean, belief.covariance
 
-    def unseen_ns(self, stamp_ns: int) -> FloatArray:
-        """Return how long before a time each was last seen; infinite where it never was."""
-        return np.where(self.last_seen_ns == NEVER_NS, np.inf, stamp_ns - self.last_seen_ns)
 
-
-_BELIEFS = ("mean", "covariance", "place_mean", "place_covariance")
+_BELIEFS = ("mean", "covariance", "placed", "place_mean", "place_covariance")
+_UNKNOWN = {"last_seen_ns": NEVER_NS, "miss_rate": math.nan}  # What columns hold for None
 _KINDS: dict[Any, Any] = {Objects: object, BoolArray: bool, IntArray: np.int64, FloatArray: float}
 _COLUMNS = {name: _KINDS[hint] for name, hint in get_type_hints(Tracks).items() if name not in _BELIEFS}
 _NOWHERE = CartesianBelief(np.zeros_like(IN_VIEW.mean), np.zeros_like(IN_VIEW.covariance))
@@ -225,11 +213,10 @@ def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
 
 def predict_tracks(tracks: Tracks, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
-    polar = np.ones(len(tracks), bool)
     tracks.existence[tracks.seen] *= math.exp(-step_s / site.street.unseen_s)
     if tracks.placed.any():
         _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
-        polar = ~tracks.placed  # Those that have just lost their place, too
+    polar = ~tracks.placed  # Those that have just lost their place, too
     if polar.any():
         # All of them are read and written where they stand.
         _relax(tracks, slice(None) if polar.all() else polar, step_s, site)
@@ -259,7 +246,8 @@ def _drive_on(tracks: Tracks, rows: IntArray, step_s: float, site: SiteGeometry)
 
 def acceleration_psd(moving: BoolArray, site: SiteGeometry) -> FloatArray:
     """Return the densities of the white acceleration that entities move by, m^2/s^3."""
-    return np.where(moving, site.street.acceleration, _PARKED_ACCELERATION)
+    # A parked one must not drift with its boxes, but stay updatable.
+    return np.where(moving, site.street.acceleration, LEAST_STD)
 
 
 def _relax(tracks: Tracks, rows: BoolArray | slice, step_s: float, site: SiteGeometry) -> None:

@@ -11,10 +11,10 @@ from functools import partial
 import numpy as np
 import scipy.signal
 
-from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.abduction.sequence.sequence_inputs import HOP_S, SIDES
 from worldstate.abduction.signature.ensemble import KINDS, EnsembleModel, log_levels, site_reference
 from worldstate.abduction.signature.ensemble_training import OPEN_FIELD, SimulatedWindows
-from worldstate.abduction.signature.site_estimate import HOP_S, SiteEstimate, SiteEstimateSettings
+from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.window_classes import BOTH, DIRECT
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -87,7 +87,7 @@ def stream_windows(streams: Sequence[HeardStream]) -> SimulatedWindows:
     labels = np.concatenate([names for _, _, names in cut])
     references = np.empty((len(sites), 3 * features.shape[1]))
     for site in np.unique(sites):
-        references[sites == site] = site_reference(log_levels(features[sites == site])).row
+        references[sites == site] = site_reference(log_levels(features[sites == site]))
     weights = WEIGHT * _balance(labels)
     # All of a hazard says its own side: see `WEIGHT`.
     own = np.zeros(len(labels))
@@ -162,9 +162,9 @@ def posteriors_along(model: EnsembleModel, features: FloatArray) -> FloatArray:
     Shapes: features (n, 60).
     """
     chosen, estimate = SiteEstimateSettings(), SiteEstimate.start(model.n_features)
-    references = np.empty((len(features), model.home.row.size))
+    references = np.empty((len(features), model.home.size))
     for row, feature in enumerate(np.asarray(features, np.float64)):
-        references[row] = estimate.reference(model).row
+        references[row] = estimate.reference(model)
         estimate = estimate.updated(feature, HOP_S, chosen)
     return model.posteriors(log_levels(features), references)
 

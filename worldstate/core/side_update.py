@@ -25,7 +25,7 @@ def heard_beside(memory: Memory, measurement: Measurement, street: StreetModel) 
     The belief moves by the sequence's own reading, which was learned where vehicles mask one another.
     """
     heard, tracks = measurement.heard, memory.tracks
-    near = tracks.moving & (tracks.unseen_ns(measurement.stamp_ns) <= _JUST_LEFT_NS)
+    near = tracks.moving & (tracks.last_seen_ns >= measurement.stamp_ns - _JUST_LEFT_NS)
     in_view = float(tracks.existence[near].max(initial=0.0))
     if memory.belief.has_times:
         in_view = max(in_view, memory.belief.in_view)

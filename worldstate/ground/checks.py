@@ -4,6 +4,7 @@ Every check names the argument, what came and what was expected.
 """
 
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar, get_args
 
@@ -14,6 +15,8 @@ from .errors import InvalidArgumentError
 from .typing import ComplexArray, FloatArray
 
 T = TypeVar("T")
+# Ends of a range that leaves out zero, one or infinity.
+ABOVE_ZERO, BELOW_ONE, MOST = math.ulp(0.0), math.nextafter(1.0, 0.0), sys.float_info.max
 
 
 def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:

@@ -24,23 +24,12 @@ from worldstate.ground import TINY, FloatArray, wrap_angle
 from worldstate.ground.serialisation import ADDED, Via
 from worldstate.measurement import Odometry, Position
 
-from .motion import (
-    AZIMUTH,
-    AZIMUTH_RATE,
-    LARGEST_STD,
-    LEAST_STD,
-    LOG_RANGE,
-    RADIAL_RATE,
-    GaussianBelief,
-    MotionBelief,
-    conditioned,
-    white_acceleration,
-)
+from .motion import DIMENSIONS, LEAST_STD, GaussianBelief, MotionBelief, conditioned, white_acceleration
 
 # Polar coordinates are singular at the array itself, and no road user comes nearer than this.
 _NEAREST_M = 1.0
-_LARGEST_PLACE_STD = LARGEST_STD**2  # m and m/s: ten times the least sure position that is taken
-_IDENTITY = np.eye(4)
+_LARGEST_PLACE_STD = 1.0 / LEAST_STD  # m and m/s: ten times the least sure position that is taken
+_IDENTITY = np.eye(DIMENSIONS)
 NumbersT = TypeVar("NumbersT", float, FloatArray)
 
 
@@ -105,8 +94,6 @@ def predict_place(
     mean[..., :2] -= chord
     strength = np.asarray(acceleration_psd)[..., None, None]
     covariance = flow @ belief.covariance @ flow.T + strength * noise
-    if not turned:
-        return _belief(mean, covariance)
     cosine, sine = math.cos(turned), math.sin(turned)
     turn = np.kron(np.eye(2), [[cosine, sine], [-sine, cosine]])
     return _belief(mean @ turn.T, turn @ covariance @ turn.T)
@@ -144,21 +131,20 @@ def polar_motion(
     cosine, sine = x / square, y / square
     turning, closing = vy * cosine - vx * sine, vx * cosine + vy * sine
     # In complex numbers d log z = dz / z, so that log r and theta, rho and theta_dot share their derivatives.
-    slope = np.zeros(belief.covariance.shape)
-    slope[..., AZIMUTH, 0] = slope[..., AZIMUTH_RATE, 2] = -sine
-    slope[..., AZIMUTH, 1] = slope[..., AZIMUTH_RATE, -1] = cosine
-    slope[..., AZIMUTH_RATE, 0] = vy / square - 2.0 * cosine * turning
-    slope[..., AZIMUTH_RATE, 1] = -vx / square - 2.0 * sine * turning
-    slope[..., RADIAL_RATE, 0] = vx / square - 2.0 * cosine * closing
-    slope[..., RADIAL_RATE, 1] = vy / square - 2.0 * sine * closing
-    slope[..., RADIAL_RATE, 2] = slope[..., LOG_RANGE, 0] = cosine
-    slope[..., RADIAL_RATE, -1] = slope[..., LOG_RANGE, 1] = sine
+    none = np.zeros_like(r)
+    rows = (
+        (-sine, cosine, none, none),
+        (vy / square - 2.0 * cosine * turning, -vx / square - 2.0 * sine * turning, -sine, cosine),
+        (vx / square - 2.0 * cosine * closing, vy / square - 2.0 * sine * closing, cosine, sine),
+        (cosine, sine, none, none),
+    )
+    slope = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     # A sharp position far away would leave a covariance that is singular to rounding.
     covariance = slope @ belief.covariance @ slope.mT + LEAST_STD**2 * _IDENTITY
     # Axes that turn with the ego vehicle see everything turn the other way.
     seen_turning = turning - ego_yaw_rate_rad_s
     mean = np.stack([np.arctan2(y, x), seen_turning, closing, 0.5 * np.log(square)], axis=-1)
-    return MotionBelief(mean, conditioned(covariance, LARGEST_STD))
+    return MotionBelief(mean, conditioned(covariance))
 
 
 def _update(
@@ -225,12 +211,11 @@ def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
 
 def corrected(ego: EgoBelief | None, told: Odometry) -> EgoBelief:
     """Return the ego vehicle as odometry has it: its twist, and its pose where that was told."""
-    pose, covariance = (
-        (np.zeros(_POSE), np.zeros((_POSE, _POSE))) if ego is None else (ego.pose, ego.covariance)
-    )
+    before = ego or EgoBelief(np.zeros(_POSE), np.zeros((_POSE, _POSE)), 0.0, 0.0, 0.0, 0.0)
+    pose, covariance = before.pose, before.covariance
     if told.pose is not None:
         at = told.pose
         pose = np.array([*at.position_m, at.yaw_rad])
         covariance = np.diag([at.position_std_m**2] * 2 + [at.yaw_std_rad**2])
     twist = told.speed_mps, told.yaw_rate_rad_s, told.speed_std_mps, told.yaw_rate_std_rad_s
-    return EgoBelief(pose, covariance, *twist, told.pose is not None or (ego is not None and ego.localised))
+    return EgoBelief(pose, covariance, *twist, before.localised or told.pose is not None)

@@ -28,8 +28,8 @@ import numpy as np
 from worldstate.ground import TINY, FloatArray, InvalidArgumentError, wrap_angle
 from worldstate.ground.serialisation import Via
 
-_DIMENSIONS = 4
-AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(_DIMENSIONS)
+DIMENSIONS = 4
+AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(DIMENSIONS)
 
 _Numbers: TypeAlias = float | FloatArray  # Of one belief, or of each of many
 
@@ -70,25 +70,27 @@ def white_acceleration(step_s: float) -> FloatArray:
 
 @lru_cache
 def _unit_noise(step_s: float) -> FloatArray:
-    (twice, once), (_, rate) = white_acceleration(step_s).tolist()
-    return np.array(
-        [[twice, once, 0.0, 0.0], [once, rate, 0.0, 0.0], [0.0, 0.0, rate, once], [0.0, 0.0, once, twice]]
-    )
+    noise, unit = np.zeros((DIMENSIONS, DIMENSIONS)), white_acceleration(step_s)
+    noise[:RADIAL_RATE, :RADIAL_RATE], noise[RADIAL_RATE:, RADIAL_RATE:] = unit, unit[::-1, ::-1]
+    return noise
 
 
 def _checked_covariance(row: FloatArray) -> FloatArray:
     """Return the covariance that a checkpoint holds as one row."""
-    covariance = row.reshape(_DIMENSIONS, _DIMENSIONS)
+    covariance = row.reshape(DIMENSIONS, DIMENSIONS)
     if not (covariance == covariance.T).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise InvalidArgumentError("expected it symmetric and positive definite")
     return covariance
 
 
+# No sensor knows a bearing to .006 degrees or an approach rate to 1e-4 1/s. Deviations below make a
+# covariance singular to rounding, and its checkpoint is refused; a hundred radians say nothing.
+LEAST_STD, LARGEST_STD = 1e-4, 1e2
 # Of the largest variance, what every one has at least, so that rounding, 1e-16 of it, leaves none below zero.
 _CONDITION = 0.1 * TINY
 
 
-def conditioned(covariance: FloatArray, largest_std: float) -> FloatArray:
+def conditioned(covariance: FloatArray, largest_std: float = LARGEST_STD) -> FloatArray:
     r"""Return a covariance symmetric and positive definite, whatever rounding has left of it.
 
     .. math:: P \leftarrow S P S + \kappa \max_i (S P S)_{ii}\, I, \qquad
@@ -116,16 +118,14 @@ class GaussianBelief:
     entities: with twenty a step takes half the time when all are predicted and updated at once.
     """
 
-    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(_DIMENSIONS))]
+    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(DIMENSIONS))]
     covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, _checked_covariance)]
 
     @classmethod
     def stacked(cls, beliefs: Sequence[Self]) -> Self:
         """Return many beliefs, or none, as one with a leading axis."""
-        mean, covariance = ([one.mean for one in beliefs], [one.covariance for one in beliefs])
-        return cls(
-            np.reshape(mean, (-1, _DIMENSIONS)), np.reshape(covariance, (-1, _DIMENSIONS, _DIMENSIONS))
-        )
+        covariance = np.reshape([one.covariance for one in beliefs], (-1, DIMENSIONS, DIMENSIONS))
+        return cls(np.reshape([one.mean for one in beliefs], (-1, DIMENSIONS)), covariance)
 
     def each(self) -> list[Self]:
         """Return the beliefs that were stacked."""
@@ -139,9 +139,6 @@ _LOG_NEAREST, _LOG_FARTHEST = math.log(NEAREST_M), math.log(FARTHEST_M)
 # Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
 # array.
 _CLOSEST_SHARE = 0.5
-# No sensor knows a bearing to .006 degrees or an approach rate to 1e-4 1/s. Deviations below make a
-# covariance singular to rounding, and its checkpoint is refused; a hundred radians say nothing.
-LEAST_STD, LARGEST_STD = 1e-4, 1e2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,8 +180,7 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: _Numbers) -> 
     .. math:: m \leftarrow f(m), \quad P \leftarrow F P F^T + Q
     """
     start = belief.mean.copy()
-    if step_s > 0.0:
-        start[..., RADIAL_RATE] = np.maximum(start[..., RADIAL_RATE], -_CLOSEST_SHARE / step_s)
+    start[..., RADIAL_RATE] = np.maximum(start[..., RADIAL_RATE], -_CLOSEST_SHARE / max(step_s, TINY))
     # Clipped before exp: approach rates that contradict each other drive log r, which is not measured, so far
     # that exp overflows.
     range_m = np.exp(np.minimum(np.maximum(belief.mean[..., LOG_RANGE], _LOG_NEAREST), _LOG_FARTHEST))
@@ -239,14 +235,13 @@ def update(
     row: int,
     value: _Numbers,
     std: _Numbers,
-    weight: _Numbers | None = None,
+    weight: _Numbers = 1.0,
     ago_s: float = 0.0,
 ) -> MotionBelief:
     r"""Return the belief after one component was measured, of this entity with probability w.
 
-    Probabilistic data association, of a certain one where no weight is given: a bearing is one of AZIMUTH, an
-    approach rate -1/TTA one of RADIAL_RATE. A bearing of `ago_s` ago measures
-    :math:`h^T m = \theta - t\dot\theta`.
+    Probabilistic data association: a bearing is one of AZIMUTH, an approach rate -1/TTA one of RADIAL_RATE. A
+    bearing of `ago_s` ago measures :math:`h^T m = \theta - t\dot\theta`.
 
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
@@ -263,8 +258,6 @@ def update(
     crossed = column - gain * variance[..., None]
     updated = swept - _outer(crossed, gain) + noise[..., None] * _outer(gain, gain)
     step = gain * np.asarray(residual)[..., None]
-    if weight is None:
-        return _belief(belief.mean + step, updated)
     w = np.asarray(weight)[..., None]
     covariance = w[..., None] * updated + (1.0 - w)[..., None] * belief.covariance
     return _belief(belief.mean + w * step, covariance + (w * (1.0 - w))[..., None] * _outer(step, step))
@@ -276,4 +269,4 @@ def _outer(column: FloatArray, row: FloatArray) -> FloatArray:
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> MotionBelief:
     mean[..., AZIMUTH] = wrap_angle(mean[..., AZIMUTH])
-    return MotionBelief(mean, conditioned(covariance, LARGEST_STD))
+    return MotionBelief(mean, conditioned(covariance))

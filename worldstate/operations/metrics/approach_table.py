@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S
-from worldstate.abduction.signature.site_estimate import HOP_S
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import SECONDS_PER_HOUR

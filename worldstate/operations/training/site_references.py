@@ -28,7 +28,7 @@ def with_site_references(table: FeatureTable) -> FeatureTable:
     levels = log_levels(table.features)
     references = np.empty((len(table), 3 * levels.shape[1]))
     for mine, others in _recordings(table):
-        references[mine] = site_reference(levels[others]).row
+        references[mine] = site_reference(levels[others])
     return replace(table, features=np.hstack([table.features, references]))
 
 
@@ -52,7 +52,7 @@ def asked_while_listening(
     learned = learned_while_listening(replace(table, features=windows), rng)
 
     def posteriors(model: EnsembleModel, rows: BoolArray) -> FloatArray:
-        references = [learned[row].reference(model).row for row in np.flatnonzero(rows)]
+        references = [learned[row].reference(model) for row in np.flatnonzero(rows)]
         return model.explain(np.hstack([windows[rows], references]))
 
     return posteriors
