@@ -17,11 +17,11 @@ from worldstate.state.world_state import judged
 
 from .birth_death import events_between, published
 from .budget_watch import SLACK_NS
-from .cues import cues_of
+from .cues import SideAlarms
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import MOST_BOXES, NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
-from .site_model import FilterModel, from_here, published_belief, site_geometry_of
+from .site_model import FilterModel, from_here, site_geometry_of
 from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
 from .step import advanced, take_in
 
@@ -88,7 +88,7 @@ class WorldFilter:
     @property
     def belief(self) -> SideBelief:
         """What is believed of the sides, of which the snapshot states marginals."""
-        return published_belief(self._memory, from_here(self._model, self._memory.ego))
+        return SideAlarms(self._memory, from_here(self._model, self._memory.ego)).sides
 
     @property
     def risk(self) -> float:
@@ -110,7 +110,7 @@ class WorldFilter:
             entities=entities_of(tracks, memory, model.site),
             relations=memory.relations if is_fresh else relations_at(memory, tracks, model),
             context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
-            cues=cues_of(memory, model, sensors),
+            cues=SideAlarms(memory, model).cues(sensors),
             calibrated=self.policy.alpha > 0.0,
             bearing=last.bearing,
             domain=last.domain,

@@ -1,7 +1,5 @@
 """One step of the filter: the memory at a later time, and after what was measured then."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from worldstate.belief.kinematics.cartesian import corrected, driven
@@ -21,7 +19,7 @@ from .birth_death import (
     surviving,
     view_heard,
 )
-from .cues import SideAdvisory, advisories, note_announced, note_source
+from .cues import SideAlarms, note_source
 from .detection_update import new_looks, update_looks, update_positions
 from .fixed_lag import Timed
 from .memory import CountedLook, Memory
@@ -77,25 +75,30 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
     An advisory that had ended when the draft was carried to its time begins anew.
     """
     model = from_here(model, memory.ego)
-    was_advised = any(one.advised_ns is not None for one in before.history)
-    held = advisories(memory, model) if was_advised else (None,) * len(before.history)
+    stood = [one.advised_ns is not None for one in before.history]
+    if any(stood):
+        stood = [one is not None for one in SideAlarms(memory, model).advisories]
     memory.counts.measurements += 1
     if isinstance(measurement, Odometry):
         _take_odometry(memory, measurement)
     elif isinstance(measurement, PositionScan):
         update_positions(memory, measurement, model)
     else:
-        measurement = without_open_sides(measurement, model.context)
-        _perceive(memory, measurement, start_ns, model)
-    gone = _announced_in_view(before, memory)
-    if gone:
-        memory.belief = memory.belief.not_held(gone, model.policy, model.site.street)
-    note_announced(memory, model)
-    named = advisories(memory, model)
+        _perceive(memory, without_open_sides(measurement, model.context), start_ns, model)
+    came = _announced_in_view(before, memory)
+    if came:
+        memory.belief = memory.belief.not_held(came, model.policy, model.site.street)
+    alarms = SideAlarms(memory, model)
+    alarms.note_announced()
+    stands = [one is not None for one in alarms.advisories]
     if isinstance(measurement, Measurement):
-        birth_death(memory, [one is not None for one in named], measurement, model.site)
+        birth_death(memory, stands, measurement, model.site)
     _keep_likeliest(memory)
-    _note_advisories(memory, [None if k in gone else one for k, one in enumerate(held)], named)
+    for k, side in enumerate(memory.history):
+        if not stands[k]:
+            side.advised_ns = None
+        elif side.advised_ns is None or not stood[k] or k in came:
+            side.advised_ns = memory.stamp_ns
     merged = merge_tracks(memory, model.site).items()
     memory.last.events = tuple(Event(memory.stamp_ns, "merged", name, into) for name, into in merged)
     memory.relations = relations_at(memory, published(memory.tracks, model.site.street), model)
@@ -142,14 +145,3 @@ def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
     seen = set(memory.tracks.id[memory.tracks.seen])
     told = (hidden_on(before.tracks, k) for k in range(len(before.history)))
     return [k for k, row in enumerate(told) if row is not None and before.tracks.id[row] in seen]
-
-
-def _note_advisories(
-    memory: Memory, held: Sequence[SideAdvisory | None], named: Sequence[SideAdvisory | None]
-) -> None:
-    """Note since when an advisory has been out on each side."""
-    for side, old, new in zip(memory.history, held, named, strict=True):
-        if new is None:
-            side.advised_ns = None
-        elif old is None or side.advised_ns is None:
-            side.advised_ns = memory.stamp_ns
