@@ -61,7 +61,10 @@ class FixedLag:
         if any(_delivery(one) == _delivery(measurement) for one in (*self._at(stamp_ns), held) if one):
             return self.counted(repeated=1)
         if stamp_ns < max(self.latest.stamp_ns - LAG_NS, self.base.stamp_ns):
-            return self._too_late(stamp_ns)
+            since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
+            if stamp_ns - since_ns >= REANCHOR_NS:
+                return None
+            return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
         if held is not None and self._agree(held.stamp_ns, stamp_ns):
             first, second = sorted((held, measurement), key=attrgetter("stamp_ns"))
             return replace(self.counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
@@ -111,12 +114,6 @@ class FixedLag:
         counts = {name: getattr(self.delivery, name) + number for name, number in more.items()}
         return replace(self, delivery=replace(self.delivery, **counts))
 
-    def _too_late(self, stamp_ns: int) -> "FixedLag | None":
-        since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
-        if stamp_ns - since_ns >= REANCHOR_NS:
-            return None
-        return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
-
 
 _STAMP_NS = attrgetter("measurement.stamp_ns")
 # What a delivery is known by; one source measures one thing at a time.
@@ -125,10 +122,9 @@ _delivery = attrgetter("stamp_ns", "source")
 
 def _content(measurement: Timed) -> tuple[int, str]:
     """Return what measurements of one instant are in order of: their kind, and all of them but names."""
-    if isinstance(measurement, Odometry):
-        return 0, str(encode(replace(measurement, source="-")))
-    if isinstance(measurement, PositionScan):
-        return 2 + (measurement.searched is None), str(encode(replace(measurement, source="-")))
+    if not isinstance(measurement, Measurement):
+        order = 0 if isinstance(measurement, Odometry) else 2 + (measurement.searched is None)
+        return order, str(encode(replace(measurement, source="-")))
     looks = sorted(str(encode(replace(one, look=replace(one.look, sensor="-")))) for one in measurement.looks)
     return 1, str((looks, encode(replace(measurement, source="-", look=None, sightings=(), further=()))))
 
