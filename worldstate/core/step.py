@@ -6,7 +6,6 @@ from worldstate.belief.kinematics.cartesian import corrected, driven
 from worldstate.belief.track import Tracks, predict_tracks, turn
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
-from worldstate.state import Event
 
 from .acoustic_update import acoustic_update
 from .birth_death import (
@@ -99,8 +98,7 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
             side.advised_ns = None
         elif side.advised_ns is None or not stood[k] or k in came:
             side.advised_ns = memory.stamp_ns
-    merged = merge_tracks(memory, model.site).items()
-    memory.last.events = tuple(Event(memory.stamp_ns, "merged", name, into) for name, into in merged)
+    memory.last.events = merge_tracks(memory, model.site)
     memory.relations = relations_at(memory, published(memory.tracks, model.site.street), model)
 
 
@@ -108,7 +106,7 @@ def _perceive(memory: Memory, measurement: Measurement, start_ns: int, model: Fi
     """Update a draft with a measurement's signature, its looks and its sequence."""
     last = memory.sources.get(measurement.source)
     since_ns = measurement.stamp_ns - (start_ns if last is None else last.stamp_ns)
-    measurement, looks = new_looks(memory, measurement, start_ns, model.site.settings)
+    measurement, looks = new_looks(memory, measurement, start_ns, model.site.street)
     # Of windows that overlap, what is new counts.
     weight = min(max(seconds(since_ns), 0.0) / model.site.settings.window_s, 1.0)
     acoustic_update(memory, measurement, weight, model.site.street)
