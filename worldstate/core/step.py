@@ -1,5 +1,7 @@
 """One step of the filter: the memory at a later time, and after what was measured then."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from worldstate.belief.kinematics.cartesian import corrected, driven
@@ -50,66 +52,66 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
 
 def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
     """Update the memory after announced entities have come past their edge, or their place was lost."""
-    tracks, emerged, gone = memory.tracks, list[int](), list[int]()
+    tracks, street, emerged, gone = memory.tracks, model.site.street, list[int](), list[int]()
     now = {name: row for row, name in enumerate(tracks.id)}
     # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
-    heard = [chance >= model.site.street.birth for chance in memory.sides.hidden]
+    heard = [chance >= street.birth for chance in memory.sides.hidden]
     for old in np.flatnonzero(before.placed & ~before.seen).tolist():
         row, side = now[before.id[old]], int(before.side[old])
         if before.behind[old] >= 0.5 > tracks.behind[row]:
             emerged.append(side)
         only_heard = np.flatnonzero(~tracks.detected & (tracks.side == side)).tolist()
-        others = [one for one in only_heard if one not in gone]
+        others = set(only_heard).difference(gone)
         if row in others and (len(others) > 1 or not heard[side]):
             gone.append(row)
     memory.tracks = tracks.without(gone)
-    past_edges(
-        memory, dict.fromkeys(emerged, model.site.street.unheard), (), memory.stamp_ns, model.site.street
-    )
+    past_edges(memory, dict.fromkeys(emerged, street.unheard), (), memory.stamp_ns, street)
 
 
 def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
-    """Update a draft with a measurement of its time; `before` is what it was drafted from.
-
-    An advisory that had ended when the draft was carried to its time begins anew.
-    """
+    """Update a draft with a measurement of its time; `before` is what it was drafted from."""
     model = from_here(model, memory.ego)
-    stood = [one.advised_ns is not None for one in before.history]
-    if any(stood):
-        stood = [one is not None for one in SideAlarms(memory, model).advisories]
-    memory.counts.measurements += 1
-    if isinstance(measurement, Odometry):
-        _take_odometry(memory, measurement)
-    elif isinstance(measurement, PositionScan):
-        update_positions(memory, measurement, model)
-    else:
-        _perceive(memory, without_open_sides(measurement, model.context), start_ns, model)
-    came = _announced_in_view(before, memory)
-    if came:
-        memory.belief = memory.belief.not_held(came, model.policy, model.site.street)
+    stood = _standing(before, memory, model)
+    _perceive(memory, measurement, start_ns, model)
+    emerged = _emerge(before, memory, model)
     alarms = SideAlarms(memory, model)
     alarms.note_announced()
     stands = [one is not None for one in alarms.advisories]
     if isinstance(measurement, Measurement):
         birth_death(memory, stands, measurement, model.site)
     _keep_likeliest(memory)
-    for k, side in enumerate(memory.history):
-        if not stands[k]:
-            side.advised_ns = None
-        elif side.advised_ns is None or not stood[k] or k in came:
-            side.advised_ns = memory.stamp_ns
+    _note_advisories(memory, [one and k not in emerged for k, one in enumerate(stood)], stands)
     memory.last.events = merge_tracks(memory, model.site)
     memory.relations = relations_at(memory, published(memory.tracks, model.site.street), model)
 
 
-def _perceive(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
-    """Update a draft with a measurement's signature, its looks and its sequence."""
-    last = memory.sources.get(measurement.source)
+def _standing(before: Memory, memory: Memory, model: FilterModel) -> list[bool]:
+    """Return on which sides an advisory stands before a measurement counts.
+
+    One that had ended when the draft was carried to this time begins anew.
+    """
+    stood = [one.advised_ns is not None for one in before.history]
+    return [one is not None for one in SideAlarms(memory, model).advisories] if any(stood) else stood
+
+
+def _perceive(memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
+    """Update a draft with odometry, with positions, or with what is heard and seen."""
+    memory.counts.measurements += 1
+    if isinstance(measurement, Odometry):
+        _take_odometry(memory, measurement)
+    elif isinstance(measurement, PositionScan):
+        update_positions(memory, measurement, model)
+    else:
+        _hear_and_look(memory, without_open_sides(measurement, model.context), start_ns, model)
+
+
+def _hear_and_look(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
+    last, site = memory.sources.get(measurement.source), model.site
     since_ns = measurement.stamp_ns - (start_ns if last is None else last.stamp_ns)
-    measurement, looks = new_looks(memory, measurement, start_ns, model.site.street)
     # Of windows that overlap, what is new counts.
-    weight = min(max(seconds(since_ns), 0.0) / model.site.settings.window_s, 1.0)
-    acoustic_update(memory, measurement, weight, model.site.street)
+    weight = min(max(seconds(since_ns), 0.0) / site.settings.window_s, 1.0)
+    measurement, looks = new_looks(memory, measurement, start_ns, site.street)
+    acoustic_update(memory, measurement, weight, site.street)
     update_looks(memory, measurement, looks, model)
     note_source(memory, measurement, model)
     update_belief(memory, measurement, [seen for seen, _ in looks], model)
@@ -136,6 +138,14 @@ def _keep_likeliest(memory: Memory) -> None:
         memory.counts.left_out += len(tracks) - MOST_TRACKS
 
 
+def _emerge(before: Memory, memory: Memory, model: FilterModel) -> list[int]:
+    """Return the sides whose vehicle of before is in view now, and end what is held for them."""
+    emerged = _announced_in_view(before, memory)
+    if emerged:
+        memory.belief = memory.belief.not_held(emerged, model.policy, model.site.street)
+    return emerged
+
+
 def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
     """Return the sides whose vehicle of before is in view now, from whichever side it came."""
     if not hidden_rows(before.tracks):
@@ -143,3 +153,12 @@ def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
     seen = set(memory.tracks.id[memory.tracks.seen])
     told = (hidden_on(before.tracks, k) for k in range(len(before.history)))
     return [k for k, row in enumerate(told) if row is not None and before.tracks.id[row] in seen]
+
+
+def _note_advisories(memory: Memory, stood: Sequence[bool], stands: Sequence[bool]) -> None:
+    """Note since when an advisory has been out on each side."""
+    for side, was_out, is_out in zip(memory.history, stood, stands, strict=True):
+        if not is_out:
+            side.advised_ns = None
+        elif not was_out or side.advised_ns is None:
+            side.advised_ns = memory.stamp_ns
