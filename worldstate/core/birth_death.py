@@ -66,8 +66,8 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
     Their existence, their chance to be hidden, their side and azimuth are marginals; their own are an
     identity, classes and the approach rate. One alone may be on any side, two are on one each.
     """
-    tracks, sides, belief = memory.tracks, _unseen(memory, site), memory.belief
-    rows = _heard_rows(tracks)
+    tracks, belief, rows = memory.tracks, memory.belief, _heard_rows(memory.tracks)
+    sides = _unseen(memory, site) if rows else memory.sides
     for i in rows:
         shares = sides.side_shares(site.street.death) if len(rows) == 1 else ()
         is_open = sum(share > 0.0 for share in shares) > 1
