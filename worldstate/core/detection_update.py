@@ -134,7 +134,7 @@ def detection_update(
     chances, detection = np.append(whose.chances, np.ones(len(whose.new))), np.full(len(tracks), -1)
     detection[list(whose.found)], detection[n:] = list(whose.found.values()), whose.new
     rows, missed, was_seen = np.flatnonzero(detection >= 0), np.flatnonzero(detection < 0), tracks.seen.copy()
-    found = _Found(rows, detection[rows], detections)
+    found = _Found(rows, detection[rows], chances[rows], detections)
     if in_sight:
         hits, existence = np.minimum(whose.pairs.T @ by_look, 1.0), tracks.existence.copy()
         existence[:n], detected = _existence(known, hits, scans, site.street)
@@ -145,8 +145,8 @@ def detection_update(
         existence[first], tracks.behind[first] = chances[first] + another, 0.0
     else:
         existence = _told(tracks, found, scans[0].source, 1.0 - site.street.doubt)
-    _move(tracks, found, chances, site.street)
-    _see(tracks, found, chances, scans, stamp_ns, site)
+    _move(tracks, found, site.street)
+    _see(tracks, found, scans, stamp_ns, site)
     follow_places(tracks, site)
     if not in_sight:
         occlude(tracks, site)
@@ -159,10 +159,11 @@ def detection_update(
 
 
 class _Found(NamedTuple):
-    """Which entities were found, and by which detections, row by row."""
+    """Which entities were found, by which detections, and the chances that these were theirs, row by row."""
 
     rows: IndexArray
     by: IndexArray
+    chances: FloatArray
     detections: Detections
 
 
@@ -246,17 +247,17 @@ def _told(tracks: Tracks, found: _Found, source: str, most: float) -> FloatArray
     return after
 
 
-def _move(tracks: Tracks, found: _Found, chances: FloatArray, street: StreetModel) -> None:
+def _move(tracks: Tracks, found: _Found, street: StreetModel) -> None:
     """Update the motion or the place of the found tracks with what was measured of them."""
-    rows, by, detections = found
+    rows, by, chances, detections = found
     placed = tracks.placed[rows] | bool(detections.positions)
     usual = ~placed & tracks.seen[rows] & (detections.moving[by] == tracks.moving[rows])
     for i, j, has_place in zip(*(column[~usual].tolist() for column in (rows, by, placed)), strict=True):
         tracks.put(i, (_placed if has_place else _motion_at)(tracks, i, detections, j, street))
     if usual.any():
-        rows, by = rows[usual], by[usual]
+        rows, by, chances = rows[usual], by[usual], chances[usual]
         before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
-        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by], chances[rows])
+        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by], chances)
         tracks.mean[rows], tracks.covariance[rows] = after.mean, after.covariance
 
 
@@ -286,29 +287,19 @@ def _motion_at(tracks: Tracks, row: int, boxes: Detections, by: int, street: Str
     return MotionBelief.around(expected, std)
 
 
-def _see(
-    tracks: Tracks,
-    found: _Found,
-    chances: FloatArray,
-    scans: Sequence[Scan],
-    stamp_ns: int,
-    site: SiteGeometry,
-) -> None:
+def _see(tracks: Tracks, found: _Found, scans: Sequence[Scan], stamp_ns: int, site: SiteGeometry) -> None:
     """Update the found tracks; those not in view before take their side and class there."""
-    (rows, by, detections), street = found, site.street
-    azimuth_rad, moving, gains = (
-        detections.azimuth_rad[by],
-        detections.moving[by],
-        (street.label_gain, street.doubt),
-    )
-    found_at = zip(rows.tolist(), by.tolist(), tracks.seen[rows].tolist(), azimuth_rad.tolist(), strict=True)
-    for i, j, was_seen, at_rad in found_at:
+    rows, by, chances, detections = found
+    azimuth_rad, moving = detections.azimuth_rad[by], detections.moving[by]
+    gains = site.street.label_gain, site.street.doubt
+    columns = rows, by, chances, tracks.seen[rows], azimuth_rad
+    for i, j, chance, was_seen, at_rad in zip(*(one.tolist() for one in columns), strict=True):
         tracks.sources[i] = merged(tracks.sources[i], scans[0].source)
         if classes := detections.classes[j]:
             tracks.labels[i] = relabelled(tracks.labels[i], classes, *gains) if was_seen else classes
         if detections.in_sight and not was_seen:
             tracks.side[i] = site.nearest_side(at_rad)
-            tracks.came_from[i] *= chances[i]
+            tracks.came_from[i] *= chance
     tracks.updated_ns[rows] = stamp_ns
     tracks.moving[rows] = np.where(np.isnan(moving), tracks.moving[rows], moving > 0.0)
     if detections.positions:

@@ -27,22 +27,23 @@ def site_geometry_of(
 ) -> SiteGeometry:
     """Return the site geometry of a context, as the ego vehicle has it."""
     x, y, yaw_rad = (0.0, 0.0, 0.0) if ego is None else ego.pose.tolist()
-    sides, street = [], settings.street
-    for one in context.occluders:
-        hidden = one.hidden_azimuth_rad, one.hidden_std_rad
-        edge = SideGeometry(
+    sides = (
+        SideGeometry(
             one.direction,
             one.edge_azimuth_rad,
-            *hidden,
+            one.hidden_azimuth_rad,
+            one.hidden_std_rad,
             one.edge_std_rad,
             one.pace_hz,
             one.hides,
-            street=street,
+            0.0 if one.corner_m is None else yaw_rad,
+            None if one.corner_m is None else math.dist(one.corner_m, (x, y)),
+            settings.street.assumed_certainty if one.assumed else 1.0,
+            0.0 if one.corner_m is None else abs(one.corner_m[1] - y),
+            settings.street,
         )
-        if one.corner_m is not None:
-            far_m, wall_m = math.dist(one.corner_m, (x, y)), abs(one.corner_m[1] - y)
-            edge = replace(edge, yaw_rad=yaw_rad, corner_m=far_m, wall_m=wall_m)
-        sides.append(replace(edge, certainty=street.assumed_certainty) if one.assumed else edge)
+        for one in context.occluders
+    )
     twist = (context.ego_speed_mps or 0.0, 0.0) if ego is None else (ego.speed_mps, ego.yaw_rate_rad_s)
     return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, *twist)
 
