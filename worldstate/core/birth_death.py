@@ -1,6 +1,6 @@
 """Births, hand-overs and deaths of entities, those that have become one, and the events of all this."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -236,29 +236,23 @@ def after_look(
 
     `emerged` is the chance that a detection was theirs, by the rows of those that were not seen before.
     """
-    tracks = memory.tracks
+    tracks, sides, least = memory.tracks, memory.tracks.side.tolist(), site.street.unheard
     # Of the side where it is: what was heard may have been believed on the other one. Of two the likelier.
-    residuals = [
-        (max(site.street.unheard, 1.0 - chance), int(tracks.side[i])) for i, chance in emerged.items()
-    ]
+    residuals = [(max(least, 1.0 - chance), sides[i]) for i, chance in emerged.items()]
     handed_over = {side: residual for residual, side in sorted(residuals, reverse=True)}
     # First seen near an edge that hides vehicles, it came past it unheard.
     unheard = set[int]()
     for i in range(known, len(tracks)):
-        side = site.sides[k := int(tracks.side[i])]
+        side = site.sides[sides[i]]
         apart_rad = side.distance_rad(float(tracks.mean[i, AZIMUTH]), float(tracks.width_rad[i]))
         if side.hides and tracks.seen[i] and tracks.moving[i] and apart_rad <= 2.0 * site.street.edge_std_rad:
-            unheard.add(k)
+            unheard.add(sides[i])
     memory.tracks = surviving(tracks, site.street)
     past_edges(memory, handed_over, unheard, stamp_ns, site.street)
 
 
 def past_edges(
-    memory: Memory,
-    handed_over: Mapping[int, float],
-    unheard: Collection[int],
-    stamp_ns: int,
-    street: StreetModel,
+    memory: Memory, handed_over: Mapping[int, float], unheard: Set[int], stamp_ns: int, street: StreetModel
 ) -> None:
     """Update the memory after vehicles came past the edges of some sides: the one place that tells of it.
 
@@ -269,12 +263,10 @@ def past_edges(
         return
     tracks, hidden = memory.tracks, ~memory.tracks.seen
     # One that is still believed hidden where another came from was not what came.
-    left = {k: float(k in tracks.side[hidden]) for k in unheard}
+    came = {k: float(k in tracks.side[hidden]) for k in unheard} | dict(handed_over)
     # Told apart from others: by a message, or since they were seen.
     apart = hidden & (tracks.detected | (tracks.last_seen_ns != NEVER_NS))
-    memory.belief = memory.belief.handed_over(
-        left | dict(handed_over), set(tracks.side[apart].tolist()), stamp_ns, street
-    )
+    memory.belief = memory.belief.handed_over(came, set(tracks.side[apart].tolist()), stamp_ns, street)
     for side in handed_over:
         memory.history[side].handover_ns = stamp_ns
 

@@ -5,9 +5,10 @@ and those after it once more. One that was delivered before is dropped, one olde
 that is ahead of all others by more than the lag waits until another one confirms its stamp.
 """
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from operator import attrgetter
 from typing import TypeAlias
 
@@ -94,20 +95,16 @@ class FixedLag:
         at = bisect_left(self.arrivals, measurement.stamp_ns, key=_STAMP_NS)
         at += sum(_content(one) < _content(measurement) for one in same)
         memory = self.arrivals[at].before if at < len(self.arrivals) else self.latest
-        kept = list(self.arrivals[:at])
-        for one in (measurement, *(later.measurement for later in self.arrivals[at:])):
-            kept.append(Arrival(one, memory))
-            memory = step(memory, one)
+        again = (measurement, *(later.measurement for later in self.arrivals[at:]))
+        *befores, memory = accumulate(again, step, initial=memory)
+        kept = [*self.arrivals[:at], *map(Arrival, again, befores)]
         oldest = bisect_left(kept, memory.stamp_ns - LAG_NS, key=_STAMP_NS)
         counted = self.counted(replayed=1) if measurement.stamp_ns < self.latest.stamp_ns else self
         return replace(counted, latest=memory, arrivals=tuple(kept[oldest:]), late_since_ns=None)
 
     def _at(self, stamp_ns: int) -> list[Timed]:
         """Return what was taken of one instant, in its order."""
-        if not self.arrivals or stamp_ns > self.arrivals[-1].measurement.stamp_ns:
-            return []
-        first, end = (side(self.arrivals, stamp_ns, key=_STAMP_NS) for side in (bisect_left, bisect_right))
-        return [one.measurement for one in self.arrivals[first:end]]
+        return [one.measurement for one in self.arrivals if one.measurement.stamp_ns == stamp_ns]
 
     def counted(self, **more: int) -> "FixedLag":
         """Return the buffer with some counts of its delivery raised."""
@@ -143,8 +140,6 @@ class LagRecord:
 
 def restored(latest: Memory, past: LagRecord, step: Step) -> FixedLag:
     """Return the buffer of a checkpoint, with the memory before each of its measurements computed anew."""
-    arrivals, memory = list[Arrival](), past.base
-    for one in past.measurements:
-        arrivals.append(Arrival(one, memory))
-        memory = step(memory, one)
-    return FixedLag(latest, tuple(arrivals), past.delivery, past.late_since_ns, past.held)
+    befores = accumulate(past.measurements, step, initial=past.base)
+    arrivals = tuple(map(Arrival, past.measurements, befores))
+    return FixedLag(latest, arrivals, past.delivery, past.late_since_ns, past.held)

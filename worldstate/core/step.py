@@ -65,7 +65,7 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
         if row in others and (len(others) > 1 or not heard[side]):
             gone.append(row)
     memory.tracks = tracks.without(gone)
-    past_edges(memory, dict.fromkeys(emerged, street.unheard), (), memory.stamp_ns, street)
+    past_edges(memory, dict.fromkeys(emerged, street.unheard), set(), memory.stamp_ns, street)
 
 
 def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
