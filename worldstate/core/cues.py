@@ -50,13 +50,10 @@ def note_source(memory: Memory, measurement: Measurement, model: FilterModel) ->
         return
     # At the policy's own prior, without memory: the statistic of the paper. Of other sides it has none.
     prior, explanations = model.policy.reference_prior, len(measurement.signature.directions) + 2
-    log_prior = tuple(
-        map(math.log, prior if len(prior) == explanations else [1.0 / explanations] * explanations)
-    )
-    posterior = posterior_of(log_prior, measurement.signature, measurement.co_evidence)
-    ratio = posterior.log_lambda
-    statistic, bounded = min(posterior.hidden_total, 1.0), ratio if math.isfinite(ratio) else None
-    memory.last.instant = Instant(statistic, bounded)
+    usual = prior if len(prior) == explanations else [1.0 / explanations] * explanations
+    found = posterior_of(tuple(map(math.log, usual)), measurement.signature, measurement.co_evidence)
+    ratio = found.log_lambda if math.isfinite(found.log_lambda) else None
+    memory.last.instant = Instant(min(found.hidden_total, 1.0), ratio)
 
 
 # No slots: what follows from the memory is computed once, if it is asked for.

@@ -266,13 +266,12 @@ def _placed(
 ) -> CartesianBelief:
     """Return the place of a track after a position, or after a bearing of what has a place."""
     place = tracks.place(row)
-    if not detections.positions:
-        assert place is not None
-        return update_bearing(place, float(detections.azimuth_rad[by]), float(detections.std_rad[by]))
-    if place is not None:
+    if place is None:
+        place, (azimuth_rad, *_) = at_position(detections.positions[by], street.speed_mps), tracks.mean[row]
+        return update_bearing(place, azimuth_rad, tracks.azimuth_std_rad[row]) if tracks.seen[row] else place
+    if detections.positions:
         return update_position(place, detections.positions[by])
-    place, (azimuth_rad, *_) = at_position(detections.positions[by], street.speed_mps), tracks.mean[row]
-    return update_bearing(place, azimuth_rad, tracks.azimuth_std_rad[row]) if tracks.seen[row] else place
+    return update_bearing(place, float(detections.azimuth_rad[by]), float(detections.std_rad[by]))
 
 
 def _motion_at(tracks: Tracks, row: int, boxes: Detections, by: int, street: StreetModel) -> MotionBelief:

@@ -181,7 +181,7 @@ class WorldFilter:
             steps = (*(one.before for one in lag.arrivals), lag.latest)
             known, now = (published(one.latest.tracks, self.settings.street) for one in (self._lag, lag))
             lag.latest.last.events = events_between(known, now, steps)
-            lag = lag.counted(boxes_left_out=left_out)
+            lag = lag.counted(boxes_left_out=left_out) if left_out else lag
         world = self._with(lag.latest, lag)
         return world if self.stamp_ns <= world.stamp_ns + SLACK_NS else world.predict_to(self.stamp_ns)
 
@@ -206,12 +206,10 @@ class WorldFilter:
         return world
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
-        delivery = self._lag.delivery
         fresh = first_memory(self.context, self.settings, measurement.stamp_ns)
         fresh.counts.left_out = self._memory.counts.left_out
-        counted = replace(delivery, reanchored=delivery.reanchored + 1)
-        world = replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=FixedLag(fresh, (), counted))
-        return world.update(measurement)
+        lag = FixedLag(fresh, (), self._lag.counted(reanchored=1).delivery)
+        return replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=lag).update(measurement)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a checkpoint as JSON-able values: what is read back continues bit for bit.
@@ -222,15 +220,8 @@ class WorldFilter:
         >>> WorldFilter.from_dict(world.to_dict()).state == world.state
         True
         """
-        lag = self._lag
-        past = LagRecord(
-            stamp_ns=self.stamp_ns,
-            base=lag.base,
-            measurements=tuple(one.measurement for one in lag.arrivals),
-            delivery=lag.delivery,
-            late_since_ns=lag.late_since_ns,
-            held=lag.held,
-        )
+        lag, measurements = self._lag, tuple(one.measurement for one in self._lag.arrivals)
+        past = LagRecord(self.stamp_ns, lag.base, measurements, lag.delivery, lag.late_since_ns, lag.held)
         # What was predicted since the last measurement is predicted again.
         return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, lag.latest, past))
 

@@ -162,12 +162,11 @@ def hidden_azimuth(
         return track.motion.azimuth_rad, track.motion.azimuth_std_rad, "measured"
     if belief.has_times:
         return *hidden_bearing(belief.coming[side], site.sides[side]), "context"
-    is_heard = track is not None and track.side == side
-    motion = track.motion if track is not None and is_heard else site.sides[side].prior()
-    # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
-    # that.
-    std_rad = math.hypot(motion.azimuth_std_rad, site.sides[side].bias_std_rad)
-    return motion.azimuth_rad, std_rad, _rests_on(motion, site.sides[side])
+    corner = site.sides[side]
+    motion = track.motion if track is not None and track.side == side else corner.prior()
+    # Sound round a corner comes from its edge, not from the vehicle, which averaging over hops leaves.
+    std_rad = math.hypot(motion.azimuth_std_rad, corner.bias_std_rad)
+    return motion.azimuth_rad, std_rad, _rests_on(motion, corner)
 
 
 def _rests_on(motion: MotionBelief, side: SideGeometry) -> AzimuthSource:

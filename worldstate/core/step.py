@@ -73,7 +73,9 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
     model = from_here(model, memory.ego)
     stood = _standing(before, memory, model)
     _perceive(memory, measurement, start_ns, model)
-    emerged = _emerge(before, memory, model)
+    emerged = _announced_in_view(before, memory)
+    if emerged:
+        memory.belief = memory.belief.not_held(emerged, model.policy, model.site.street)
     alarms = SideAlarms(memory, model)
     alarms.note_announced()
     stands = [one is not None for one in alarms.advisories]
@@ -136,14 +138,6 @@ def _keep_likeliest(memory: Memory) -> None:
         order = np.lexsort((-tracks.existence, tracks.detected))
         memory.tracks = tracks.taken(np.sort(order[:MOST_TRACKS]))
         memory.counts.left_out += len(tracks) - MOST_TRACKS
-
-
-def _emerge(before: Memory, memory: Memory, model: FilterModel) -> list[int]:
-    """Return the sides whose vehicle of before is in view now, and end what is held for them."""
-    emerged = _announced_in_view(before, memory)
-    if emerged:
-        memory.belief = memory.belief.not_held(emerged, model.policy, model.site.street)
-    return emerged
 
 
 def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
