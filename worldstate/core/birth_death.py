@@ -1,6 +1,6 @@
 """Births, hand-overs and deaths of entities, those that have become one, and the events of all this."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -14,8 +14,8 @@ from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, MotionBelief
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.street_model import StreetModel
-from worldstate.belief.track import NEVER_NS, Tracks, born, heard_as
-from worldstate.ground import TINY, BoolArray
+from worldstate.belief.track import NEVER_NS, Track, Tracks, born, heard_as
+from worldstate.ground import TINY
 from worldstate.ground.values import nanoseconds, wrap_angle
 from worldstate.measurement import Measurement
 from worldstate.state import Event
@@ -44,8 +44,20 @@ def birth_death(
     memory.tracks = tracks.without([i for i in _heard_rows(tracks) if _ends(memory, i, alarmed, site)])
     side = _side_of_birth(memory, alarmed, site) if measurement.heard.usable else None
     if side is not None:
-        _give_birth(memory, side, measurement, site)
+        one = born_hidden(memory, side, 0.0, measurement.stamp_ns, measurement.source, site)
+        # A detector adds to the kinds at the hand-over.
+        labels, motion = measurement.kinds or one.labels, site.sides[side].prior()
+        memory.tracks = memory.tracks.joined([replace(one, labels=labels, motion=motion)])
     view_heard(memory, site)
+
+
+def born_hidden(
+    memory: Memory, side: int, existence: float, stamp_ns: int, source: str, site: SiteGeometry
+) -> Track:
+    """Return one more hidden entity of a side."""
+    one = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
+    memory.history[side].births += 1
+    return replace(one, side=side, came_from=1.0, sources=(source,))
 
 
 def view_heard(memory: Memory, site: SiteGeometry) -> None:
@@ -54,8 +66,8 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
     Their existence, their chance to be hidden, their side and azimuth are marginals; their own are an
     identity, classes and the approach rate. One alone may be on any side, two are on one each.
     """
-    tracks, sides, belief = memory.tracks, _unseen(memory, site), memory.belief
-    rows = _heard_rows(tracks)
+    tracks, belief, rows = memory.tracks, memory.belief, _heard_rows(memory.tracks)
+    sides = _unseen(memory, site) if rows else memory.sides
     for i in rows:
         shares = sides.side_shares(site.street.death) if len(rows) == 1 else ()
         is_open = sum(share > 0.0 for share in shares) > 1
@@ -110,8 +122,9 @@ def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry)
 
 def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> int | None:
     """Return the side on which a hidden entity is born, if one is: of one vehicle the likelier one."""
-    tracks, sides, least = memory.tracks, memory.sides, HIDDEN
-    heard, rearmed, every = _heard_rows(tracks), _rearmed(memory), range(len(site.sides))
+    tracks, sides, least, every = memory.tracks, memory.sides, HIDDEN, range(len(site.sides))
+    stamps_ns, heard = [one.handover_ns for one in memory.history], _heard_rows(tracks)
+    rearmed = [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in stamps_ns]
     taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
     if heard and (len(heard) > 1 or sides.both < least):
         return None
@@ -124,29 +137,8 @@ def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) 
     return max(free, key=sides.hidden_on, default=None)
 
 
-def _give_birth(memory: Memory, k: int, measurement: Measurement, site: SiteGeometry) -> None:
-    """Add one more hidden entity on a side."""
-    one = born(site.sides[k].label, memory.history[k].births, 0.0, measurement.stamp_ns, site)
-    memory.history[k].births += 1
-    one = replace(
-        one,
-        side=k,
-        came_from=1.0,
-        motion=site.sides[k].prior(),
-        # A detector adds to the kinds at the hand-over.
-        labels=measurement.kinds or one.labels,
-        sources=(measurement.source,),
-    )
-    memory.tracks = memory.tracks.joined([one])
-
-
-def _rearmed(memory: Memory) -> list[bool]:
-    stamps_ns = (one.handover_ns for one in memory.history)
-    return [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in stamps_ns]
-
-
-def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
-    """Merge tracks that have become one; return by the ids that end those that go on.
+def merge_tracks(memory: Memory, site: SiteGeometry) -> tuple[Event, ...]:
+    """Merge tracks that have become one; return which ids have ended, and which go on.
 
     Of two at one place, of the same class, one has just been found and the other not for a second. They go on
     where the first is, under the id that was known earlier. Two that are only heard go on as the likelier one
@@ -177,16 +169,11 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> dict[str, str]:
     memory.tracks = tracks.without(ended)
     if ended:
         view_heard(memory, site)
-    return into
+    return tuple(Event(stamp_ns, "merged", *ids) for ids in into.items())
 
 
 def _age(tracks: Tracks, row: int) -> tuple[int, str]:
     return tracks.created_ns[row], tracks.id[row]
-
-
-def told_apart(tracks: Tracks) -> BoolArray:
-    """Return which were told apart from others: by a message, or since they were seen."""
-    return np.asarray(tracks.detected | (tracks.last_seen_ns != NEVER_NS))
 
 
 def _at_one_place(tracks: Tracks, one: int, other: int, gate_rad: float) -> bool:
@@ -208,13 +195,12 @@ def _likeliest(labels: ClassShares) -> str:
 
 def hidden_on(tracks: Tracks, k: int) -> int | None:
     """Return the row of the likeliest hidden entity of a side, or of one that may be there, if any is."""
-    there = [i for i in hidden_rows(tracks) if _may_be_on(tracks, i, k)]
+    there = [
+        i
+        for i in hidden_rows(tracks)
+        if (tracks.side[i] == k if tracks.detected[i] or not (of := tracks.side_shares[i]) else of[k] > 0.0)
+    ]
     return max(there, key=lambda i: (tracks.side[i] == k, tracks.existence[i]), default=None)
-
-
-def _may_be_on(tracks: Tracks, row: int, side: int) -> bool:
-    shares = tracks.side_shares[row]
-    return bool(shares[side] > 0.0 if shares and not tracks.detected[row] else tracks.side[row] == side)
 
 
 # Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.
@@ -257,29 +243,23 @@ def after_look(
 
     `emerged` is the chance that a detection was theirs, by the rows of those that were not seen before.
     """
-    tracks = memory.tracks
+    tracks, sides, least = memory.tracks, memory.tracks.side.tolist(), site.street.unheard
     # Of the side where it is: what was heard may have been believed on the other one. Of two the likelier.
-    residuals = [
-        (max(site.street.unheard, 1.0 - chance), int(tracks.side[i])) for i, chance in emerged.items()
-    ]
+    residuals = [(max(least, 1.0 - chance), sides[i]) for i, chance in emerged.items()]
     handed_over = {side: residual for residual, side in sorted(residuals, reverse=True)}
     # First seen near an edge that hides vehicles, it came past it unheard.
     unheard = set[int]()
     for i in range(known, len(tracks)):
-        side = site.sides[k := int(tracks.side[i])]
+        side = site.sides[sides[i]]
         apart_rad = side.distance_rad(float(tracks.mean[i, AZIMUTH]), float(tracks.width_rad[i]))
         if side.hides and tracks.seen[i] and tracks.moving[i] and apart_rad <= 2.0 * site.street.edge_std_rad:
-            unheard.add(k)
+            unheard.add(sides[i])
     memory.tracks = surviving(tracks, site.street)
     past_edges(memory, handed_over, unheard, stamp_ns, site.street)
 
 
 def past_edges(
-    memory: Memory,
-    handed_over: Mapping[int, float],
-    unheard: Collection[int],
-    stamp_ns: int,
-    street: StreetModel,
+    memory: Memory, handed_over: Mapping[int, float], unheard: Set[int], stamp_ns: int, street: StreetModel
 ) -> None:
     """Update the memory after vehicles came past the edges of some sides: the one place that tells of it.
 
@@ -290,9 +270,10 @@ def past_edges(
         return
     tracks, hidden = memory.tracks, ~memory.tracks.seen
     # One that is still believed hidden where another came from was not what came.
-    left = {k: float(k in tracks.side[hidden]) for k in unheard}
-    apart = set(tracks.side[hidden & told_apart(tracks)].tolist())
-    memory.belief = memory.belief.handed_over(left | dict(handed_over), apart, stamp_ns, street)
+    came = {k: float(k in tracks.side[hidden]) for k in unheard} | dict(handed_over)
+    # Told apart from others: by a message, or since they were seen.
+    apart = hidden & (tracks.detected | (tracks.last_seen_ns != NEVER_NS))
+    memory.belief = memory.belief.handed_over(came, set(tracks.side[apart].tolist()), stamp_ns, street)
     for side in handed_over:
         memory.history[side].handover_ns = stamp_ns
 

@@ -60,11 +60,6 @@ class Evidence:
         """The mean of all alternatives, itself an e-value."""
         return math.fsum(self.values) / len(self.values)
 
-    @property
-    def nats(self) -> float:
-        """Log of the e-value."""
-        return math.log(self.value)
-
     def after(self, factors: Sequence[float], step_s: float) -> "Evidence":
         """Return the evidence after a time watched, and what it brought for each alternative."""
         anew = -math.expm1(-_BEGUN_ANEW_HZ * step_s)
@@ -119,7 +114,6 @@ class WatchedHop:
     within: tuple[float, ...]  # Chance that one does within two seconds
 
 
-_NEVER: tuple[int | None, ...] = (None, None)
 _NO_ONSETS, _NO_CHANCES = Evidence((1.0,) * len(RATES)), Evidence((1.0, 1.0))
 _MOST = len(RATES) * BROKEN * (1.0 + TINY)  # All of the mean in one of them
 
@@ -134,8 +128,8 @@ class BudgetWatch:
     stamp_ns: int = 0
     since_ns: int | None = None  # Since when a camera has looked without a break
     pending_ns: tuple[int, ...] = ()  # Onsets of which it is not known yet whether anything comes
-    over_ns: tuple[int | None, ...] = _NEVER  # When each side was last above the threshold
-    emerged_ns: tuple[int | None, ...] = _NEVER
+    over_ns: tuple[int | None, ...] = (None, None)  # When each side was last above the threshold
+    emerged_ns: tuple[int | None, ...] = (None, None)
     bet: tuple[int, tuple[float, ...]] | None = None  # Chances stated then, of which the outcome is awaited
 
     def watches(self, stamp_ns: int) -> bool:
@@ -144,42 +138,36 @@ class BudgetWatch:
 
     def after(self, hop: WatchedHop, onsets_per_hour: float) -> "BudgetWatch":
         """Return the watch one hop on."""
-        watch = self
-        if not (hop.looked and self.watches(hop.stamp_ns)):
-            since_ns = hop.stamp_ns if hop.looked else None
-            watch = replace(self, since_ns=since_ns, stamp_ns=hop.stamp_ns, pending_ns=(), bet=None)
-        if watch.since_ns is not None:
-            watch = watch._seen(hop)._judged(hop, onsets_per_hour)._betted(hop)
-        return watch._noted(hop)
-
-    def _seen(self, hop: WatchedHop) -> "BudgetWatch":
-        """Return the watch after the vehicles that have come into view since the last hop."""
-        new = [k for k, ns in enumerate(hop.emerged_ns) if ns is not None and ns != self.emerged_ns[k]]
-        if not new:
-            return self
-        own = [_recent(self.over_ns[k], hop) for k in new]
-        tally = replace(
-            self.tally,
-            arrivals=self.tally.arrivals + len(new),
-            warned=self.tally.warned + sum(own),
+        now_ns, watch = hop.stamp_ns, self
+        if not (hop.looked and self.watches(now_ns)):
+            since_ns = now_ns if hop.looked else None
+            watch = replace(self, since_ns=since_ns, stamp_ns=now_ns, pending_ns=(), bet=None)
+        if hop.looked:
+            watch = watch._counted(hop, onsets_per_hour)._betted(hop)
+        begins = any(hop.over) and all(ns is None or now_ns - ns > ENDS_NS for ns in self.over_ns)
+        pending_ns = (*watch.pending_ns, now_ns) if begins else watch.pending_ns
+        over_ns = tuple(now_ns if yes else ns for ns, yes in zip(self.over_ns, hop.over, strict=True))
+        return replace(
+            watch, stamp_ns=now_ns, emerged_ns=hop.emerged_ns, pending_ns=pending_ns, over_ns=over_ns
         )
-        return replace(self, tally=tally, pending_ns=())
 
-    def _judged(self, hop: WatchedHop, onsets_per_hour: float) -> "BudgetWatch":
-        """Return the watch after the time, and its onsets, of which it is now known that nothing came."""
-        assert self.since_ns is not None
+    def _counted(self, hop: WatchedHop, onsets_per_hour: float) -> "BudgetWatch":
+        """Return the watch after the vehicles that have come, and time of which it is known that none did."""
+        new = [k for k, ns in enumerate(hop.emerged_ns) if ns is not None and ns != self.emerged_ns[k]]
+        warned_ns, pending_ns = (self.over_ns[k] for k in new), () if new else self.pending_ns
         known_ns = hop.stamp_ns - HORIZON_NS
-        quiet_ns = HORIZON_NS + max([self.since_ns, *(ns for ns in hop.emerged_ns if ns is not None)])
+        quiet_ns = HORIZON_NS + max(ns for ns in (self.since_ns, *hop.emerged_ns) if ns is not None)
         step_ns = max(known_ns - max(self.stamp_ns - HORIZON_NS, quiet_ns), 0)
-        false = sum(quiet_ns <= ns <= known_ns for ns in self.pending_ns)
-        tally = replace(
-            self.tally,
-            quiet_ns=self.tally.quiet_ns + step_ns,
-            false_onsets=self.tally.false_onsets + false,
+        false = sum(quiet_ns <= ns <= known_ns for ns in pending_ns)
+        tally = Tally(
+            self.tally.quiet_ns + step_ns,
+            self.tally.false_onsets + false,
+            self.tally.arrivals + len(new),
+            self.tally.warned + sum(ns is not None and ns >= known_ns for ns in warned_ns),
         )
         factors = onset_factors(false, seconds(step_ns), onsets_per_hour)
-        pending_ns = tuple(ns for ns in self.pending_ns if ns > known_ns)
         onsets = self.onsets.after(factors, seconds(step_ns))
+        pending_ns = tuple(ns for ns in pending_ns if ns > known_ns)
         return replace(self, tally=tally, onsets=onsets, pending_ns=pending_ns)
 
     def _betted(self, hop: WatchedHop) -> "BudgetWatch":
@@ -193,53 +181,33 @@ class BudgetWatch:
         within = self.within.after(chance_factors(chances, came), BET_S)
         return replace(self, within=within, bet=(hop.stamp_ns, hop.within))
 
-    def _noted(self, hop: WatchedHop) -> "BudgetWatch":
-        """Return the watch with an onset, where this hop is one, and when each side was last above."""
-        begins = any(hop.over) and all(ns is None or hop.stamp_ns - ns > ENDS_NS for ns in self.over_ns)
-        return replace(
-            self,
-            stamp_ns=hop.stamp_ns,
-            emerged_ns=hop.emerged_ns,
-            pending_ns=(*self.pending_ns, hop.stamp_ns) if begins else self.pending_ns,
-            over_ns=tuple(
-                hop.stamp_ns if yes else ns for ns, yes in zip(self.over_ns, hop.over, strict=True)
-            ),
-        )
-
     def check(self, sides: int) -> None:
         """Refuse what a file cannot have been written with."""
         laid = self.emerged_ns if self.bet is None else self.bet[1]
-        lengths = {len(one) for one in (self.over_ns, self.emerged_ns, laid)}
-        tests = (self.onsets, _NO_ONSETS), (self.within, _NO_CHANCES)
-        if lengths != {sides} or any(len(one.values) != len(first.values) for one, first in tests):
+        if {len(self.over_ns), len(self.emerged_ns), len(laid)} != {sides}:
             raise InvalidArgumentError(f"memory.sequence.watch: expected values of {sides} sides")
-        if not all(0.0 < value <= _MOST for one, _ in tests for value in one.values):
-            raise InvalidArgumentError(f"memory.sequence.watch: expected e-values up to {_MOST:g}")
+        for one, first in ((self.onsets, _NO_ONSETS), (self.within, _NO_CHANCES)):
+            if len(one.values) != len(first.values) or not all(0.0 < value <= _MOST for value in one.values):
+                expected = f"{len(first.values)} e-values up to {_MOST:g}"
+                raise InvalidArgumentError(f"memory.sequence.watch: expected {expected}")
 
 
 def budget_of(watch: BudgetWatch, stamp_ns: int, alarm: SequenceAlarm) -> Budget:
     """Return how the watch over the budget of an alarm stands at a time."""
     # In full precision they would take twice as long to write.
     tests = {"onsets": watch.onsets, "within": watch.within}
-    evidence_nats = {name: round(one.nats, 6) for name, one in tests.items()}
-    verdict, why = _verdict(watch, stamp_ns)
-    asked, promise = alarm.asked_alpha, alarm.promise
-    return Budget(verdict, why, evidence_nats, alarm.onsets_per_hour, watch.tally, asked, promise)
-
-
-def _verdict(watch: BudgetWatch, stamp_ns: int) -> tuple[Verdict, str | None]:
-    if not watch.watches(stamp_ns):
-        return "unwatched", "no camera looks where vehicles come into view"
+    evidence_nats = {name: round(math.log(one.value), 6) for name, one in tests.items()}
     low, high = watch.within.values
     found = {
         "more false onsets than the budget": watch.onsets.broken,
         f"chances within two seconds are too {'low' if low > high else 'high'}": watch.within.broken,
     }
-    if any(found.values()):
-        return "broken", "; ".join(what for what, is_so in found.items() if is_so)
-    doubted = max(watch.onsets.value, watch.within.value) >= IN_DOUBT
-    return "in doubt" if doubted else "kept", None
-
-
-def _recent(over_ns: int | None, hop: WatchedHop) -> bool:
-    return over_ns is not None and hop.stamp_ns - over_ns <= HORIZON_NS
+    in_doubt = max(one.value for one in tests.values()) >= IN_DOUBT
+    verdict: Verdict = "in doubt" if in_doubt else "kept"
+    why = None
+    if not watch.watches(stamp_ns):
+        verdict, why = "unwatched", "no camera looks where vehicles come into view"
+    elif any(found.values()):
+        verdict, why = "broken", "; ".join(what for what, is_so in found.items() if is_so)
+    asked, promise = alarm.asked_alpha, alarm.promise
+    return Budget(verdict, why, evidence_nats, alarm.onsets_per_hour, watch.tally, asked, promise)

@@ -1,19 +1,18 @@
 """Advisories and cues: the alarm over the belief and what messages announce, and what is published."""
 
 import math
-from dataclasses import dataclass
-from functools import partial
-from typing import Literal
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, TypeAlias
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import posterior_of
 from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.belief.hidden_bearing import announced, time_to_visible
+from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.side_belief import SideBelief
 from worldstate.ground import TINY
 from worldstate.measurement import Measurement
@@ -22,12 +21,12 @@ from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, Sen
 from .birth_death import HIDDEN, hidden_on
 from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceState
 from .side_update import heard_beside
-from .site_model import FilterModel, published_belief
+from .site_model import FilterModel
 from .snapshot_builder import hidden_azimuth, sector, time_to_arrival
-from .street_belief import StreetBelief, bounded_log_odds
+from .street_belief import bounded_log_odds
 
-NO_LOOK = Unqueried("sound alone")
 _UNNAMED = "no source distinguishes this side: its risk is that of the prior"
+_Times: TypeAlias = tuple[dict[str, float] | None, tuple[float, float, float] | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,199 +50,206 @@ def note_source(memory: Memory, measurement: Measurement, model: FilterModel) ->
         return
     # At the policy's own prior, without memory: the statistic of the paper. Of other sides it has none.
     prior, explanations = model.policy.reference_prior, len(measurement.signature.directions) + 2
-    log_prior = tuple(
-        map(math.log, prior if len(prior) == explanations else [1.0 / explanations] * explanations)
-    )
-    posterior = posterior_of(log_prior, measurement.signature, measurement.co_evidence)
-    ratio = posterior.log_lambda
-    statistic, bounded = min(posterior.hidden_total, 1.0), ratio if math.isfinite(ratio) else None
-    memory.last.instant = Instant(statistic, bounded)
+    usual = prior if len(prior) == explanations else [1.0 / explanations] * explanations
+    found = posterior_of(tuple(map(math.log, usual)), measurement.signature, measurement.co_evidence)
+    ratio = found.log_lambda if math.isfinite(found.log_lambda) else None
+    memory.last.instant = Instant(min(found.hidden_total, 1.0), ratio)
 
 
-def advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
-    """Return the advisory of each side, None where there is none; none stands beside a risk below 0.1."""
-    every = raised_advisories(memory, model)
-    return standing(every, published_belief(memory, model), model.site.street.death) if any(every) else every
+# No slots: what follows from the memory is computed once, if it is asked for.
+@dataclass(frozen=True, eq=False)
+class SideAlarms:
+    """The alarms of all sides at one time, and the belief of the sides as it is published."""
 
+    memory: Memory
+    model: FilterModel
 
-def standing(
-    raised: tuple[SideAdvisory | None, ...], sides: SideBelief, least: float
-) -> tuple[SideAdvisory | None, ...]:
-    """Return the advisories that no risk denies."""
-    return tuple(one if risk >= least else None for one, risk in zip(raised, sides.risks, strict=True))
+    @cached_property
+    def sides(self) -> SideBelief:
+        r"""The belief of the sides with the policy's calibration, messages and tracks.
 
+        .. math:: r_k = \min\big(P(hid),\ g(P(hid))\big)\, P(k \mid hid)
 
-def raised_advisories(memory: Memory, model: FilterModel) -> tuple[SideAdvisory | None, ...]:
-    """Return the advisory of each side at any risk: that by messages if what is heard raises none.
+        without a sequence model, whose probabilities are calibrated: of what is hidden at most all comes into
+        view, so that the calibrated map g of the policy can only lower it. It is a map of what windows heard:
+        before the first one the risk is that of the prior, or an array that hears nothing would report a
+        street quieter than any.
+        """
+        belief, tracks = self.memory.belief, self.memory.tracks
+        sides = belief.sides
+        if belief.read_ns and not belief.has_times:
+            hidden = sides.hypotheses[0]
+            risk = min(float(self.model.policy.risk_map(hidden)), hidden)
+            # The floor only matters where P(hidden) has underflowed; then no direction has a share.
+            share = risk / max(hidden, TINY)
+            sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
+        # What drives behind the ego explains nothing of what is ahead.
+        ahead = tracks.seen & tracks.moving & (np.cos(tracks.mean[:, AZIMUTH]) > 0.0)
+        unseen = 1.0 - tracks.existence[ahead] * (1.0 - tracks.behind[ahead])
+        return sides.at_least(self._announced).beside(float(unseen.prod()))
 
-    None is raised in the first second of a sequence, which was counted in no budget.
-    """
-    belief, stamp_ns = memory.belief, memory.stamp_ns
-    threshold, raised = belief.threshold_nats(model.policy, model.site.street), list[SideAdvisory | None]()
-    pairs = zip(belief.alarm_ends_ns(stamp_ns), belief.decided_at(stamp_ns), strict=True)
-    for end_ns, decided in pairs:
-        stands = end_ns is not None and memory.last.no_sequence != TOO_FEW
-        raised.append(SideAdvisory(end_ns, decided < threshold) if stands and end_ns else None)
-    for k, nats in enumerate(_announced_nats(memory, model)):
-        heard, since_ns = raised[k], memory.history[k].announced_ns
-        end_ns = _announced_ends_ns(memory, k)
-        stands = since_ns is not None and min(end_ns, since_ns + NEWS_HOLDS_NS) >= stamp_ns
-        if stands and (heard is None or (heard.held and nats >= threshold)):
-            raised[k] = SideAdvisory(end_ns, nats < threshold, announced=True)
-    return tuple(raised)
+    @cached_property
+    def _announced(self) -> tuple[float, ...]:
+        return announced(self.memory.tracks, self.model.site)
 
+    @cached_property
+    def _messages(self) -> list[tuple[float, int]]:
+        """Log-odds that an announced road user comes into view, and when that ends without news, by side."""
+        memory, tracks = self.memory, self.memory.tracks
+        placed, long_ago_ns = tracks.placed & ~tracks.seen, memory.stamp_ns - 2 * NEWS_HOLDS_NS
+        updated_ns = (tracks.updated_ns[placed & (tracks.side == k)] for k in range(len(memory.history)))
+        ends_ns = [int(ns.max(initial=long_ago_ns)) + NEWS_HOLDS_NS for ns in updated_ns]
+        return list(zip(map(bounded_log_odds, self._announced), ends_ns, strict=True))
 
-def note_announced(memory: Memory, model: FilterModel) -> None:
-    """Note on which sides messages reach the threshold now."""
-    threshold = memory.belief.threshold_nats(model.policy, model.site.street)
-    for k, nats in enumerate(_announced_nats(memory, model)):
-        if nats >= threshold and _announced_ends_ns(memory, k) >= memory.stamp_ns:
-            memory.history[k].announced_ns = memory.stamp_ns
+    @cached_property
+    def _threshold_nats(self) -> float:
+        return self.memory.belief.threshold_nats(self.model.policy, self.model.site.street)
 
+    def note_announced(self) -> None:
+        """Note on which sides messages reach the threshold now."""
+        for side, (nats, ends_ns) in zip(self.memory.history, self._messages, strict=True):
+            if nats >= self._threshold_nats and ends_ns >= self.memory.stamp_ns:
+                side.announced_ns = self.memory.stamp_ns
 
-def _announced_nats(memory: Memory, model: FilterModel) -> list[float]:
-    """Return the log-odds that an announced road user comes into view, by side."""
-    return list(map(bounded_log_odds, announced(memory.tracks, model.site)))
+    @cached_property
+    def _raised(self) -> list[SideAdvisory | None]:
+        """The advisory of each side at any risk: that by messages if what is heard raises none.
 
+        None is raised in the first second of a sequence, which was counted in no budget.
+        """
+        memory, belief, stamp_ns = self.memory, self.memory.belief, self.memory.stamp_ns
+        ends_ns = belief.alarm_ends_ns(stamp_ns)
+        if memory.last.no_sequence == TOO_FEW:
+            ends_ns = (None,) * len(ends_ns)
+        raised = [
+            None if end_ns is None else SideAdvisory(end_ns, decided < self._threshold_nats)
+            for end_ns, decided in zip(ends_ns, belief.decided_at(stamp_ns), strict=True)
+        ]
+        for k, (nats, end_ns) in enumerate(self._messages):
+            heard, since_ns, is_below = raised[k], memory.history[k].announced_ns, nats < self._threshold_nats
+            stands = since_ns is not None and min(end_ns, since_ns + NEWS_HOLDS_NS) >= stamp_ns
+            if stands and (heard is None or (heard.held and not is_below)):
+                raised[k] = SideAdvisory(end_ns, is_below, announced=True)
+        return raised
 
-def _announced_ends_ns(memory: Memory, side: int) -> int:
-    """Return when the announcements of a side end without news."""
-    tracks = memory.tracks
-    rows = tracks.placed & ~tracks.seen & (tracks.side == side)
-    return int(tracks.updated_ns[rows].max(initial=memory.stamp_ns - 2 * NEWS_HOLDS_NS)) + NEWS_HOLDS_NS
+    @cached_property
+    def advisories(self) -> list[SideAdvisory | None]:
+        """The advisory of each side, None where there is none; none stands beside a risk below 0.1."""
+        if not any(self._raised):
+            return self._raised
+        least, pairs = self.model.site.street.death, zip(self._raised, self.sides.risks, strict=True)
+        return [one if risk >= least else None for one, risk in pairs]
 
+    def cues(self, sensors: tuple[SensorHealth, ...]) -> tuple[RiskCue, ...]:
+        """Return one risk cue per side, none before the first measurement."""
+        if not self.memory.counts.measurements:
+            return ()
+        rested_on = tuple(one for one in sensors if one.condition != "silent")
+        # All sides together: what is taken out of arrays once.
+        pairs = zip(self._times(), self._evidence(), strict=True)
+        return tuple(self._cue(k, times, evidence, rested_on) for k, (times, evidence) in enumerate(pairs))
 
-def why_none(memory: Memory, model: FilterModel, side: int, sides: SideBelief) -> str | None:
-    """Return why a side of high risk has no advisory; None if it is likelier that none comes."""
-    if sides.risks[side] <= HIDDEN:
-        return None
-    belief = memory.belief
-    if memory.last.no_sequence == TOO_FEW:
-        return "less than a second of sound: no alarm is raised yet"
-    if not belief.has_news(memory.stamp_ns):
-        return "nothing was measured for a second"
-    if belief.alarm_nats[side] < belief.alarm_nats.max():
-        return "one vehicle is likelier than two, and likelier on the other side"
-    if belief.has_times:
-        return "it is not sure to come within three seconds, or not for long enough"
-    return "it is not sure to be there, or not for long enough"
+    def _cue(
+        self, k: int, times: _Times, evidence: EvidenceTerms, sensors: tuple[SensorHealth, ...]
+    ) -> RiskCue:
+        memory, site, sides, told = self.memory, self.model.site, self.sides, self.advisories[k]
+        row = hidden_on(memory.tracks, k)
+        track = None if row is None else memory.tracks.row(row)
+        azimuth_rad, std_rad, source = hidden_azimuth(k, track, memory.belief, site)
+        within, interval_s = times
+        arrival_s = None
+        if track is not None and track.approach_heard:
+            arrival_s = time_to_arrival(track.motion.inverse_tta_hz, track.motion.inverse_tta_std_hz)
+        # Distance and speed of an announced vehicle tell more than the sound.
+        if track is not None and track.place is not None:
+            interval_s = time_to_visible(track.place, site.sides[track.side], site)[1] or interval_s
+        named = memory.last.named  # None of them before the first window
+        is_named = told is not None or not named or site.sides[k].label in named
+        since_ns, entity_id = memory.history[k].advised_ns, None if track is None else track.id
+        advisory = held = None
+        if told is not None:
+            advisory = Advisory(memory.stamp_ns if since_ns is None else since_ns, told.ends_ns, sensors)
+            held = Held(entity_id, told.ends_ns) if told.held else None
+        return RiskCue(
+            direction=site.sides[k].label,
+            statistic=memory.last.instant.statistic,
+            log_lambda=memory.last.instant.log_lambda,
+            hypotheses=Priors(*sides.hypotheses),
+            azimuth_rad=azimuth_rad,
+            azimuth_std_rad=std_rad,
+            azimuth_source=source,
+            risk=sides.risks[k],
+            confidence=sides.risks[k] / max(sum(sides.risks), TINY),
+            advisory=advisory,
+            alpha=self._alpha(evidence),
+            entity_id=entity_id,
+            horizon_s=arrival_s if interval_s is None else interval_s[1],
+            within=within,
+            time_to_visible_s=interval_s,
+            sector_rad=sector(azimuth_rad, std_rad),
+            evidence=evidence if is_named else None,
+            held=held,
+            not_advised=None if told is not None else self._why_none(k) if is_named else _UNNAMED,
+        )
 
+    def _why_none(self, side: int) -> str | None:
+        """Return why a side of high risk has no advisory; None if it is likelier that none comes."""
+        belief = self.memory.belief
+        if self.sides.risks[side] <= HIDDEN:
+            return None
+        if self.memory.last.no_sequence == TOO_FEW:
+            return "less than a second of sound: no alarm is raised yet"
+        if not belief.has_news(self.memory.stamp_ns):
+            return "nothing was measured for a second"
+        if belief.alarm_nats[side] < belief.alarm_nats.max():
+            return "one vehicle is likelier than two, and likelier on the other side"
+        until = "come within three seconds" if belief.has_times else "be there"
+        return f"it is not sure to {until}, or not for long enough"
 
-_Times = tuple[dict[str, float] | None, tuple[float, float, float] | None]
+    def _alpha(self, evidence: EvidenceTerms) -> float | None:
+        """Return the share of hazard-free time in alarm: of the policy, or by a sequence's curve."""
+        alpha, alarm = self.model.policy.alpha or None, self.memory.belief.alarm
+        if evidence.hypothesis == "hidden" or alpha is None:
+            return alpha
+        return alarm.promise.alpha if evidence.hypothesis == "coming" and alarm and alarm.promise else None
 
+    def _times(self) -> list[_Times]:
+        """Return the probabilities of coming into view, and the time to it if a vehicle is expected."""
+        belief = self.memory.belief
+        if not belief.has_times:
+            return [(None, None)] * len(self.advisories)
+        posterior = belief.posterior
+        within = posterior.within()[0].tolist()
+        soon = posterior.groups[0, :, :STATED].sum(axis=1).tolist()
+        # The times are those of a vehicle that comes: in an empty street they would say nothing.
+        stated = [
+            chance > (0.5 if told is None else 0.0)
+            for told, chance in zip(self.advisories, soon, strict=True)
+        ]
+        intervals_s = posterior.time_to_visible_s()[0].tolist() if any(stated) else within
+        names = [f"{end_s:g}" for end_s in HORIZONS_S]
+        return [
+            (dict(zip(names, chances, strict=True)), (row[0], row[1], row[2]) if is_stated else None)
+            for chances, row, is_stated in zip(within, intervals_s, stated, strict=True)
+        ]
 
-def cues_of(memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...]) -> tuple[RiskCue, ...]:
-    """Return one risk cue per side, none before the first measurement."""
-    if not memory.counts.measurements:
-        return ()
-    sides, raised = published_belief(memory, model), raised_advisories(memory, model)
-    told, evidence = standing(raised, sides, model.site.street.death), _evidence(memory, model, raised)
-    # All sides together: what is taken out of arrays once.
-    times = _times(memory.belief, [one is not None for one in told])
-    rested_on = tuple(one for one in sensors if one.condition != "silent")
-    build = partial(_cue, memory, memory.last.instant, model, sides, rested_on)
-    return tuple(map(build, range(len(told)), told, times, evidence))
+    def _evidence(self) -> list[EvidenceTerms]:
+        r"""Return for each side what the alarm goes by: the belief, or messages if they alone raise one.
 
+        With L the log-odds after the prior, what was heard, every look, and messages,
 
-def _cue(
-    memory: Memory,
-    instant: Instant,
-    model: FilterModel,
-    sides: SideBelief,
-    sensors: tuple[SensorHealth, ...],
-    k: int,
-    told: SideAdvisory | None,
-    times: _Times,
-    evidence: EvidenceTerms,
-) -> RiskCue:
-    row = hidden_on(memory.tracks, k)
-    track = None if row is None else memory.tracks.row(row)
-    azimuth_rad, std_rad, source = hidden_azimuth(k, track, memory.belief, model.site)
-    within, interval_s = times
-    arrival_s = None
-    if track is not None and track.approach_heard:
-        arrival_s = time_to_arrival(track.motion.inverse_tta_hz, track.motion.inverse_tta_std_hz)
-    # Distance and speed of an announced vehicle tell more than the sound.
-    if track is not None and track.place is not None:
-        interval_s = time_to_visible(track.place, model.site.sides[track.side], model.site)[1] or interval_s
-    named = memory.last.named  # None of them before the first window
-    is_named = told is not None or not named or model.site.sides[k].label in named
-    since_ns, entity_id = memory.history[k].advised_ns, None if track is None else track.id
-    advisory = held = None
-    if told is not None:
-        advisory = Advisory(memory.stamp_ns if since_ns is None else since_ns, told.ends_ns, sensors)
-        held = Held(entity_id, told.ends_ns) if told.held else None
-    return RiskCue(
-        direction=model.site.sides[k].label,
-        statistic=instant.statistic,
-        log_lambda=instant.log_lambda,
-        hypotheses=Priors(*sides.hypotheses),
-        azimuth_rad=azimuth_rad,
-        azimuth_std_rad=std_rad,
-        azimuth_source=source,
-        risk=sides.risks[k],
-        confidence=sides.risks[k] / max(sum(sides.risks), TINY),
-        advisory=advisory,
-        alpha=_alpha(memory, model.policy, evidence),
-        entity_id=entity_id,
-        horizon_s=arrival_s if interval_s is None else interval_s[1],
-        within=within,
-        time_to_visible_s=interval_s,
-        sector_rad=sector(azimuth_rad, std_rad),
-        evidence=evidence if is_named else None,
-        held=held,
-        not_advised=None if told is not None else why_none(memory, model, k, sides) if is_named else _UNNAMED,
-    )
-
-
-def _alpha(memory: Memory, policy: CueingPolicy, evidence: EvidenceTerms) -> float | None:
-    """Return the share of hazard-free time in alarm: of the policy, or by the curve of a sequence's alarm."""
-    if evidence.hypothesis == "hidden":
-        return policy.alpha or None
-    alarm = memory.belief.alarm if evidence.hypothesis == "coming" else None
-    return alarm.promise.alpha if alarm and alarm.promise and policy.alpha else None
-
-
-def _times(belief: StreetBelief, advised: list[bool]) -> list[_Times]:
-    """Return the probabilities of coming into view, and the time to it if a vehicle is expected."""
-    if not belief.has_times:
-        return [(None, None)] * len(advised)
-    posterior = belief.posterior
-    within = posterior.within()[0].tolist()
-    soon = posterior.groups[0, :, :STATED].sum(axis=1).tolist()
-    # The times are those of a vehicle that comes: in an empty street they would say nothing.
-    stated = [chance > (0.0 if told else 0.5) for told, chance in zip(advised, soon, strict=True)]
-    intervals_s = posterior.time_to_visible_s()[0].tolist() if any(stated) else within
-    names = [f"{end_s:g}" for end_s in HORIZONS_S]
-    return [
-        (dict(zip(names, chances, strict=True)), (row[0], row[1], row[2]) if told else None)
-        for chances, row, told in zip(within, intervals_s, stated, strict=True)
-    ]
-
-
-def _evidence(
-    memory: Memory, model: FilterModel, raised: tuple[SideAdvisory | None, ...]
-) -> list[EvidenceTerms]:
-    r"""Return for each side what the alarm goes by: the belief, or messages if they alone raise an advisory.
-
-    With L the log-odds after the prior, what was heard, every look, and messages,
-
-    .. math:: t_j = L_j - L_{j-1}
-    """
-    belief, street = memory.belief, model.site.street
-    after, threshold = belief.log_odds(street), belief.threshold_nats(model.policy, street)
-    terms = np.diff(list(after.values()), axis=0, prepend=0.0).T.tolist()
-    hypothesis: Literal["coming", "hidden"] = "coming" if belief.has_times else "hidden"
-    heard = [
-        EvidenceTerms(hypothesis, dict(zip(after, own, strict=True)), decides, threshold)
-        for own, decides in zip(terms, belief.decided_at(memory.stamp_ns), strict=True)
-    ]
-    if not any(one is not None and one.announced for one in raised):
-        return heard
-    prior, claimed = after["prior"].tolist(), _announced_nats(memory, model)
-    announcing = [
-        EvidenceTerms("announced", {"prior": before, "messages": nats - before}, nats, threshold)
-        for before, nats in zip(prior, claimed, strict=True)
-    ]
-    pairs = zip(raised, announcing, heard, strict=True)
-    return [said if one is not None and one.announced else own for one, said, own in pairs]
+        .. math:: t_j = L_j - L_{j-1}
+        """
+        belief, threshold = self.memory.belief, self._threshold_nats
+        after = belief.log_odds(self.model.site.street)
+        heard: Literal["coming", "hidden"] = "coming" if belief.has_times else "hidden"
+        terms = np.diff(list(after.values()), axis=0, prepend=0.0).T.tolist()
+        evidence = []
+        for k, (own, decides) in enumerate(zip(terms, belief.decided_at(self.memory.stamp_ns), strict=True)):
+            one, (nats, _) = self._raised[k], self._messages[k]
+            if one is not None and one.announced:
+                told = {"prior": own[0], "messages": nats - own[0]}
+                evidence.append(EvidenceTerms("announced", told, nats, threshold))
+            else:
+                evidence.append(EvidenceTerms(heard, dict(zip(after, own, strict=True)), decides, threshold))
+        return evidence

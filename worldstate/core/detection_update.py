@@ -24,7 +24,6 @@ from worldstate.belief.kinematics.motion import (
     MotionBelief,
     update,
 )
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry, normal_shares
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import (
@@ -42,7 +41,7 @@ from worldstate.ground import TINY, FloatArray, seconds, wrap_angle
 from worldstate.ground.typing import IndexArray
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
-from .birth_death import HIDDEN, after_look
+from .birth_death import HIDDEN, after_look, born_hidden
 from .fixed_lag import LAG_NS
 from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory
 from .site_model import FilterModel
@@ -54,7 +53,7 @@ _NEW_RATE_STD, _PARKED_RATE_STD = 0.5, LEAST_STD
 
 
 def new_looks(
-    memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings
+    memory: Memory, measurement: Measurement, start_ns: int, street: StreetModel
 ) -> tuple[Measurement, list[tuple[CameraLook, float]]]:
     r"""Note the looks of a measurement; return it, and the new ones, weighed.
 
@@ -71,14 +70,13 @@ def new_looks(
         in_time = -FORGOTTEN_NS < look.stamp_ns - measurement.stamp_ns <= LAG_NS
         if in_time and (last is None or look.stamp_ns > last.stamp_ns):
             since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
-            new.append((one, min(max(since_s, 0.0) / settings.street.look_s, 1.0)))
-            memory.looks[look.sensor] = CountedLook(
-                look.stamp_ns, measurement.source, look.answer, look.sector_rad, look.fault
-            )
+            new.append((one, min(max(since_s, 0.0) / street.look_s, 1.0)))
+            said = look.answer, look.sector_rad, look.fault
+            memory.looks[look.sensor] = CountedLook(look.stamp_ns, measurement.source, *said)
         elif not in_time or (last is not None and last.source != measurement.source):
             when = "was counted before" if in_time else "is of another time"
-            said = Unqueried(f"this look of {look.sensor} {when}")
-            measurement = replace(measurement, co_evidence=said)
+            unasked = Unqueried(f"this look of {look.sensor} {when}")
+            measurement = replace(measurement, co_evidence=unasked)
     return measurement, new
 
 
@@ -87,18 +85,16 @@ def update_looks(
 ) -> None:
     """Update the memory with the new looks of a measurement, all cameras at once."""
     if looks:
-        street = model.site.street
-        scans = [camera_scan(seen, model.site.view(seen.look), weight, street) for seen, weight in looks]
-        detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, model.site)
+        site = model.site
+        scans = [camera_scan(seen, site.view(seen.look), weight, site.street) for seen, weight in looks]
+        detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, site)
 
 
 def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> None:
     """Update the memory with the positions of a radar or a radio: entities, and announced hidden ones."""
-    street, last = model.site.street, memory.looks.get(scan.source)
+    street, last, before = model.site.street, memory.looks.get(scan.source), memory.belief
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
-    weight = min(elapsed_s / street.look_s, 1.0)
-    scans = [position_scan(scan, weight, street)]
-    before = memory.belief
+    scans = [position_scan(scan, min(elapsed_s / street.look_s, 1.0), street)]
     detection_update(memory, scans, None, scan.stamp_ns, model.site)
     memory.looks[scan.source] = _scan_look(scan)
     if memory.belief is not before:  # Time alone raises no alarm
@@ -125,50 +121,49 @@ def detection_update(
     `asked` is what cameras answer of the sector of a sound; None of positions.
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
-    if detections.in_sight:
+    in_sight, n = detections.in_sight, len(known)
+    if in_sight:
         detections = detections.seen_through(site)
     whose = associated(known, detections, site)
-    if detections.in_sight:
+    if in_sight:
         # A detection that may be of a known entity is a new one the less.
         detections = replace(detections, existence=detections.existence * whose.unclaimed)
-    fresh = [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
-    memory.tracks = tracks = known.joined(fresh)
-    chances, detection = np.ones(len(tracks)), np.full(len(tracks), -1)
-    chances[: len(known)] = whose.chances
-    detection[list(whose.found)], detection[len(known) :] = list(whose.found.values()), whose.new
+    memory.tracks = tracks = known.joined(
+        [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
+    )
+    chances, detection = np.append(whose.chances, np.ones(len(whose.new))), np.full(len(tracks), -1)
+    detection[list(whose.found)], detection[n:] = list(whose.found.values()), whose.new
     rows, missed, was_seen = np.flatnonzero(detection >= 0), np.flatnonzero(detection < 0), tracks.seen.copy()
-    found = _Found(rows, detection[rows], detections)
-    if scans[0].sector is None:
-        existence = _told(tracks, found, scans[0], 1.0 - site.street.doubt)
-    else:
-        existence = tracks.existence.copy()
-        hits = np.minimum(whose.pairs.T @ by_look, 1.0)
-        existence[: len(known)], detected = _existence(known, hits, scans, site.street)
+    found = _Found(rows, detection[rows], chances[rows], detections)
+    if in_sight:
+        hits, existence = np.minimum(whose.pairs.T @ by_look, 1.0), tracks.existence.copy()
+        existence[:n], detected = _existence(known, hits, scans, site.street)
+        tracks.behind[:n] = _hidden(known, detected, chances[:n], bool(detections.positions), site.street)
         # What was only heard is found, or another one is.
-        first = np.flatnonzero((detection[: len(known)] >= 0) & ~known.detected)
+        first = np.flatnonzero((detection[:n] >= 0) & ~known.detected)
         another = (1.0 - chances[first]) * detections.existence[detection[first]]
-        existence[first] = chances[first] + another
-    _move(tracks, found, chances, site.street)
-    _see(tracks, found, chances, scans, stamp_ns, site)
-    follow_places(tracks, site)
-    if scans[0].sector is None:
-        occlude(tracks, site)
+        existence[first], tracks.behind[first] = chances[first] + another, 0.0
     else:
-        tracks.behind[: len(known)] = _hidden(known, detected, whose.chances, scans[0], site)
-        tracks.behind[first] = 0.0
+        existence = _told(tracks, found, scans[0].source, 1.0 - site.street.doubt)
+    _move(tracks, found, site.street)
+    _see(tracks, found, scans, stamp_ns, site)
+    follow_places(tracks, site)
+    if not in_sight:
+        occlude(tracks, site)
     if len(missed):
         _miss(memory, missed, scans, asked)
     tracks.existence = existence
     _hide(tracks, site)
-    emerged = [i for i in whose.found if tracks.seen[i] and not was_seen[i]]
-    after_look(memory, {i: float(chances[i]) for i in emerged}, len(known), stamp_ns, site)
+    emerged = {i: float(chances[i]) for i in whose.found if tracks.seen[i] and not was_seen[i]}
+    after_look(memory, emerged, n, stamp_ns, site)
 
 
 class _Found(NamedTuple):
-    """Which entities were found, and by which detections, row by row."""
+    """Which entities were found, by which detections, and the chances that these were theirs, row by row."""
 
     rows: IndexArray
     by: IndexArray
+    chances: FloatArray
     detections: Detections
 
 
@@ -183,9 +178,7 @@ def _born(
         track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
         memory.counts.sighted += 1
         return replace(track, side=site.nearest_side(azimuth_rad), sources=(scan.source,), behind=0.0)
-    track = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
-    memory.history[side].births += 1
-    return replace(track, side=side, came_from=1.0, sources=(scan.source,))
+    return born_hidden(memory, side, existence, stamp_ns, scan.source, site)
 
 
 def _existence(
@@ -215,7 +208,7 @@ def _existence(
 
 
 def _hidden(
-    tracks: Tracks, detected: FloatArray, chances: Sequence[float], scan: Scan, site: SiteGeometry
+    tracks: Tracks, detected: FloatArray, chances: FloatArray, by_radar: bool, street: StreetModel
 ) -> FloatArray:
     r"""Return P(hidden | exists) after the looks of an instant, with the chance c that they detected it.
 
@@ -224,11 +217,10 @@ def _hidden(
     with P(hidden) b before, P(detected | in line of sight) p, and for what is hidden q times as much: a radar
     also finds some of that, by multipath and diffraction.
     """
-    b, q = tracks.behind, site.street.hidden_return if scan.detections.positions else 0.0
+    b, q = tracks.behind, street.hidden_return if by_radar else 0.0
     found = b * q / np.maximum(b * q + 1.0 - b, TINY)
     missed = b / np.maximum(b + (1.0 - b) * (1.0 - detected), TINY)
-    after = np.array(chances) * found + (1.0 - np.array(chances)) * missed
-    return np.where(tracks.detected, after, b)
+    return np.where(tracks.detected, chances * found + (1.0 - chances) * missed, b)
 
 
 def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
@@ -244,10 +236,10 @@ def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
     return np.where(covers, normal_shares(deviations), 0.0)
 
 
-def _told(tracks: Tracks, found: _Found, scan: Scan, most: float) -> FloatArray:
+def _told(tracks: Tracks, found: _Found, source: str, most: float) -> FloatArray:
     """Return the existence after messages."""
     # A sender that lies in one message lies in the next: what a source repeats counts once.
-    news = np.array([scan.source not in tracks.sources[i] for i in found.rows.tolist()], bool)
+    news = np.array([source not in tracks.sources[i] for i in found.rows.tolist()], bool)
     rows, told = found.rows[news], found.detections.existence[found.by[news]]
     odds, before = told / (1.0 - told), np.minimum(tracks.existence[rows], most)
     after = tracks.existence.copy()
@@ -255,83 +247,67 @@ def _told(tracks: Tracks, found: _Found, scan: Scan, most: float) -> FloatArray:
     return after
 
 
-def _move(tracks: Tracks, found: _Found, chances: FloatArray, street: StreetModel) -> None:
+def _move(tracks: Tracks, found: _Found, street: StreetModel) -> None:
     """Update the motion or the place of the found tracks with what was measured of them."""
-    rows, by, detections = found
+    rows, by, chances, detections = found
     placed = tracks.placed[rows] | bool(detections.positions)
     usual = ~placed & tracks.seen[rows] & (detections.moving[by] == tracks.moving[rows])
-    for i, j in zip(rows[~usual].tolist(), by[~usual].tolist(), strict=True):
-        if detections.positions or tracks.placed[i]:
-            tracks.put(i, _placed(tracks, i, detections, j, street.speed_mps))
-        else:
-            tracks.put(i, _motion_at(detections, j, tracks.mean[i], tracks.covariance[i], street))
+    for i, j, has_place in zip(*(column[~usual].tolist() for column in (rows, by, placed)), strict=True):
+        tracks.put(i, (_placed if has_place else _motion_at)(tracks, i, detections, j, street))
     if usual.any():
-        rows, by = rows[usual], by[usual]
+        rows, by, chances = rows[usual], by[usual], chances[usual]
         before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
-        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by], chances[rows])
+        after = update(before, AZIMUTH, detections.azimuth_rad[by], detections.std_rad[by], chances)
         tracks.mean[rows], tracks.covariance[rows] = after.mean, after.covariance
 
 
-def _placed(tracks: Tracks, row: int, detections: Detections, by: int, speed_mps: float) -> CartesianBelief:
+def _placed(
+    tracks: Tracks, row: int, detections: Detections, by: int, street: StreetModel
+) -> CartesianBelief:
     """Return the place of a track after a position, or after a bearing of what has a place."""
     place = tracks.place(row)
-    if not detections.positions:
-        assert place is not None
-        return update_bearing(place, float(detections.azimuth_rad[by]), float(detections.std_rad[by]))
-    position = detections.positions[by]
-    if place is not None:
-        return update_position(place, position)
-    place = at_position(position, speed_mps)
-    if not tracks.seen[row]:
-        return place
-    return update_bearing(place, float(tracks.mean[row, AZIMUTH]), float(tracks.azimuth_std_rad[row]))
+    if place is None:
+        place, (azimuth_rad, *_) = at_position(detections.positions[by], street.speed_mps), tracks.mean[row]
+        return update_bearing(place, azimuth_rad, tracks.azimuth_std_rad[row]) if tracks.seen[row] else place
+    if detections.positions:
+        return update_position(place, detections.positions[by])
+    return update_bearing(place, float(detections.azimuth_rad[by]), float(detections.std_rad[by]))
 
 
-def _motion_at(
-    boxes: Detections, by: int, mean: FloatArray, covariance: FloatArray, street: StreetModel
-) -> MotionBelief:
+def _motion_at(tracks: Tracks, row: int, boxes: Detections, by: int, street: StreetModel) -> MotionBelief:
     """Return the motion belief at a box, with approach rate and range of an earlier belief."""
     moving = boxes.moving[by] > 0.0
     rate_std = _NEW_RATE_STD if moving else _PARKED_RATE_STD
     expected = [boxes.azimuth_rad[by], 0.0, 0.0, math.log(street.range_m)]
     std = [boxes.std_rad[by], rate_std, rate_std, street.range_spread]
     if moving:
-        expected[2:] = mean[RADIAL_RATE:].tolist()
-        std[2:] = np.sqrt(np.diag(covariance)[RADIAL_RATE : LOG_RANGE + 1]).tolist()
+        expected[2:] = tracks.mean[row, RADIAL_RATE:].tolist()
+        std[2:] = np.sqrt(tracks.covariance[row].diagonal()[RADIAL_RATE:]).tolist()
     return MotionBelief.around(expected, std)
 
 
-def _see(
-    tracks: Tracks,
-    found: _Found,
-    chances: FloatArray,
-    scans: Sequence[Scan],
-    stamp_ns: int,
-    site: SiteGeometry,
-) -> None:
+def _see(tracks: Tracks, found: _Found, scans: Sequence[Scan], stamp_ns: int, site: SiteGeometry) -> None:
     """Update the found tracks; those not in view before take their side and class there."""
-    rows, by, detections = found
-    was_seen, gains = tracks.seen[rows].tolist(), (site.street.label_gain, site.street.doubt)
-    tracks.updated_ns[rows] = stamp_ns
-    for i, j, known in zip(rows.tolist(), by.tolist(), was_seen, strict=True):
+    rows, by, chances, detections = found
+    azimuth_rad, moving = detections.azimuth_rad[by], detections.moving[by]
+    gains = site.street.label_gain, site.street.doubt
+    columns = rows, by, chances, tracks.seen[rows], azimuth_rad
+    for i, j, chance, was_seen, at_rad in zip(*(one.tolist() for one in columns), strict=True):
         tracks.sources[i] = merged(tracks.sources[i], scans[0].source)
         if classes := detections.classes[j]:
-            tracks.labels[i] = relabelled(tracks.labels[i], classes, *gains) if known else classes
-    moving = detections.moving[by]
+            tracks.labels[i] = relabelled(tracks.labels[i], classes, *gains) if was_seen else classes
+        if detections.in_sight and not was_seen:
+            tracks.side[i] = site.nearest_side(at_rad)
+            tracks.came_from[i] *= chance
+    tracks.updated_ns[rows] = stamp_ns
     tracks.moving[rows] = np.where(np.isnan(moving), tracks.moving[rows], moving > 0.0)
     if detections.positions:
         tracks.approach_heard[rows] = True  # By the velocity of its position
     else:
         tracks.width_rad[rows] = detections.width_rad[by]
-    if not detections.in_sight:
-        return
-    azimuth_rad = detections.azimuth_rad[by]
-    for at, i in enumerate(rows.tolist()):
-        if not was_seen[at]:
-            tracks.side[i] = site.nearest_side(float(azimuth_rad[at]))
-            tracks.came_from[i] *= chances[i]
-    tracks.seen[rows], tracks.last_seen_ns[rows], tracks.answer[rows] = True, stamp_ns, "visible"
-    tracks.miss_rate[rows] = miss_rates(scans, azimuth_rad)
+    if detections.in_sight:
+        tracks.seen[rows], tracks.last_seen_ns[rows], tracks.answer[rows] = True, stamp_ns, "visible"
+        tracks.miss_rate[rows] = miss_rates(scans, azimuth_rad)
 
 
 def _hide(tracks: Tracks, site: SiteGeometry) -> None:
@@ -358,15 +334,13 @@ def _miss(memory: Memory, rows: IndexArray, scans: Sequence[Scan], asked: CoEvid
         holds = detected & within & ~left
         rates[left] = math.nan
     absent = ~np.isnan(rates)
-    tracks.answer[rows[absent]], tracks.miss_rate[rows[absent]] = "absent", rates[absent]
-    unasked = rows[~absent & ~holds]
-    tracks.answer[unasked], tracks.miss_rate[unasked] = "unqueried", math.nan
+    rows, rates, absent = (one[absent | ~holds] for one in (rows, rates, absent))
+    tracks.answer[rows], tracks.miss_rate[rows] = np.where(absent, "absent", "unqueried"), rates
 
 
 def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
     """Return where cameras with a sector of their own looked in the last second."""
-    if not any(one.names_sector for one in scans):
-        return []
-    recent = (one for one in memory.looks.values() if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
+    looks = memory.looks.values() if any(one.names_sector for one in scans) else ()
+    recent = (one for one in looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
     asked = (one for one in recent if not isinstance(one.answer, Unqueried))
     return [Sector.between(*one.sector_rad) for one in asked if one.sector_rad is not None]

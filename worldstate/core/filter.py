@@ -11,17 +11,17 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds
 from worldstate.ground.serialisation import Layout, decode, encode
-from worldstate.measurement import Measurement, Odometry, PositionScan, Sighting
+from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 from worldstate.state.world_state import judged
 
 from .birth_death import events_between, published
 from .budget_watch import SLACK_NS
-from .cues import cues_of
+from .cues import SideAlarms
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import MOST_BOXES, NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
-from .site_model import FilterModel, from_here, published_belief, site_geometry_of
+from .site_model import FilterModel, from_here, site_geometry_of
 from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
 from .step import advanced, take_in
 
@@ -88,7 +88,7 @@ class WorldFilter:
     @property
     def belief(self) -> SideBelief:
         """What is believed of the sides, of which the snapshot states marginals."""
-        return published_belief(self._memory, from_here(self._model, self._memory.ego))
+        return SideAlarms(self._memory, from_here(self._model, self._memory.ego)).sides
 
     @property
     def risk(self) -> float:
@@ -110,7 +110,7 @@ class WorldFilter:
             entities=entities_of(tracks, memory, model.site),
             relations=memory.relations if is_fresh else relations_at(memory, tracks, model),
             context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
-            cues=cues_of(memory, model, sensors),
+            cues=SideAlarms(memory, model).cues(sensors),
             calibrated=self.policy.alpha > 0.0,
             bearing=last.bearing,
             domain=last.domain,
@@ -172,9 +172,7 @@ class WorldFilter:
             is built.
         """
         # Before anything is computed: a measurement that is refused leaves the filter as it was.
-        measurement, left_out = _fitting(measurement, self.context), 0
-        if isinstance(measurement, Measurement):
-            measurement, left_out = _counting_boxes(measurement)
+        measurement, left_out = _fitting(measurement, self.context)
         lag = self._lag.add(measurement, self.stamp_ns, self._step)
         if lag is None:
             return self._begun_anew(measurement)
@@ -183,7 +181,7 @@ class WorldFilter:
             steps = (*(one.before for one in lag.arrivals), lag.latest)
             known, now = (published(one.latest.tracks, self.settings.street) for one in (self._lag, lag))
             lag.latest.last.events = events_between(known, now, steps)
-            lag = lag.counted(boxes_left_out=left_out)
+            lag = lag.counted(boxes_left_out=left_out) if left_out else lag
         world = self._with(lag.latest, lag)
         return world if self.stamp_ns <= world.stamp_ns + SLACK_NS else world.predict_to(self.stamp_ns)
 
@@ -193,12 +191,11 @@ class WorldFilter:
 
     def _step(self, memory: Memory, measurement: Timed) -> Memory:
         """Return the memory after one more measurement, not earlier than the last one."""
-        if memory is self._lag.latest and measurement.stamp_ns == self.stamp_ns:
-            draft = self._memory.draft()  # It was predicted there before
-        elif measurement.stamp_ns > memory.stamp_ns:
-            draft = advanced(memory, measurement.stamp_ns, self._model)
-        else:  # Within the slack the belief is not moved back
-            draft = memory.draft()
+        is_predicted = memory is self._lag.latest and measurement.stamp_ns == self.stamp_ns
+        latest = self._memory if is_predicted else memory
+        # Within the slack the belief is not moved back.
+        is_later = measurement.stamp_ns > latest.stamp_ns
+        draft = advanced(latest, measurement.stamp_ns, self._model) if is_later else latest.draft()
         take_in(memory, draft, measurement, self.start_ns, self._model)
         return draft
 
@@ -209,12 +206,10 @@ class WorldFilter:
         return world
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
-        delivery = self._lag.delivery
         fresh = first_memory(self.context, self.settings, measurement.stamp_ns)
         fresh.counts.left_out = self._memory.counts.left_out
-        counted = replace(delivery, reanchored=delivery.reanchored + 1)
-        world = replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=FixedLag(fresh, (), counted))
-        return world.update(measurement)
+        lag = FixedLag(fresh, (), self._lag.counted(reanchored=1).delivery)
+        return replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=lag).update(measurement)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a checkpoint as JSON-able values: what is read back continues bit for bit.
@@ -225,15 +220,8 @@ class WorldFilter:
         >>> WorldFilter.from_dict(world.to_dict()).state == world.state
         True
         """
-        lag = self._lag
-        past = LagRecord(
-            stamp_ns=self.stamp_ns,
-            base=lag.base,
-            measurements=tuple(one.measurement for one in lag.arrivals),
-            delivery=lag.delivery,
-            late_since_ns=lag.late_since_ns,
-            held=lag.held,
-        )
+        lag, measurements = self._lag, tuple(one.measurement for one in self._lag.arrivals)
+        past = LagRecord(self.stamp_ns, lag.base, measurements, lag.delivery, lag.late_since_ns, lag.held)
         # What was predicted since the last measurement is predicted again.
         return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, lag.latest, past))
 
@@ -281,40 +269,36 @@ class FilterRecord:
     past: LagRecord
 
     def __post_init__(self) -> None:
-        for memory in (self.memory, self.past.base):
-            self._check(memory)
-
-    def _check(self, memory: Memory) -> None:
         k = len(self.context.directions)
-        memory.belief.check(k)
-        if len(memory.history) != k or max(memory.tracks.side.tolist(), default=0) >= k:
-            raise InvalidArgumentError("memory: expected known sides")
+        for memory in (self.memory, self.past.base):
+            memory.belief.check(k)
+            if len(memory.history) != k or max(memory.tracks.side.tolist(), default=0) >= k:
+                raise InvalidArgumentError("memory: expected known sides")
 
 
-def _counting_boxes(measurement: Measurement) -> tuple[Measurement, int]:
-    """Return a measurement with the boxes of each image that count, and the number of the others."""
-    every = (measurement.sightings, *(one.sightings for one in measurement.further))
-    left_out = sum(max(len(boxes) - MOST_BOXES, 0) for boxes in every)
-    if not left_out:
-        return measurement, 0
-    further = tuple(replace(one, sightings=_counting(one.sightings)) for one in measurement.further)
-    return replace(measurement, sightings=_counting(measurement.sightings), further=further), left_out
+def _fitting(measurement: object, context: Context) -> tuple[Timed, int]:
+    """Return a measurement at the time it was taken, with the boxes that count, and how many do not.
 
-
-def _counting(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
-    """Return the moving ones and those of the highest score, however a detector lists them."""
-    return tuple(sorted(sightings, key=lambda one: (not one.moving, -one.score, BY_ALL(one)))[:MOST_BOXES])
-
-
-def _fitting(measurement: object, context: Context) -> Timed:
-    """Return a measurement at the time it was taken; refuse one that does not fit the context."""
+    One that does not fit the context is refused.
+    """
     if isinstance(measurement, PositionScan):
-        return replace(measurement, stamp_ns=measurement.observed_ns, latency_s=0.0)
+        return replace(measurement, stamp_ns=measurement.observed_ns, latency_s=0.0), 0
     if isinstance(measurement, Odometry):
-        return measurement
+        return measurement, 0
     if not isinstance(measurement, Measurement):
         raise InvalidArgumentError(f"measurement: expected a Measurement, got {type(measurement).__name__}")
     expected, got = context.directions, measurement.signature.directions
     if not set(got) & set(expected):
         raise InvalidArgumentError(f"signature: expected one of the directions {expected}, got {got}")
-    return measurement
+    every = (measurement.sightings, *(one.sightings for one in measurement.further))
+    left_out = sum(max(len(boxes) - MOST_BOXES, 0) for boxes in every)
+    if left_out:
+        first, *others = (tuple(sorted(boxes, key=_first_counting)[:MOST_BOXES]) for boxes in every)
+        further = map(CameraLook, (one.look for one in measurement.further), others)
+        measurement = replace(measurement, sightings=first, further=tuple(further))
+    return measurement, left_out
+
+
+def _first_counting(one: Sighting) -> tuple[object, ...]:
+    """Return what boxes count by: moving ones and high scores first, however a detector lists them."""
+    return not one.moving, -one.score, BY_ALL(one)

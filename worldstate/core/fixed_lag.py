@@ -5,9 +5,10 @@ and those after it once more. One that was delivered before is dropped, one olde
 that is ahead of all others by more than the lag waits until another one confirms its stamp.
 """
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from operator import attrgetter
 from typing import TypeAlias
 
@@ -61,7 +62,10 @@ class FixedLag:
         if any(_delivery(one) == _delivery(measurement) for one in (*self._at(stamp_ns), held) if one):
             return self.counted(repeated=1)
         if stamp_ns < max(self.latest.stamp_ns - LAG_NS, self.base.stamp_ns):
-            return self._too_late(stamp_ns)
+            since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
+            if stamp_ns - since_ns >= REANCHOR_NS:
+                return None
+            return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
         if held is not None and self._agree(held.stamp_ns, stamp_ns):
             first, second = sorted((held, measurement), key=attrgetter("stamp_ns"))
             return replace(self.counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
@@ -91,31 +95,21 @@ class FixedLag:
         at = bisect_left(self.arrivals, measurement.stamp_ns, key=_STAMP_NS)
         at += sum(_content(one) < _content(measurement) for one in same)
         memory = self.arrivals[at].before if at < len(self.arrivals) else self.latest
-        kept = list(self.arrivals[:at])
-        for one in (measurement, *(later.measurement for later in self.arrivals[at:])):
-            kept.append(Arrival(one, memory))
-            memory = step(memory, one)
+        again = (measurement, *(later.measurement for later in self.arrivals[at:]))
+        *befores, memory = accumulate(again, step, initial=memory)
+        kept = [*self.arrivals[:at], *map(Arrival, again, befores)]
         oldest = bisect_left(kept, memory.stamp_ns - LAG_NS, key=_STAMP_NS)
         counted = self.counted(replayed=1) if measurement.stamp_ns < self.latest.stamp_ns else self
         return replace(counted, latest=memory, arrivals=tuple(kept[oldest:]), late_since_ns=None)
 
     def _at(self, stamp_ns: int) -> list[Timed]:
         """Return what was taken of one instant, in its order."""
-        if not self.arrivals or stamp_ns > self.arrivals[-1].measurement.stamp_ns:
-            return []
-        first, end = (side(self.arrivals, stamp_ns, key=_STAMP_NS) for side in (bisect_left, bisect_right))
-        return [one.measurement for one in self.arrivals[first:end]]
+        return [one.measurement for one in self.arrivals if one.measurement.stamp_ns == stamp_ns]
 
     def counted(self, **more: int) -> "FixedLag":
         """Return the buffer with some counts of its delivery raised."""
         counts = {name: getattr(self.delivery, name) + number for name, number in more.items()}
         return replace(self, delivery=replace(self.delivery, **counts))
-
-    def _too_late(self, stamp_ns: int) -> "FixedLag | None":
-        since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
-        if stamp_ns - since_ns >= REANCHOR_NS:
-            return None
-        return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
 
 
 _STAMP_NS = attrgetter("measurement.stamp_ns")
@@ -125,10 +119,9 @@ _delivery = attrgetter("stamp_ns", "source")
 
 def _content(measurement: Timed) -> tuple[int, str]:
     """Return what measurements of one instant are in order of: their kind, and all of them but names."""
-    if isinstance(measurement, Odometry):
-        return 0, str(encode(replace(measurement, source="-")))
-    if isinstance(measurement, PositionScan):
-        return 2 + (measurement.searched is None), str(encode(replace(measurement, source="-")))
+    if not isinstance(measurement, Measurement):
+        order = 0 if isinstance(measurement, Odometry) else 2 + (measurement.searched is None)
+        return order, str(encode(replace(measurement, source="-")))
     looks = sorted(str(encode(replace(one, look=replace(one.look, sensor="-")))) for one in measurement.looks)
     return 1, str((looks, encode(replace(measurement, source="-", look=None, sightings=(), further=()))))
 
@@ -147,8 +140,6 @@ class LagRecord:
 
 def restored(latest: Memory, past: LagRecord, step: Step) -> FixedLag:
     """Return the buffer of a checkpoint, with the memory before each of its measurements computed anew."""
-    arrivals, memory = list[Arrival](), past.base
-    for one in past.measurements:
-        arrivals.append(Arrival(one, memory))
-        memory = step(memory, one)
-    return FixedLag(latest, tuple(arrivals), past.delivery, past.late_since_ns, past.held)
+    befores = accumulate(past.measurements, step, initial=past.base)
+    arrivals = tuple(map(Arrival, past.measurements, befores))
+    return FixedLag(latest, arrivals, past.delivery, past.late_since_ns, past.held)

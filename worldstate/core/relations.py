@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from worldstate.state.entity import EGO
 
 from .memory import Memory
 from .site_model import FilterModel
+from .street_belief import StreetBelief
 
 _HOLDS = 0.5  # The probability from which on a relation is said to hold
 _KEPT_NS = nanoseconds(LONGEST_S)  # Of a relation that has ended
@@ -24,6 +26,7 @@ _KEPT_NS = nanoseconds(LONGEST_S)  # Of a relation that has ended
 _HALF_LANE_M, _LEAST_SPEED_MPS = 1.6, 1.5
 _ALIKE = 0.5  # Cosine of headings in one lane: within 60 degrees
 _LEAST = 0.05  # What is less likely is not named
+Edge: TypeAlias = tuple[str, str, str, float]  # From what to what, its kind, and P(it holds)
 
 
 def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Relation, ...]:
@@ -35,17 +38,16 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
         return ()
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
     some = tracks.taken(related).rows()
-    edges = [one for track in some for one in _edges(track, memory, model)]
+    edges = [one for track in some for one in _edges(track, memory.belief, model)]
     known_m = model.site.street.known_m
     placed = [one for one in some if one.place and one.place.position_std_m < known_m]
     if placed:
-        edges += _between(placed, memory.stamp_ns, model.context)
-    edges += _hiding(tracks, memory.stamp_ns, model)
-    now = {(one.src, one.dst, one.kind): one for one in edges}
+        edges += (edge for edge in _between(placed, model.context) if edge[-1] >= _LEAST)
+    edges += _hiding(tracks, model)
+    now = {edge[:-1]: edge[-1] for edge in edges}
     names = {*tracks.id, *(one.id for one in model.context.occluders), EGO}
-    ended = [key for key in before if key not in now and names.issuperset(key[:2])]
-    now |= {key: Relation(*key, 0.0, memory.stamp_ns) for key in ended}
-    held = (_held(edge, before.get(key)) for key, edge in now.items())
+    now |= {key: 0.0 for key in before if key not in now and names.issuperset(key[:2])}
+    held = (_held(Relation(*key, chance, memory.stamp_ns), before.get(key)) for key, chance in now.items())
     return tuple(edge for edge in held if edge.probability or edge.until_ns is not None)
 
 
@@ -60,48 +62,42 @@ def _held(edge: Relation, before: Relation | None) -> Relation:
     return replace(edge, since_ns=before.since_ns, until_ns=until_ns) if is_kept else edge
 
 
-def _edges(track: Track, memory: Memory, model: FilterModel) -> Iterator[Relation]:
+def _edges(track: Track, belief: StreetBelief, model: FilterModel) -> Iterator[Edge]:
     """Yield the relations of one entity to its occluder and to the ego vehicle."""
-    occluders, stamp_ns, share = model.context.occluders, memory.stamp_ns, track.behind
+    occluders = model.context.occluders
     if not track.seen:
         for k, weight in enumerate(side_weights(track, len(occluders))):
             if weight > 0.0:
-                one, hidden = occluders[k], share * weight
-                comes = hidden * _comes(track, k, memory, model)
-                yield Relation(track.id, one.id, "occluded_by", hidden, stamp_ns)
-                yield Relation(track.id, one.id, "approaching_from", comes, stamp_ns)
-    elif track.came_from >= _LEAST and share < _HOLDS:
-        yield Relation(track.id, occluders[track.side].id, "emerged_from", track.came_from, stamp_ns)
+                hidden = track.behind * weight
+                yield track.id, occluders[k].id, "occluded_by", hidden
+                yield track.id, occluders[k].id, "approaching_from", hidden * _comes(track, k, belief, model)
+    elif track.came_from >= _LEAST and track.behind < _HOLDS:
+        yield track.id, occluders[track.side].id, "emerged_from", track.came_from
     if track.approach_heard:
         deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
-        yield Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns)
+        yield track.id, EGO, "approaching", normal_share(deviations)
 
 
-def _hiding(tracks: Tracks, stamp_ns: int, model: FilterModel) -> Iterator[Relation]:
+def _hiding(tracks: Tracks, model: FilterModel) -> Iterator[Edge]:
     """Yield which corners and entities hide those that were in view before."""
     rows = np.flatnonzero(tracks.seen & (tracks.behind >= _LEAST))
     if len(rows):
-        by, names = (
-            occluded(tracks, model.site)[rows],
-            [*(one.id for one in model.context.occluders), *tracks.id],
-        )
+        names = [*(one.id for one in model.context.occluders), *tracks.id]
+        by = occluded(tracks, model.site)[rows]
         chances = tracks.behind[rows, None] * by / np.maximum(by.sum(axis=1, keepdims=True), _LEAST)
         for i, k in zip(*np.nonzero(chances >= _LEAST), strict=True):
-            chance = min(float(chances[i, k]), 1.0)
-            yield Relation(tracks.id[rows[i]], names[k], "occluded_by", chance, stamp_ns)
+            yield tracks.id[rows[i]], names[k], "occluded_by", min(float(chances[i, k]), 1.0)
 
 
-def _comes(track: Track, side: int, memory: Memory, model: FilterModel) -> float:
+def _comes(track: Track, side: int, belief: StreetBelief, model: FilterModel) -> float:
     """Return P(it comes into view from there within five seconds | hidden), by its place or the sound."""
     if track.place is not None:
         return float(time_to_visible(track.place, model.site.sides[side], model.site, LONGEST_S)[0])
-    if not memory.belief.has_times:
-        return 1.0
-    coming = memory.belief.coming[side]
-    return float(coming[:STATED].sum() / max(coming.sum(), TINY))
+    coming = belief.coming[side]
+    return float(coming[:STATED].sum() / max(coming.sum(), TINY)) if belief.has_times else 1.0
 
 
-def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterator[Relation]:
+def _between(tracks: Sequence[Track], context: Context) -> Iterator[Edge]:
     r"""Yield which entity is next ahead of which in a lane, and which will cross the path of the ego vehicle.
 
     With the heading u of b, its normal n and the offset d from b to a,
@@ -109,8 +105,7 @@ def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterat
     .. math:: P(\text{one lane}) = P(|n \cdot d| \le w / 2), \qquad
               P(\text{in front}) = P(\text{one lane})\, P(u \cdot d > 0)
     """
-    ids = [*(one.id for one in tracks), EGO]
-    places = [one.place for one in tracks if one.place]
+    ids, places = [*(one.id for one in tracks), EGO], [one.place for one in tracks if one.place]
     mean = np.array([*(one.mean for one in places), np.zeros_like(places[0].mean)])
     covariance = np.array([*(one.covariance for one in places), np.zeros_like(places[0].covariance)])
     speed = np.hypot(*mean[:, 2:].T)
@@ -133,13 +128,10 @@ def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterat
         left, right = (normal_share((end_m - aside) / std_m) for end_m in (_HALF_LANE_M, -_HALF_LANE_M))
         lane = left - right
         ahead = lane * normal_share(float(along[a, b]) / math.sqrt(along_var[a, b]))
-        for kind, chance in (("same_lane", lane), ("in_front_of", ahead)):
-            if chance >= _LEAST:
-                yield Relation(ids[a], ids[b], kind, chance, stamp_ns)
+        yield ids[a], ids[b], "same_lane", lane
+        yield ids[a], ids[b], "in_front_of", ahead
     for track in tracks:
-        chance = _crosses(track, context.ego_speed_mps or 0.0)
-        if chance >= _LEAST:
-            yield Relation(track.id, EGO, "conflicts_with_ego_path", chance, stamp_ns)
+        yield track.id, EGO, "conflicts_with_ego_path", _crosses(track, context.ego_speed_mps or 0.0)
 
 
 def _crosses(track: Track, ego_speed_mps: float) -> float:

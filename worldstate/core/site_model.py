@@ -3,22 +3,14 @@
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import MOST_NATS
-from worldstate.belief.hidden_bearing import announced
 from worldstate.belief.kinematics.cartesian import EgoBelief
-from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.ground import TINY
 from worldstate.measurement import Measurement
 from worldstate.state import Context
 from worldstate.state.context import seen_from
-
-from .memory import Memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,27 +69,3 @@ def without_open_sides(measurement: Measurement, context: Context) -> Measuremen
     pairs = zip(said.directions, said.hidden, strict=True)
     hidden = tuple(-MOST_NATS if side in is_open else nats for side, nats in pairs)
     return replace(measurement, signature=replace(said, hidden=hidden))
-
-
-def published_belief(memory: Memory, model: FilterModel) -> SideBelief:
-    r"""Return the belief of the sides as it is published: with the policy's calibration, messages and tracks.
-
-    .. math:: r_k = \min\big(P(hid),\ g(P(hid))\big)\, P(k \mid hid)
-
-    without a sequence model, whose probabilities are calibrated: of what is hidden at most all comes into
-    view, so that the calibrated map g of the policy can only lower it. It is a map of what windows heard:
-    before the first one the risk is that of the prior, or an array that hears nothing would report a street
-    quieter than any.
-    """
-    sides = memory.sides
-    if memory.belief.read_ns and not memory.belief.has_times:
-        hidden = sides.hypotheses[0]
-        risk = min(float(model.policy.risk_map(hidden)), hidden)
-        # The floor only matters where P(hidden) has underflowed; then no direction has a share.
-        share = risk / max(hidden, TINY)
-        sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
-    tracks = memory.tracks
-    # What drives behind the ego explains nothing of what is ahead.
-    ahead = tracks.seen & tracks.moving & (np.cos(tracks.mean[:, AZIMUTH]) > 0.0)
-    unseen = 1.0 - tracks.existence[ahead] * (1.0 - tracks.behind[ahead])
-    return sides.at_least(announced(tracks, model.site)).beside(float(unseen.prod()))

@@ -23,8 +23,7 @@ from worldstate.belief.kinematics.motion import (
     MotionBelief,
     white_acceleration,
 )
-from worldstate.belief.side_belief import SideBelief
-from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import Track, Tracks, acceleration_psd
 from worldstate.ground import seconds
 from worldstate.state import Classification, Context, Entity, Hearing, SearchedView, SensorHealth, Visibility
@@ -42,6 +41,8 @@ _AFTER_S = np.array([1.0, 2.0])
 _CUBES = np.array([white_acceleration(after_s)[0, 0] for after_s in _AFTER_S])
 _SOONER, _LATER = (f"{after_s:g}" for after_s in _AFTER_S)
 Forecast: TypeAlias = dict[str, tuple[float, float]]
+# Mean and deviations of a track's motion, covariance of azimuth and rate, forecast, as Python numbers.
+_Moments: TypeAlias = tuple[list[float], list[float], list[float], Forecast]
 
 
 def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
@@ -67,12 +68,8 @@ def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
     azimuth_rad = theta + np.arctan2(b, a)
     azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
     # Full precision would take twice as long to write.
-    rows = np.stack(
-        [np.clip(azimuth_rad.round(_SHORT), -np.pi, np.pi), np.sqrt(variance).round(_SHORT)], axis=-1
-    )
-    return [
-        {_SOONER: (mean, std), _LATER: (then, then_std)} for (mean, std), (then, then_std) in rows.tolist()
-    ]
+    means, stds = np.clip(azimuth_rad.round(_SHORT), -np.pi, np.pi), np.sqrt(variance).round(_SHORT)
+    return [{_SOONER: (*soon,), _LATER: (*late,)} for soon, late in np.stack([means, stds], axis=-1).tolist()]
 
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
@@ -81,43 +78,37 @@ NINE_OF_TEN = NormalDist().inv_cdf(1.0 - TAIL)  # Standard deviations to either 
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
 
 
-# Mean and deviations of a track's motion, covariance of azimuth and rate, forecast, as Python numbers.
-_Moments: TypeAlias = tuple[list[float], list[float], list[float], Forecast]
-
-
 def entities_of(tracks: Tracks, memory: Memory, site: SiteGeometry) -> tuple[Entity, ...]:
     """Return some tracks as published entities."""
     # All at once: a number taken out of an array by itself costs as much as a row.
     stds = np.sqrt(tracks.covariance.diagonal(axis1=1, axis2=2))
     lists = (array.round(_DIGITS).tolist() for array in (tracks.mean, stds, tracks.covariance[:, *_UPPER]))
     moments = zip(*lists, forecasts(tracks, site), strict=True)
-    build = partial(_entity, memory, memory.sides, site)
-    return tuple(map(build, tracks.rows(), moments))
+    return tuple(map(partial(_entity, memory.belief, site), tracks.rows(), moments))
 
 
-def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track, moments: _Moments) -> Entity:
+def _entity(belief: StreetBelief, site: SiteGeometry, track: Track, moments: _Moments) -> Entity:
     mean, std, (variance, mixed, rate_variance), forecast = moments
-    existence, share = track.existence, track.behind
-    hidden = share >= HIDDEN
+    existence, hidden, side = track.existence, track.behind >= HIDDEN, site.sides[track.side]
     if hidden and track.place is not None and not track.seen:
         # Not combined: what is believed of the side may rest on the same messages.
-        existence = max(existence, sides.hidden[track.side])
+        existence = max(existence, belief.sides.hidden[track.side])
     heard_only = hidden and not track.detected
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
     closing_hz = -mean[RADIAL_RATE] if track.approach_heard else None
     # Rounded up, what stands right behind would be beyond a half turn.
     azimuth_rad, std_rad = min(max(mean[AZIMUTH], -math.pi), math.pi), std[AZIMUTH]
-    source = _azimuth_source(track, track.motion, site)
+    source: AzimuthSource = "measured" if track.detected else _rests_on(track.motion, side)
     if heard_only:
-        azimuth_rad, std_rad, source = hidden_azimuth(track.side, track, memory.belief, site)
+        azimuth_rad, std_rad, source = hidden_azimuth(track.side, track, belief, site)
     return Entity(
         id=track.id,
         status="hidden" if hidden else "visible" if track.seen else "emerged",
         existence_probability=existence,
-        hidden_probability=share * existence,
+        hidden_probability=track.behind * existence,
         classification=_classes(track),
         moving=track.moving,
-        direction=site.sides[track.side].label,
+        direction=side.label,
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
         azimuth_rate_rad_s=None if hidden else mean[AZIMUTH_RATE],
@@ -135,7 +126,7 @@ def _entity(memory: Memory, sides: SideBelief, site: SiteGeometry, track: Track,
         azimuth_covariance=None if heard_only else (variance, mixed, rate_variance),
         forecast=None if heard_only else forecast,
         azimuth_source=source,
-        sides=_side_shares(track, memory, site),
+        sides=_side_shares(track, belief, site),
     )
 
 
@@ -151,11 +142,8 @@ def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
     half_rad = NINE_OF_TEN * std_rad
     if half_rad >= math.pi:
         return -math.pi, math.pi
-    # wrap_angle goes through arrays, which takes ten times as long for one number.
-    right_rad, left_rad = azimuth_rad - half_rad, azimuth_rad + half_rad
-    return round(math.remainder(right_rad, math.tau), _SHORT), round(
-        math.remainder(left_rad, math.tau), _SHORT
-    )
+    right_rad, left_rad = (math.remainder(azimuth_rad + way * half_rad, math.tau) for way in (-1.0, 1.0))
+    return round(right_rad, _SHORT), round(left_rad, _SHORT)
 
 
 def time_to_arrival(closing_hz: float | None, std_hz: float) -> float | None:
@@ -174,31 +162,26 @@ def hidden_azimuth(
         return track.motion.azimuth_rad, track.motion.azimuth_std_rad, "measured"
     if belief.has_times:
         return *hidden_bearing(belief.coming[side], site.sides[side]), "context"
-    heard = track if track is not None and track.side == side else None
-    motion = site.sides[side].prior() if heard is None else heard.motion
-    # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
-    # that.
-    std_rad = math.hypot(motion.azimuth_std_rad, site.sides[side].bias_std_rad)
-    return motion.azimuth_rad, std_rad, _azimuth_source(heard, motion, site)
+    corner = site.sides[side]
+    motion = track.motion if track is not None and track.side == side else corner.prior()
+    # Sound round a corner comes from its edge, not from the vehicle, which averaging over hops leaves.
+    std_rad = math.hypot(motion.azimuth_std_rad, corner.bias_std_rad)
+    return motion.azimuth_rad, std_rad, _rests_on(motion, corner)
 
 
-def _azimuth_source(track: Track | None, motion: MotionBelief, site: SiteGeometry) -> AzimuthSource:
+def _rests_on(motion: MotionBelief, side: SideGeometry) -> AzimuthSource:
     """Return what an azimuth rests on: bearings where they hold more of what is known than the context."""
-    if track is None or track.detected:
-        return "context" if track is None else "measured"
-    context_std = site.sides[track.side].std_rad
-    return "measured" if 2.0 * motion.azimuth_std_rad**2 <= context_std**2 else "context"
+    return "measured" if 2.0 * motion.azimuth_std_rad**2 <= side.std_rad**2 else "context"
 
 
-def _side_shares(track: Track, memory: Memory, site: SiteGeometry) -> tuple[SideShare, ...]:
+def _side_shares(track: Track, belief: StreetBelief, site: SiteGeometry) -> tuple[SideShare, ...]:
     """Return the parts of the azimuth density of an entity that may be on several sides."""
-    if track.detected:
-        return ()
-    shares = {k: share for k, share in enumerate(track.side_shares) if share > 0.0}
-    if len(shares) < 2:
-        return ()
-    at = {k: hidden_azimuth(k, track, memory.belief, site)[:2] for k in shares}
-    return tuple(SideShare(site.sides[k].label, round(share, _DIGITS), *at[k]) for k, share in shares.items())
+    shares = [] if track.detected else [(k, share) for k, share in enumerate(track.side_shares) if share]
+    return tuple(
+        SideShare(site.sides[k].label, round(share, _DIGITS), *hidden_azimuth(k, track, belief, site)[:2])
+        for k, share in shares
+        if len(shares) > 1
+    )
 
 
 def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
@@ -225,21 +208,17 @@ def ego_of(ego: EgoBelief) -> Ego:
 
 def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
     """Return how every sensor is that spoke or looked."""
-    spoke = {name: (one.stamp_ns, one.fault) for name, one in memory.sources.items()}
-    looked = {name: (look.stamp_ns, _look_fault(look)) for name, look in memory.looks.items()}
-    told = sorted((looked | spoke).items())
-    return tuple(_health(name, ns, fault, memory.stamp_ns) for name, (ns, fault) in told)
+    last = {name: (look.stamp_ns, _look_fault(look)) for name, look in memory.looks.items()}
+    last |= {name: (one.stamp_ns, one.fault) for name, one in memory.sources.items()}
+    return tuple(_health(name, *last[name], memory.stamp_ns) for name in sorted(last))
 
 
 def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
     """Return how well every source that listens could hear; of one that is silent nothing is known."""
     listening = [(name, one) for name, one in sorted(memory.sources.items()) if one.heard.measured]
-    told = tuple(
-        Hearing(name, one.heard.share, one.heard_ns, one.heard.reason)
-        for name, one in listening
-        if memory.stamp_ns <= one.stamp_ns + NEWS_HOLDS_NS
-    )
-    return told if listening else None
+    told = [pair for pair in listening if memory.stamp_ns <= pair[1].stamp_ns + NEWS_HOLDS_NS]
+    every = tuple(Hearing(name, one.heard.share, one.heard_ns, one.heard.reason) for name, one in told)
+    return every if listening else None
 
 
 def _health(sensor: str, stamp_ns: int, fault: str | None, now_ns: int) -> SensorHealth:
@@ -250,10 +229,8 @@ def _health(sensor: str, stamp_ns: int, fault: str | None, now_ns: int) -> Senso
 
 def _look_fault(look: CountedLook) -> str | None:
     answer = look.answer
-    if look.fault is not None:
+    if look.fault is not None or isinstance(answer, Unqueried) or answer.miss_rate < MOSTLY_MISSED:
         return look.fault
-    if isinstance(answer, Unqueried) or answer.miss_rate < MOSTLY_MISSED:
-        return None
     return f"misses {answer.miss_rate:.0%} of what is in view"
 
 

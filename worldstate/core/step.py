@@ -8,7 +8,6 @@ from worldstate.belief.kinematics.cartesian import corrected, driven
 from worldstate.belief.track import Tracks, predict_tracks, turn
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
-from worldstate.state import Event
 
 from .acoustic_update import acoustic_update
 from .birth_death import (
@@ -22,7 +21,7 @@ from .birth_death import (
     surviving,
     view_heard,
 )
-from .cues import SideAdvisory, advisories, note_announced, note_source
+from .cues import SideAlarms, note_source
 from .detection_update import new_looks, update_looks, update_positions
 from .fixed_lag import Timed
 from .memory import CountedLook, Memory
@@ -54,7 +53,7 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
 
 def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
     """Update the memory after announced entities have come past their edge, or their place was lost."""
-    tracks, emerged, gone = memory.tracks, list[int](), list[int]()
+    tracks, street, emerged, gone = memory.tracks, model.site.street, list[int](), list[int]()
     now = {name: row for row, name in enumerate(tracks.id)}
     # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
     heard = [chance >= HIDDEN for chance in memory.sides.hidden]
@@ -63,53 +62,59 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
         if before.behind[old] >= 0.5 > tracks.behind[row]:
             emerged.append(side)
         only_heard = np.flatnonzero(~tracks.detected & (tracks.side == side)).tolist()
-        others = [one for one in only_heard if one not in gone]
+        others = set(only_heard).difference(gone)
         if row in others and (len(others) > 1 or not heard[side]):
             gone.append(row)
     memory.tracks = tracks.without(gone)
-    past_edges(
-        memory, dict.fromkeys(emerged, model.site.street.unheard), (), memory.stamp_ns, model.site.street
-    )
+    past_edges(memory, dict.fromkeys(emerged, street.unheard), set(), memory.stamp_ns, street)
 
 
 def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
-    """Update a draft with a measurement of its time; `before` is what it was drafted from.
-
-    An advisory that had ended when the draft was carried to its time begins anew.
-    """
+    """Update a draft with a measurement of its time; `before` is what it was drafted from."""
     model = from_here(model, memory.ego)
-    was_advised = any(one.advised_ns is not None for one in before.history)
-    held = advisories(memory, model) if was_advised else (None,) * len(before.history)
+    stood = _standing(before, memory, model)
+    _perceive(memory, measurement, start_ns, model)
+    emerged = _announced_in_view(before, memory)
+    if emerged:
+        memory.belief = memory.belief.not_held(emerged, model.policy, model.site.street)
+    alarms = SideAlarms(memory, model)
+    alarms.note_announced()
+    stands = [one is not None for one in alarms.advisories]
+    if isinstance(measurement, Measurement):
+        birth_death(memory, stands, measurement, model.site)
+    _keep_likeliest(memory)
+    _note_advisories(memory, [one and k not in emerged for k, one in enumerate(stood)], stands)
+    memory.last.events = merge_tracks(memory, model.site)
+    memory.relations = relations_at(memory, published(memory.tracks, model.site.street), model)
+
+
+def _standing(before: Memory, memory: Memory, model: FilterModel) -> list[bool]:
+    """Return on which sides an advisory stands before a measurement counts.
+
+    One that had ended when the draft was carried to this time begins anew.
+    """
+    stood = [one.advised_ns is not None for one in before.history]
+    return [one is not None for one in SideAlarms(memory, model).advisories] if any(stood) else stood
+
+
+def _perceive(memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
+    """Update a draft with odometry, with positions, or with what is heard and seen."""
     memory.counts.measurements += 1
     if isinstance(measurement, Odometry):
         _take_odometry(memory, measurement)
     elif isinstance(measurement, PositionScan):
         update_positions(memory, measurement, model)
     else:
-        measurement = without_open_sides(measurement, model.context)
-        _perceive(memory, measurement, start_ns, model)
-    gone = _announced_in_view(before, memory)
-    if gone:
-        memory.belief = memory.belief.not_held(gone, model.policy, model.site.street)
-    note_announced(memory, model)
-    named = advisories(memory, model)
-    if isinstance(measurement, Measurement):
-        birth_death(memory, [one is not None for one in named], measurement, model.site)
-    _keep_likeliest(memory)
-    _note_advisories(memory, [None if k in gone else one for k, one in enumerate(held)], named)
-    merged = merge_tracks(memory, model.site).items()
-    memory.last.events = tuple(Event(memory.stamp_ns, "merged", name, into) for name, into in merged)
-    memory.relations = relations_at(memory, published(memory.tracks, model.site.street), model)
+        _hear_and_look(memory, without_open_sides(measurement, model.context), start_ns, model)
 
 
-def _perceive(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
-    """Update a draft with a measurement's signature, its looks and its sequence."""
-    last = memory.sources.get(measurement.source)
+def _hear_and_look(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
+    last, site = memory.sources.get(measurement.source), model.site
     since_ns = measurement.stamp_ns - (start_ns if last is None else last.stamp_ns)
-    measurement, looks = new_looks(memory, measurement, start_ns, model.site.settings)
     # Of windows that overlap, what is new counts.
-    weight = min(max(seconds(since_ns), 0.0) / model.site.settings.window_s, 1.0)
-    acoustic_update(memory, measurement, weight, model.site)
+    weight = min(max(seconds(since_ns), 0.0) / site.settings.window_s, 1.0)
+    measurement, looks = new_looks(memory, measurement, start_ns, site.street)
+    acoustic_update(memory, measurement, weight, site)
     update_looks(memory, measurement, looks, model)
     note_source(memory, measurement, model)
     update_belief(memory, measurement, [seen for seen, _ in looks], model)
@@ -145,12 +150,10 @@ def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
     return [k for k, row in enumerate(told) if row is not None and before.tracks.id[row] in seen]
 
 
-def _note_advisories(
-    memory: Memory, held: Sequence[SideAdvisory | None], named: Sequence[SideAdvisory | None]
-) -> None:
+def _note_advisories(memory: Memory, stood: Sequence[bool], stands: Sequence[bool]) -> None:
     """Note since when an advisory has been out on each side."""
-    for side, old, new in zip(memory.history, held, named, strict=True):
-        if new is None:
+    for side, was_out, is_out in zip(memory.history, stood, stands, strict=True):
+        if not is_out:
             side.advised_ns = None
-        elif old is None or side.advised_ns is None:
+        elif not was_out or side.advised_ns is None:
             side.advised_ns = memory.stamp_ns

@@ -157,7 +157,7 @@ def named(name: str, value: object) -> None:
 def check_fields(instance: object, **expected: Any) -> None:
     """Refuse a field of a frozen dataclass that is not as expected: a type, or the ends of a number's range.
 
-    Numbers and what numpy has of them become Python's own.
+    Numbers and what numpy has of them become Python's own; None is as expected if the range ends with it.
 
     Examples
     --------
@@ -176,7 +176,8 @@ def check_fields(instance: object, **expected: Any) -> None:
             value = value.item()
             object.__setattr__(instance, name, value)
         if is_range:
-            object.__setattr__(instance, name, in_range(name, value, *wanted))
+            if value is not None or wanted[-1] is not None:
+                object.__setattr__(instance, name, in_range(name, value, *wanted[:2]))
         elif not isinstance(value, wanted):
             raise InvalidArgumentError(f"{name}: expected {_called(wanted)}, got {_shown(value)}")
 

@@ -5,13 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
-import numpy as np
-
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.checks import all_of, check_fields, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
-_LEAST_STD_RAD, _FASTEST = 1e-4, 100.0  # The second in Hz or m/s
+_LEAST_STD_RAD, _FASTEST, _FARTHEST_M = 1e-4, 100.0, 1e6  # The second in Hz or m/s
 
 _AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (math.ulp(0.0), math.pi)
 _OCCLUDER = {
@@ -24,8 +22,8 @@ _OCCLUDER = {
     "pace_hz": (math.ulp(0.0), _FASTEST),
     "assumed": bool,
     "hides": bool,
+    "crossing_m": (0.0, 2.0 * _FARTHEST_M, None),
 }
-_FARTHEST_M = 1e6
 _PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: a vehicle that comes past it is in view
 
 
@@ -84,10 +82,8 @@ class Rates:
         """
         arrival_hz = sides * self.arrival_hz
         # Each state's weight is the sum over the ways that lead into it from both others.
-        leaves_hidden, leaves_visible = (
-            self.emergence_hz + self.departure_hz,
-            self.reocclusion_hz + self.visible_departure_hz,
-        )
+        leaves_hidden = self.emergence_hz + self.departure_hz
+        leaves_visible = self.reocclusion_hz + self.visible_departure_hz
         hidden = arrival_hz * leaves_visible + self.visible_arrival_hz * self.reocclusion_hz
         visible = arrival_hz * self.emergence_hz + self.visible_arrival_hz * leaves_hidden
         none = leaves_hidden * leaves_visible - self.emergence_hz * self.reocclusion_hz
@@ -123,7 +119,7 @@ class Priors:
 
     def __post_init__(self) -> None:
         values = (self.hidden, self.visible, self.none)
-        if min(values) < 0 or not np.isclose(sum(values), 1.0):
+        if min(values) < 0 or not math.isclose(sum(values), 1.0, rel_tol=1e-5):
             raise InvalidArgumentError(f"priors: expected three probabilities that sum to one, got {values}")
 
 
@@ -180,10 +176,8 @@ class Occluder:
         check_fields(self, **_OCCLUDER)
         if self.corner_m is not None:
             object.__setattr__(self, "corner_m", pair("corner_m", self.corner_m, _FARTHEST_M))
-        if self.crossing_m is not None:
-            check_fields(self, crossing_m=(0.0, 2.0 * _FARTHEST_M))
             # Else an ego vehicle that drives up to the corner would cross the lane before it has passed it.
-            if self.corner_m is not None and self.crossing_m <= max(self.corner_m[0], 0.0):
+            if self.crossing_m is not None and self.crossing_m <= max(self.corner_m[0], 0.0):
                 expected = f"the lane beyond the corner, {self.corner_m[0]} m ahead"
                 raise InvalidArgumentError(f"crossing_m: expected {expected}, got {self.crossing_m}")
 
@@ -393,14 +387,12 @@ class Context:
             if not names or len(set(names)) != len(names):
                 raise InvalidArgumentError(f"occluders: expected different ids and directions, got {names}")
         check_fields(self, rates=Rates, priors=Priors | None, site=str | None, hidden_by_side=Mapping | None)
-        check_fields(self, view_half_angle_rad=(0.0, math.pi))
+        check_fields(self, view_half_angle_rad=(0.0, math.pi), degradation=(0.0, 1.0, None))
+        check_fields(self, ego_speed_mps=(-_FASTEST, _FASTEST, None))
         for side, chance in (self.hidden_by_side or {}).items():
             in_range(f"hidden_by_side[{side!r:.40}]", chance, 0.0, 1.0)
             if side not in self.directions:
                 raise InvalidArgumentError(f"hidden_by_side: expected {self.directions}, got {side!r:.40}")
-        for name, span in (("ego_speed_mps", (-_FASTEST, _FASTEST)), ("degradation", (0.0, 1.0))):
-            if getattr(self, name) is not None:
-                check_fields(self, **{name: span})
 
     @property
     def directions(self) -> tuple[str, ...]:
