@@ -42,7 +42,7 @@ def test_of_peaks_of_which_some_are_anywhere_share_and_spread_are_found(share, s
     rng = np.random.default_rng(seed)
     own = rng.random(4000) < share
     errors = np.where(own, std * rng.standard_normal(4000), rng.uniform(-0.5 * math.pi, 0.5 * math.pi, 4000))
-    assert _mixture(errors, math.pi) == pytest.approx((share, std), rel=0.12)
+    assert _mixture(errors, math.pi)[:2] == pytest.approx((share, std), rel=0.12)
 
 
 @given(st.floats(0.02, 0.3), st.integers(2, 9), st.integers(0, 4))

@@ -85,7 +85,7 @@ def test_the_order_of_arrival_does_not_matter_within_the_lag(seed: int) -> None:
 @settings(max_examples=5)
 def test_events_lead_from_one_snapshot_to_the_next_however_late_their_cause_comes(seed: int) -> None:
     rng, world, counted = np.random.default_rng(seed), WorldFilter(), set()
-    for one in arrived_late(rng, script(rng, 30)):
+    for one in arrived_late(rng, script(rng, 80)):
         before, world = world.state.entities, world.update(one)
         was, now = (
             {one.id: one.status == "visible" for one in many} for many in (before, world.state.entities)

@@ -106,6 +106,7 @@ class StreetModel:
     bearing_s: float = number("bearing_s")
     extent_rad: float = number("extent_rad")
     past_std_rad: float = number("past_std_rad")
+    birth: float = number("birth")
     turn_share: float = number("turn_share")
     excess_low_db: float = number("excess_low_db")
     excess_high_db: float = number("excess_high_db")

@@ -26,7 +26,7 @@ from .memory import MOST_BOXES, Memory
 # After a hand-over no birth on its side: the window still holds the sound from before it.
 _REARM_NS = nanoseconds(1.0)
 _MASKED = 0.5  # Of the existence below which a hidden entity ends, beside a vehicle just come into view
-HIDDEN = 0.5  # Likelier than not: P(hidden | exists) of an entity that is hidden, and P(hidden) of a birth
+HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 # Of two at one place; an entity that is found by itself within it is another one.
 _ALONE_NS = nanoseconds(1.0)
 
@@ -122,7 +122,7 @@ def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry)
 
 def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> int | None:
     """Return the side on which a hidden entity is born, if one is: of one vehicle the likelier one."""
-    tracks, sides, least, every = memory.tracks, memory.sides, HIDDEN, range(len(site.sides))
+    tracks, sides, least, every = memory.tracks, memory.sides, site.street.birth, range(len(site.sides))
     stamps_ns, heard = [one.handover_ns for one in memory.history], _heard_rows(tracks)
     rearmed = [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in stamps_ns]
     taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
@@ -146,7 +146,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> tuple[Event, ...]:
     """
     tracks, stamp_ns, into, ended = memory.tracks, memory.stamp_ns, dict[str, str](), list[int]()
     heard = _heard_rows(tracks)
-    least = HIDDEN * min((tracks.existence[i] for i in heard), default=0.0)
+    least = site.street.birth * min((tracks.existence[i] for i in heard), default=0.0)
     # Beside the less likely one the other one would not be born.
     if len(heard) > 1 and memory.sides.both < least:
         first, second, *_ = sorted(heard, key=lambda i: (-tracks.existence[i], *_age(tracks, i)))

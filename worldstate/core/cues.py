@@ -18,7 +18,7 @@ from worldstate.ground import TINY
 from worldstate.measurement import Measurement
 from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
 
-from .birth_death import HIDDEN, hidden_on
+from .birth_death import hidden_on
 from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceState
 from .side_update import heard_beside
 from .site_model import FilterModel
@@ -195,7 +195,7 @@ class SideAlarms:
     def _why_none(self, side: int) -> str | None:
         """Return why a side of high risk has no advisory; None if it is likelier that none comes."""
         belief = self.memory.belief
-        if self.sides.risks[side] <= HIDDEN:
+        if self.sides.risks[side] <= self.model.site.street.birth:
             return None
         if self.memory.last.no_sequence == TOO_FEW:
             return "less than a second of sound: no alarm is raised yet"

@@ -11,7 +11,6 @@ from worldstate.measurement import Measurement, Odometry, PositionScan
 
 from .acoustic_update import acoustic_update
 from .birth_death import (
-    HIDDEN,
     birth_death,
     hidden_on,
     hidden_rows,
@@ -56,7 +55,7 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
     tracks, street, emerged, gone = memory.tracks, model.site.street, list[int](), list[int]()
     now = {name: row for row, name in enumerate(tracks.id)}
     # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
-    heard = [chance >= HIDDEN for chance in memory.sides.hidden]
+    heard = [chance >= street.birth for chance in memory.sides.hidden]
     for old in np.flatnonzero(before.placed & ~before.seen).tolist():
         row, side = now[before.id[old]], int(before.side[old])
         if before.behind[old] >= 0.5 > tracks.behind[row]:

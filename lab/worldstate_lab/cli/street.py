@@ -14,6 +14,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -49,6 +50,7 @@ STREET, SITE = StreetModel(), site_geometry_of(Context(), FilterSettings())
 _GAP_S = 0.35  # Three images without a box end a track
 _LIKELY, _SLACK_S = 0.5, 1e-3
 _ROUNDS, _VALUES = 100, 61  # Of an expectation-maximization, and of a search
+_LAGS = 11  # Hops of the second that a bearing is of
 
 
 def vehicle_facts(heard: HeardStream, facts: Facts) -> tuple[FloatArray, FloatArray]:
@@ -99,8 +101,9 @@ def stream_facts(path: Path, model: Model, facts: Facts) -> list[Measurement]:
                 facts["emerged"].append((belief.joint, k, belief.both_come > _LIKELY, parts[i + 2]))
                 if not comes[i, 1 - k] and belief.comes.max() >= _LIKELY:
                     facts["wrong"].append(belief.comes[k] < belief.comes[1 - k])
-        if isinstance(peak, Bearing) and not comes[i].any() and np.isfinite(lone_rad[i]):
-            facts["peak"].append(peak.azimuth_rad - lone_rad[i])
+        before_rad = lone_rad[i - np.arange(min(_LAGS, i + 1))]
+        if isinstance(peak, Bearing) and not comes[i].any() and np.isfinite(before_rad).sum() == _LAGS:
+            facts["peak"].append(peak.azimuth_rad - before_rad)
         soon = truth.coming_s[i] <= HORIZONS_S[-1]
         if isinstance(peak, Bearing) and comes[i].sum() == soon.sum() == 1 and not truth.seen[i]:
             facts["hidden_peak"] += (peak.azimuth_rad - hidden_rad[i, soon]).tolist()
@@ -145,14 +148,15 @@ def _least(loss: Callable[[StreetModel], float], name: str) -> float:
     return float(min(values.tolist(), key=lambda value: loss(replace(STREET, **{name: value}))))
 
 
-def _mixture(errors: FloatArray, span_rad: float) -> tuple[float, float]:
-    """Return share and deviation of errors that are normal, if the rest is anywhere in a span, by EM."""
+def _mixture(errors: FloatArray, span_rad: float) -> tuple[float, float, float]:
+    """Return share and deviation of normal errors, the rest anywhere in a span, by EM; and their likelihood."""
     share, std = 0.5, 0.1
     for _ in range(_ROUNDS):
         own = share * np.exp(-0.5 * (errors / std) ** 2) / (std * math.sqrt(2.0 * math.pi))
-        weight = own / (own + (1.0 - share) / span_rad)
+        every = own + (1.0 - share) / span_rad
+        weight = own / every
         share, std = float(weight.mean()), float(np.sqrt(weight @ errors**2 / weight.sum()))
-    return share, std
+    return share, std, float(np.log(every).mean())
 
 
 def street_numbers(facts: Facts) -> dict[str, float]:
@@ -176,7 +180,9 @@ def street_numbers(facts: Facts) -> dict[str, float]:
         ]
         return -float(np.mean([np.log(one[[0, 1], parts]).sum() for one, parts in after]))
 
-    seen_path, seen_std = _mixture(np.array(facts["peak"]), math.pi)
+    # Of the times ago at which a vehicle was where its peak is, the likeliest.
+    late = [(*_mixture(errors, math.pi), hops) for hops, errors in enumerate(np.array(facts["peak"]).T)]
+    seen_path, seen_std, _, hops = max(late, key=itemgetter(2))
     followed = gaps_s <= COMING_S[-1]
     return {
         "passage_s": float(np.mean(facts["view_s"])),
@@ -194,6 +200,7 @@ def street_numbers(facts: Facts) -> dict[str, float]:
         "heard_std_rad": _mixture(np.array(facts["hidden_peak"]), math.pi)[1],
         "seen_path": seen_path,
         "seen_std_rad": seen_std,
+        "bearing_s": hops * HOP_S,
     }
 
 
