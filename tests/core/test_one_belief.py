@@ -293,28 +293,6 @@ def test_a_second_vehicle_believed_apart_is_not_unheard_because_the_first_masks_
     assert cue_of(world.state, "right").risk > 0.8 * cue_of(before, "right").risk
 
 
-def test_a_second_vehicle_keeps_its_place_at_half_the_chance_while_the_first_masks_it() -> None:
-    world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
-    kept_s, right = 0.0, ""
-    for number in range(1, 80):
-        seen = 10 <= number < 20
-        answer = Present(0.04, 0.01) if seen else Absent(0.04, 0.01)
-        boxes = (Sighting(0.53 - 0.04 * (number - 10), 0.02, "car", 0.9),) if seen else ()
-        said = TWO if number < 10 else both_sides((0.02, 0.07), (0.07, 0.02), "coming_1s")
-        look = Look("camera", number * 10**8, answer)
-        world = world.update(
-            Measurement(number * 10**8, quiet, answer, SILENT, SILENT, boxes, look=look, sequence=said)
-        )
-        there = {one.id: one for one in world.state.entities}
-        right = (
-            next((name for name, one in there.items() if one.direction == "right"), "")
-            if number < 10
-            else right
-        )
-        kept_s = 0.1 * (number - 10) if right in there else kept_s
-    assert kept_s == pytest.approx(5.0, abs=0.11)
-
-
 def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_that_follow() -> None:
     before, after = seen_from_left(both_sides((0.97, 0.01), (0.01, 0.97), "coming_0.5s"))
     assert [event.kind for event in after.events] == ["handed_over"]

@@ -2,33 +2,24 @@
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
-from functools import partial
-from operator import itemgetter
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import MOSTLY_MISSED
-from worldstate.abduction.road_users import UNKNOWN, ClassShares
 from worldstate.belief.hidden_bearing import hidden_motion, motion_in_view
-from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE, MotionBelief
+from worldstate.belief.kinematics.motion import AZIMUTH, MotionBelief
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import NEVER_NS, Track, Tracks, born, heard_as
 from worldstate.ground import TINY
-from worldstate.ground.values import nanoseconds, wrap_angle
 from worldstate.measurement import Measurement
 from worldstate.state import Event
 from worldstate.state.entity import EventKind
 
 from .memory import MOST_BOXES, Memory
 
-# After a hand-over no birth on its side: the window still holds the sound from before it.
-_REARM_NS = nanoseconds(1.0)
-_MASKED = 0.5  # Of the existence below which a hidden entity ends, beside a vehicle just come into view
 HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
-# Of two at one place; an entity that is found by itself within it is another one.
-_ALONE_NS = nanoseconds(1.0)
 
 
 def birth_death(
@@ -112,10 +103,6 @@ def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry)
     """Tell whether an entity that is only heard is believed no more."""
     least, of_side = site.street.death, int(memory.tracks.side[row])
     several = len(_heard_rows(memory.tracks)) > 1
-    # One that has just come into view on the other side masks it: that its chance is low by then is less
-    # evidence against it.
-    if memory.belief.just_emerged(site.street, but=of_side):
-        least *= _MASKED
     existence = _unseen(memory, site).existence(of_side if several else None)
     return existence < least and not (alarmed[of_side] if several else any(alarmed))
 
@@ -123,74 +110,33 @@ def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry)
 def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> int | None:
     """Return the side on which a hidden entity is born, if one is: of one vehicle the likelier one."""
     tracks, sides, least, every = memory.tracks, memory.sides, site.street.birth, range(len(site.sides))
-    stamps_ns, heard = [one.handover_ns for one in memory.history], _heard_rows(tracks)
-    rearmed = [ns is None or memory.stamp_ns - ns > _REARM_NS for ns in stamps_ns]
+    heard = _heard_rows(tracks)
+    # The window still holds the sound from before one came into view.
+    masked = memory.belief.emerged_since(memory.stamp_ns, site.street.masked_s)
     taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
     if heard and (len(heard) > 1 or sides.both < least):
         return None
-    if not taken and all(rearmed) and (sides.hidden_on(None) >= least or any(alarmed)):
+    if not taken and not any(masked) and (sides.hidden_on(None) >= least or any(alarmed)):
         return max(every, key=sides.hidden_on)
     # In view by its sound, while no sensor looks.
-    if not heard and all(rearmed) and max(memory.belief.shown) >= least:
+    if not heard and not any(masked) and max(memory.belief.shown) >= least:
         return max(every, key=memory.belief.shown.__getitem__)
-    free = [k for k in every if rearmed[k] and k not in taken and (sides.hidden[k] >= least or alarmed[k])]
+    free = [k for k in every if not masked[k] and k not in taken and (sides.hidden[k] >= least or alarmed[k])]
     return max(free, key=sides.hidden_on, default=None)
 
 
 def merge_tracks(memory: Memory, site: SiteGeometry) -> tuple[Event, ...]:
-    """Merge tracks that have become one; return which ids have ended, and which go on.
-
-    Of two at one place, of the same class, one has just been found and the other not for a second. They go on
-    where the first is, under the id that was known earlier. Two that are only heard go on as the likelier one
-    if it is unlikely that there are two.
-    """
-    tracks, stamp_ns, into, ended = memory.tracks, memory.stamp_ns, dict[str, str](), list[int]()
-    heard = _heard_rows(tracks)
+    """Merge two that are only heard if it is unlikely that there are two; return which id has ended."""
+    tracks, heard = memory.tracks, _heard_rows(memory.tracks)
     least = site.street.birth * min((tracks.existence[i] for i in heard), default=0.0)
     # Beside the less likely one the other one would not be born.
-    if len(heard) > 1 and memory.sides.both < least:
-        first, second, *_ = sorted(heard, key=lambda i: (-tracks.existence[i], *_age(tracks, i)))
-        ended.append(second)
-        into[tracks.id[second]] = tracks.id[first]
-    lost = tracks.seen & (tracks.last_seen_ns <= stamp_ns - _ALONE_NS) & (tracks.behind < HIDDEN)
-    for other in np.flatnonzero(lost).tolist():
-        found = np.flatnonzero(tracks.seen & (tracks.last_seen_ns == stamp_ns)).tolist()
-        apart = np.abs(wrap_angle(tracks.mean[:, AZIMUTH] - tracks.mean[other, AZIMUTH]))
-        # The nearest: the first of several would be another one in a mirror.
-        there = [i for i in found if _at_one_place(tracks, i, other, site.street.past_std_rad)]
-        same = min(there, key=apart.__getitem__, default=None)
-        if same is not None:
-            first, second = sorted((same, other), key=partial(_age, tracks))
-            into[tracks.id[second]] = tracks.id[first]
-            tracks.existence[same] = max(tracks.existence[same], tracks.existence[other])
-            for column in (tracks.id, tracks.created_ns, tracks.came_from):
-                column[same] = column[first]
-            ended.append(other)
-    memory.tracks = tracks.without(ended)
-    if ended:
-        view_heard(memory, site)
-    return tuple(Event(stamp_ns, "merged", *ids) for ids in into.items())
-
-
-def _age(tracks: Tracks, row: int) -> tuple[int, str]:
-    return tracks.created_ns[row], tracks.id[row]
-
-
-def _at_one_place(tracks: Tracks, one: int, other: int, gate_rad: float) -> bool:
-    """Tell whether two tracks of one class stand within each other's deviations of azimuth and range.
-
-    One that has left the view is soon anywhere in it: beyond the gate no sighting would have been its own.
-    """
-    gap = tracks.mean[one] - tracks.mean[other]
-    gap[AZIMUTH] = wrap_angle(gap[AZIMUTH])
-    variance = (tracks.covariance[one] + tracks.covariance[other]).diagonal()
-    near = abs(gap[AZIMUTH]) <= gate_rad and all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
-    alike = _likeliest(tracks.labels[one]) == _likeliest(tracks.labels[other])
-    return near and alike and bool(tracks.moving[one] == tracks.moving[other])
-
-
-def _likeliest(labels: ClassShares) -> str:
-    return max(labels, key=itemgetter(1), default=(UNKNOWN, 1.0))[0]
+    if len(heard) < 2 or memory.sides.both >= least:
+        return ()
+    age = [(-tracks.existence[i], tracks.created_ns[i], tracks.id[i]) for i in heard]
+    first, second, *_ = (heard[k] for k in sorted(range(len(heard)), key=age.__getitem__))
+    memory.tracks = tracks.without([second])
+    view_heard(memory, site)
+    return (Event(memory.stamp_ns, "merged", tracks.id[second], tracks.id[first]),)
 
 
 def hidden_on(tracks: Tracks, k: int) -> int | None:
@@ -274,8 +220,6 @@ def past_edges(
     # Told apart from others: by a message, or since they were seen.
     apart = hidden & (tracks.detected | (tracks.last_seen_ns != NEVER_NS))
     memory.belief = memory.belief.handed_over(came, set(tracks.side[apart].tolist()), stamp_ns, street)
-    for side in handed_over:
-        memory.history[side].handover_ns = stamp_ns
 
 
 def surviving(tracks: Tracks, street: StreetModel) -> Tracks:

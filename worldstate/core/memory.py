@@ -52,7 +52,6 @@ class SideHistory:
     """What happened on one approach side so far."""
 
     births: Count = 0  # Hidden entities born
-    handover_ns: int | None = None  # Last hand-over
     advised_ns: int | None = None  # Since when an advisory has been out
     announced_ns: int | None = None  # When messages last raised the alarm: time alone raises none
 

@@ -142,7 +142,7 @@ class StreetBelief:
         """Return what the alarm is raised from: higher if a vehicle has just come."""
         alarm = self.alarm
         nats = bounded_log_odds(policy.gamma) if alarm is None else alarm.threshold_nats
-        return nats + street.beside_nats * self.just_emerged(street)
+        return nats + street.beside_nats * any(self.emerged_since(self.stamp_ns, street.beside_s))
 
     def budget(self, stamp_ns: int) -> Budget | None:
         """Return how the watch over the alarm stands; None without one."""
@@ -183,11 +183,6 @@ class StreetBelief:
         return SideBelief(
             told, emerged, told, 1.0 - self.joint.none_comes, self.joint.explanations, self.both_come
         )
-
-    def just_emerged(self, street: StreetModel, but: int | None = None) -> bool:
-        """Tell whether a vehicle has just come into view, from any side but one."""
-        recent = self.emerged_since(self.stamp_ns, street.beside_s)
-        return any(is_recent for k, is_recent in enumerate(recent) if k != but)
 
     def emerged_since(self, stamp_ns: int, time_s: float) -> list[bool]:
         """Return from which sides a vehicle has come into view within so long before a time."""
