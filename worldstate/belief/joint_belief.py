@@ -88,7 +88,8 @@ def _side_rates(prior: SidePrior, street: StreetModel) -> FloatArray:
     return np.asarray((still - np.eye(STATES)) / HOP_S)
 
 
-@dataclass(frozen=True, slots=True)
+# No slots: what follows from a prior is computed once.
+@dataclass(frozen=True)
 class StreetPrior:
     """What is expected of all sides and of elsewhere without evidence."""
 
@@ -108,7 +109,7 @@ class StreetPrior:
             weights = weights[..., None] * one
         return weights
 
-    @property
+    @cached_property
     def by_part(self) -> FloatArray:
         """The joint of the hidden parts and of whether anything is in view, shape (parts, ..., parts, 2)."""
         return _by_part(self.weights)
