@@ -104,10 +104,8 @@ class StreetPrior:
     @property
     def weights(self) -> FloatArray:
         """The distribution, shape (states, ..., states, 2)."""
-        weights = np.ones(())
-        for one in (*(side.states for side in self.sides), np.array([1.0 - self.elsewhere, self.elsewhere])):
-            weights = weights[..., None] * one
-        return weights
+        every = [*(side.states for side in self.sides), np.array([1.0 - self.elsewhere, self.elsewhere])]
+        return reduce(np.multiply.outer, every)
 
     @cached_property
     def by_part(self) -> FloatArray:
@@ -119,8 +117,8 @@ class StreetPrior:
         weights = np.stack(every, axis=-1)
         for chain in chains(self, street, step_ns):
             # The axis in front goes to the end, so that at last the order is the same, but many in front.
-            weights = np.tensordot(weights, chain, ([0], [0]))
-        return weights
+            weights = weights.reshape(len(chain), -1).T @ chain
+        return weights.reshape(-1, *every[0].shape)
 
 
 @lru_cache
@@ -239,23 +237,16 @@ def window_likelihoods(
     beside a hidden one as well; the mean over the usual chance `in_view` stays. Of a side without a number
     (None) the window leaves open what comes.
     """
-    sides, known = len(hidden), [k for k, one in enumerate(hidden) if one is not None]
-    nats = np.array([0.0 if one is None else one for one in hidden])
-    top = max([*nats[known], visible, none])
-    comes = _comes(sides)[..., known]
-    count = comes.sum(axis=-1)
-    mean = comes @ np.exp(nats[known] - top) / np.maximum(count, 1)
+    known = [one is not None for one in hidden]
+    nats = np.array([-math.inf if one is None else one for one in hidden])
+    top = max(*nats.tolist(), visible, none)
+    count = reduce(np.add.outer, np.outer(known, COMES).astype(float))
+    mean = reduce(np.add.outer, np.outer(np.exp(nats - top), COMES)) / np.maximum(count, 1.0)
     clear, seen = math.exp(none - top), math.exp(visible - top)
     denied = min(seen / clear, 1.0) if clear > 0.0 else 1.0
     mean = mean / (1.0 - in_view + in_view * denied)
     found = np.where(count[..., None] > 0.0, np.multiply.outer(mean, (1.0, denied)), (clear, seen))
     return np.asarray(np.maximum(found, TINY))
-
-
-@lru_cache
-def _comes(sides: int) -> FloatArray:
-    """Return 1 for the sides from which a vehicle comes, by their parts; shape (parts, ..., parts, sides)."""
-    return np.stack(np.meshgrid(*[COMES] * sides, indexing="ij"), axis=-1).astype(float)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -335,7 +335,7 @@ def carried(
 def _expecting(kept: StreetBelief, context: Context, street: StreetModel) -> StreetBelief:
     """Return the belief at the prior of context and model, which may be another one than a step ago."""
     usual = _usual(context, kept.share)
-    if not np.array_equal(usual, kept.usual):
+    if usual is not kept.usual and not np.array_equal(usual, kept.usual):
         before, after = (StreetPrior.of(one, street).weights for one in (kept.usual, usual))
         kept = replace(kept, joint=kept.joint.at_prior(before, after), usual=usual)
     return replace(kept, groups=_with_traffic(kept, context, street))
@@ -445,7 +445,7 @@ def alerted(kept: StreetBelief, policy: CueingPolicy, street: StreetModel) -> St
     rows = [
         [one[1][k] for one in of_hop if ns is None or one[0] >= ns] for k, ns in enumerate(kept.emerged_ns)
     ]
-    decided, threshold = np.array([float(np.mean(row)) for row in rows]), kept.threshold_nats(policy, street)
+    decided, threshold = np.array([sum(row) / len(row) for row in rows]), kept.threshold_nats(policy, street)
     elsewhere = np.maximum(1.0 - kept.joint.none_comes, TINY) - kept.comes
     # By windows all sides have the same log-odds.
     rank = decided if kept.has_times else kept.comes.round(9)
