@@ -356,21 +356,19 @@ class JointBelief:
         does not, and the weight :math:`\kappa` of a look that repeats the misses of those before.
         """
         miss, clutter = answer.miss_rate, answer.clutter_rate
-        last, run = self.trust.get(sensor), (1.0, 1.0, True)
-        if last is None:
-            last = SensorTrust(street.works * self.weights, stamp_ns, miss)
-        else:
-            run = last.next_weight(stamp_ns, street)
+        works, run = street.works * self.weights, (1.0, 1.0, True)
+        if (last := self.trust.get(sensor)) is not None:
+            works, run = last.works, last.next_weight(stamp_ns, street)
         # Of a look with something in view, with nothing in view, and of a sensor that has failed.
         told = np.array([miss * (1.0 - clutter), 1.0 - clutter, 1.0])
         if isinstance(answer, Present):
             told = np.array([1.0 - told[0], clutter, clutter])
         in_view, clear, failed = (np.maximum(told, TINY) ** run[0]).tolist()
-        works = last.works * _spread(np.reshape([clear, in_view], (*[1] * self.sides, 2)))
-        after = works + (self.weights - last.works) * failed
+        found = works * _spread(np.reshape([clear, in_view], (*[1] * self.sides, 2)))
+        after = found + (self.weights - works) * failed
         others = replace(self, trust={name: one for name, one in self.trust.items() if name != sensor})
         seen = others.times(after / np.maximum(self.weights, np.finfo(float).tiny))
-        own = SensorTrust(works / after.sum(), stamp_ns, miss, *run[1:])
+        own = SensorTrust(found / after.sum(), stamp_ns, miss, *run[1:])
         return replace(seen, trust={**seen.trust, sensor: own})
 
     def emerged(self, side: int, residual: float, apart: bool, street: StreetModel) -> "JointBelief":
@@ -429,8 +427,7 @@ class JointBelief:
     def emerged_from(self) -> FloatArray:
         """P(one from a side is in view, and none comes there), shape (sides,)."""
         axes = [tuple(j for j in range(self.sides + 1) if j != k) for k in range(self.sides)]
-        by_side = [self.weights.sum(axis=one).reshape(PARTS, 2) for one in axes]
-        return np.array([one[~COMES, 1].sum() for one in by_side])
+        return np.array([self.weights.sum(axis=one)[1 : 2 * FIRST_BIN : 2].sum() for one in axes])
 
     @property
     def in_view(self) -> float:
