@@ -19,6 +19,7 @@ from worldstate.belief.joint_belief import (
     JointBelief,
     SidePrior,
     StreetPrior,
+    chains,
     joint_reading,
 )
 from worldstate.belief.street_model import StreetModel
@@ -46,8 +47,8 @@ def likelihoods(rng: np.random.Generator, sides: int) -> FloatArray:
 def product(prior: StreetPrior, weights: FloatArray, step_ns: int) -> FloatArray:
     """Return a distribution a step later by one matrix over all states together."""
     chain = np.ones((1, 1))
-    for axis in range(weights.ndim):
-        chain = np.kron(chain, prior.chain(axis, STREET, step_ns))
+    for one in chains(prior, STREET, step_ns):
+        chain = np.kron(chain, one)
     return (weights.ravel() @ chain).reshape(weights.shape)
 
 
@@ -90,9 +91,8 @@ def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior, told = prior_of(rng, 3), likelihoods(rng, 3)
     belief = JointBelief(prior.weights).told(told).carried(prior, STREET, 3 * 10**8)
-    chains = [prior.chain(axis, STREET, 3 * 10**8) for axis in range(4)]
     before = JointBelief(prior.weights).told(told).weights
-    by_hand = np.einsum("abce,ai,bj,ck,em->ijkm", before, *chains, optimize=True)
+    by_hand = np.einsum("abce,ai,bj,ck,em->ijkm", before, *chains(prior, STREET, 3 * 10**8), optimize=True)
     for k in range(3):
         own = np.moveaxis(by_hand, k, 0).reshape(PARTS, 2, -1)
         np.testing.assert_allclose(belief.hidden[k], own.sum(axis=(1, 2)), atol=1e-12)
@@ -120,8 +120,8 @@ def test_it_is_what_a_factor_graph_infers(seed: int) -> None:
         graph.add([keys[0][axis]], table(side))
     graph.add([keys[0][2]], table(np.array([1.0 - prior.elsewhere, prior.elsewhere])))
     for step, likelihood in enumerate(told, 1):
-        for axis in range(3):
-            graph.add([keys[step - 1][axis], keys[step][axis]], table(prior.chain(axis, STREET, 10**8)))
+        for axis, chain in enumerate(chains(prior, STREET, 10**8)):
+            graph.add([keys[step - 1][axis], keys[step][axis]], table(chain))
         states = np.array([likelihood[part_of(one)] for one in every_state(2)])
         graph.add(keys[step], table(states))
         belief = belief.carried(prior, STREET, 10**8).told(likelihood)

@@ -18,7 +18,7 @@ so that without other evidence p = n, whose parts are q, whatever the chain.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.markov_chain import balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
-from worldstate.ground import TINY, BoolArray, FloatArray, seconds
+from worldstate.ground import TINY, FloatArray, seconds
 
 from .street_model import StreetModel
 
@@ -88,20 +88,8 @@ def _side_rates(prior: SidePrior, street: StreetModel) -> FloatArray:
     return np.asarray((still - np.eye(STATES)) / HOP_S)
 
 
-@lru_cache
-def _side_chain(prior: SidePrior, street: StreetModel, step_ns: int) -> FloatArray:
-    return transitions(_side_rates(prior, street), step_ns)
-
-
-@lru_cache
-def _elsewhere_chain(in_view: float, passage_s: float, step_ns: int) -> FloatArray:
-    """Return the chain of a vehicle from elsewhere: not in view, in view; shape (2, 2)."""
-    leaves = 1.0 / passage_s
-    comes = leaves * in_view / (1.0 - in_view)
-    return transitions(np.array([[-comes, comes], [leaves, -leaves]]), step_ns)
-
-
-@dataclass(frozen=True, slots=True)
+# No slots: what follows from a prior is computed once.
+@dataclass(frozen=True)
 class StreetPrior:
     """What is expected of all sides and of elsewhere without evidence."""
 
@@ -116,28 +104,30 @@ class StreetPrior:
     @property
     def weights(self) -> FloatArray:
         """The distribution, shape (states, ..., states, 2)."""
-        weights = np.ones(())
-        for one in (*(side.states for side in self.sides), np.array([1.0 - self.elsewhere, self.elsewhere])):
-            weights = weights[..., None] * one
-        return weights
+        every = [*(side.states for side in self.sides), np.array([1.0 - self.elsewhere, self.elsewhere])]
+        return reduce(np.multiply.outer, every)
 
-    @property
+    @cached_property
     def by_part(self) -> FloatArray:
         """The joint of the hidden parts and of whether anything is in view, shape (parts, ..., parts, 2)."""
         return _by_part(self.weights)
 
-    def chain(self, axis: int, street: StreetModel, step_ns: int) -> FloatArray:
-        """Return the chain of a side, or of elsewhere behind the last one; rows sum to one."""
-        if axis == len(self.sides):
-            return _elsewhere_chain(self.elsewhere, street.passage_s, step_ns)
-        return _side_chain(self.sides[axis], street, step_ns)
+    def carry(self, every: Sequence[FloatArray], street: StreetModel, step_ns: int) -> FloatArray:
+        """Return some distributions a step later, in their order."""
+        weights = np.stack(every, axis=-1)
+        for chain in chains(self, street, step_ns):
+            # The axis in front goes to the end, so that at last the order is the same, but many in front.
+            weights = weights.reshape(len(chain), -1).T @ chain
+        return weights.reshape(-1, *every[0].shape)
 
-    def carry(self, weights: FloatArray, street: StreetModel, step_ns: int) -> FloatArray:
-        """Return a distribution a step later, of its shape."""
-        for axis in range(weights.ndim):
-            # The axis in front goes to the end, so that after all of them the order is the same again.
-            weights = np.tensordot(weights, self.chain(axis, street, step_ns), ([0], [0]))
-        return weights
+
+@lru_cache
+def chains(prior: StreetPrior, street: StreetModel, step_ns: int) -> list[FloatArray]:
+    """Return the chain of each side, and last that of a vehicle from elsewhere; rows sum to one."""
+    leaves = 1.0 / street.passage_s
+    comes = leaves * prior.elsewhere / (1.0 - prior.elsewhere)
+    elsewhere = np.array([[-comes, comes], [leaves, -leaves]])
+    return [transitions(one, step_ns) for one in (*(_side_rates(k, street) for k in prior.sides), elsewhere)]
 
 
 @lru_cache(maxsize=256)
@@ -151,34 +141,34 @@ def _street_prior(content: bytes, street: StreetModel) -> StreetPrior:
     return StreetPrior(sides, 1.0 - (1.0 - seen) / math.prod(1.0 - one.in_view for one in sides))
 
 
+def _clear(sides: int) -> tuple[slice | int, ...]:
+    """Return where nothing is in view among states of shape (parts, 2, ..., parts, 2, 2)."""
+    of_side: list[slice | int] = [slice(None), 0]
+    return (*of_side * sides, 0)
+
+
 def _by_part(weights: FloatArray) -> FloatArray:
     """Return the parts that a reading is about: (parts, ..., parts, 2), last whether anything is in view."""
     sides = weights.ndim - 1
     split = weights.reshape(*[PARTS, 2] * sides, 2)
-    nothing: list[slice | int] = [slice(None), 0] * sides
-    clear = split[(*nothing, 0)]
+    by_part = np.empty((*[PARTS] * sides, 2))
+    by_part[..., 0] = split[_clear(sides)]
     every = split.sum(axis=(*range(1, 2 * sides, 2), 2 * sides))
-    return np.stack([clear, np.maximum(every - clear, 0.0)], axis=-1)
-
-
-@lru_cache
-def _in_view(sides: int) -> BoolArray:
-    """Return which states have a vehicle in view, shape (states, ..., states, 2)."""
-    seen = np.zeros((*[STATES] * sides, 2), bool)
-    seen[..., 1] = True
-    for k in range(sides):
-        seen |= np.moveaxis((np.arange(STATES) % 2 == 1).reshape(STATES, *[1] * sides), 0, k)
-    return seen
+    np.maximum(every - by_part[..., 0], 0.0, out=by_part[..., 1])
+    return by_part
 
 
 def _spread(by_part: FloatArray) -> FloatArray:
-    """Return the value of every state from that of its parts: the inverse of the sums of `_by_part`."""
+    """Return the value of every state from that of its parts: the inverse of the sums of `_by_part`.
+
+    Along an axis of length one the value is the same for all parts.
+    """
     sides = by_part.ndim - 1
-    clear, seen = by_part[..., 0], by_part[..., 1]
-    for k in range(sides):
-        clear, seen = (np.repeat(one, 2, axis=k) for one in (clear, seen))
     # In C order, as a checkpoint is read: sums over another order differ in their last bit.
-    return np.ascontiguousarray(np.where(_in_view(sides), seen[..., None], clear[..., None]))
+    every = np.empty((*[PARTS, 2] * sides, 2))
+    every[:] = np.expand_dims(by_part[..., 1], (*range(1, 2 * sides, 2), 2 * sides))
+    every[_clear(sides)] = by_part[..., 0]
+    return every.reshape(*[STATES] * sides, 2)
 
 
 def usual_groups(hidden: Sequence[float], in_view: float) -> FloatArray:
@@ -208,31 +198,29 @@ def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> 
     Shapes: groups (sides, groups).
     """
     coming, other = groups[:, :BINS], groups[:, _OTHER] * (len(groups) > 1)
-    comes = np.minimum(coming.sum(axis=1), 1.0 - TINY)
+    every = np.minimum(coming.sum(axis=1), 1.0 - TINY)
     rest = np.maximum(groups[:, BINS:].sum(axis=1) - other, TINY)
     distant = np.minimum(groups[:, _DISTANT].sum(axis=1) / rest, 1.0)
     seen = min(float((groups[:, _SEEN] / rest).mean()), 1.0)
     behind = min((1.0 - by_sound) * usual_in_view + by_sound * seen, seen)
-    parts = np.zeros((len(groups), 2, PARTS))  # Side, whether one comes there, part
-    parts[:, 0, NONE], parts[:, 0, DISTANT] = 1.0 - distant, distant
-    parts[:, 1, FIRST_BIN:] = coming / np.maximum(comes, TINY)[:, None]
+    # Of every side the hidden parts, given whether a vehicle comes there.
+    parts = np.column_stack([1.0 - distant, distant, coming / np.maximum(every, TINY)[:, None]])
+    comes = every.tolist()
     if len(groups) == 1:
-        none, beside = 1.0 - float(comes[0]), comes[0] * parts[0, 1]
+        none, chances = 1.0 - comes[0], np.array([0.0, comes[0]])
     else:
-        none = float((1.0 - comes - other).mean())
-        none = min(max(none, 1.0 - float(comes.sum()), 0.0), 1.0 - float(comes.max()))
-        both = max(float(comes.sum()) - (1.0 - none), 0.0)
-        chances = {(0, 1): comes[1] - both, (1, 0): comes[0] - both, (1, 1): both}
-        beside = np.sum([one * np.outer(parts[0, a], parts[1, b]) for (a, b), one in chances.items()], axis=0)
+        none = float((1.0 - every - other).mean())
+        none = min(max(none, 1.0 - float(every.sum()), 0.0), 1.0 - max(comes))
+        both = max(float(every.sum()) - (1.0 - none), 0.0)
+        chances = np.array([[0.0, comes[1] - both], [comes[0] - both, both]])
+    beside = chances[np.ix_(*[COMES.astype(int)] * len(groups))] * reduce(np.multiply.outer, parts)
+    joint = np.multiply.outer(beside, (1.0 - behind, behind))
     # If none comes: what is in view is all that is heard, and what is far off is as few as explain it.
-    far = np.minimum(distant / max(1.0 - seen, TINY), 1.0)
-    clear, alone = np.zeros((2, *beside.shape))
-    alone.flat[0] = 1.0
+    far = np.minimum(distant / max(1.0 - seen, TINY), 1.0).tolist()
     for heard in np.ndindex(*[2] * len(groups)):
-        on, off = far[np.equal(heard, 1)], far[np.equal(heard, 0)]
-        clear[heard] = max(on.min(initial=1.0) - off.max(initial=0.0), 0.0)
-    joint = none * np.stack([(1.0 - seen) * clear, seen * alone], axis=-1)
-    joint += np.stack([(1.0 - behind) * beside, behind * beside], axis=-1)
+        on, off = ([one for one, is_far in zip(far, heard, strict=True) if is_far == k] for k in (1, 0))
+        joint[(*heard, 0)] = none * ((1.0 - seen) * max(min(on, default=1.0) - max(off, default=0.0), 0.0))
+    joint[(*[NONE] * len(groups), 1)] = none * seen
     joint = np.maximum(joint, TINY)
     return np.asarray(joint / joint.sum())
 
@@ -249,17 +237,15 @@ def window_likelihoods(
     beside a hidden one as well; the mean over the usual chance `in_view` stays. Of a side without a number
     (None) the window leaves open what comes.
     """
-    sides, known = len(hidden), [k for k, one in enumerate(hidden) if one is not None]
-    nats = np.array([0.0 if one is None else one for one in hidden])
-    top = max([*nats[known], visible, none])
-    comes = np.stack(np.meshgrid(*[COMES] * sides, indexing="ij"), axis=-1)[..., known]
-    count = comes.sum(axis=-1)
-    mean = comes @ np.exp(nats[known] - top) / np.maximum(count, 1)
+    known = [one is not None for one in hidden]
+    nats = np.array([-math.inf if one is None else one for one in hidden])
+    top = max(*nats.tolist(), visible, none)
+    count = reduce(np.add.outer, np.outer(known, COMES).astype(float))
+    mean = reduce(np.add.outer, np.outer(np.exp(nats - top), COMES)) / np.maximum(count, 1.0)
     clear, seen = math.exp(none - top), math.exp(visible - top)
     denied = min(seen / clear, 1.0) if clear > 0.0 else 1.0
     mean = mean / (1.0 - in_view + in_view * denied)
-    pairs = ((clear, 1.0), (seen, denied))
-    found = np.stack([np.where(count > 0, mean * beside, one) for one, beside in pairs], axis=-1)
+    found = np.where(count[..., None] > 0.0, np.multiply.outer(mean, (1.0, denied)), (clear, seen))
     return np.asarray(np.maximum(found, TINY))
 
 
@@ -298,23 +284,22 @@ class JointBelief:
 
     def carried(self, prior: StreetPrior, street: StreetModel, step_ns: int) -> "JointBelief":
         """Return the belief a time step later, in which sensors fail and recover."""
-        weights = prior.carry(self.weights, street, step_ns)
+        every = [self.weights, *self.alone.values(), *(one.works for one in self.trust.values())]
+        weights, *rest = prior.carry(every, street, step_ns)
+        alone, works = dict(zip(self.alone, rest, strict=False)), rest[len(self.alone) :]
         rate_hz = 1.0 / street.fails_s + 1.0 / street.recovers_s
         changed = -math.expm1(-rate_hz * seconds(step_ns)) * weights / (street.recovers_s * rate_hz)
         kept = math.exp(-rate_hz * seconds(step_ns))
-        trust = {
-            name: replace(one, works=kept * prior.carry(one.works, street, step_ns) + changed)
-            for name, one in self.trust.items()
-        }
-        alone = {name: prior.carry(one, street, step_ns) for name, one in self.alone.items()}
-        return replace(self, weights=weights, alone=alone, trust=trust)
+        pairs = zip(self.trust.items(), works, strict=True)
+        trust = {name: replace(one, works=kept * now + changed) for (name, one), now in pairs}
+        return JointBelief(weights, alone, trust)
 
     def times(self, evidence: FloatArray) -> "JointBelief":
         """Return the belief after evidence, a likelihood of every state."""
         weights = self.weights * evidence
         total = weights.sum()
         trust = {name: replace(one, works=one.works * evidence / total) for name, one in self.trust.items()}
-        return replace(self, weights=weights / total, trust=trust)
+        return JointBelief(weights / total, self.alone, trust)
 
     def read(
         self,
@@ -347,9 +332,7 @@ class JointBelief:
             mixed = heard * ratio + (1.0 - heard) * quiet
             mixed[none] = ratio[none]
             ratio = mixed / (mixed * expected).sum()
-        ratio = np.expand_dims(ratio**share, others)
-        shape = (*[PARTS] * self.sides, 2)
-        every = _spread(np.broadcast_to(ratio, shape))
+        every = _spread(np.expand_dims(ratio**share, others))
         return replace(self.times(every), alone=self.alone | {source: _normed(before * every)})
 
     def told(self, by_part: FloatArray) -> "JointBelief":
@@ -373,21 +356,19 @@ class JointBelief:
         does not, and the weight :math:`\kappa` of a look that repeats the misses of those before.
         """
         miss, clutter = answer.miss_rate, answer.clutter_rate
-        last, run = self.trust.get(sensor), (1.0, 1.0, True)
-        if last is None:
-            last = SensorTrust(street.works * self.weights, stamp_ns, miss)
-        else:
-            run = last.next_weight(stamp_ns, street)
+        works, run = street.works * self.weights, (1.0, 1.0, True)
+        if (last := self.trust.get(sensor)) is not None:
+            works, run = last.works, last.next_weight(stamp_ns, street)
         # Of a look with something in view, with nothing in view, and of a sensor that has failed.
         told = np.array([miss * (1.0 - clutter), 1.0 - clutter, 1.0])
         if isinstance(answer, Present):
             told = np.array([1.0 - told[0], clutter, clutter])
         in_view, clear, failed = (np.maximum(told, TINY) ** run[0]).tolist()
-        works = last.works * np.where(_in_view(self.sides), in_view, clear)
-        after = works + (self.weights - last.works) * failed
+        found = works * _spread(np.reshape([clear, in_view], (*[1] * self.sides, 2)))
+        after = found + (self.weights - works) * failed
         others = replace(self, trust={name: one for name, one in self.trust.items() if name != sensor})
         seen = others.times(after / np.maximum(self.weights, np.finfo(float).tiny))
-        own = SensorTrust(works / after.sum(), stamp_ns, miss, *run[1:])
+        own = SensorTrust(found / after.sum(), stamp_ns, miss, *run[1:])
         return replace(seen, trust={**seen.trust, sensor: own})
 
     def emerged(self, side: int, residual: float, apart: bool, street: StreetModel) -> "JointBelief":
@@ -446,8 +427,7 @@ class JointBelief:
     def emerged_from(self) -> FloatArray:
         """P(one from a side is in view, and none comes there), shape (sides,)."""
         axes = [tuple(j for j in range(self.sides + 1) if j != k) for k in range(self.sides)]
-        by_side = [self.weights.sum(axis=one).reshape(PARTS, 2) for one in axes]
-        return np.array([one[~COMES, 1].sum() for one in by_side])
+        return np.array([self.weights.sum(axis=one)[1 : 2 * FIRST_BIN : 2].sum() for one in axes])
 
     @property
     def in_view(self) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
@@ -69,15 +69,11 @@ class SideGeometry:
 
     def prior(self) -> MotionBelief:
         """Return the prior motion of a vehicle hidden here."""
-        return _hidden_motion(self.azimuth_rad, self.std_rad, self.street)
-
-
-@lru_cache
-def _hidden_motion(azimuth_rad: float, std_rad: float, street: StreetModel) -> MotionBelief:
-    mean = azimuth_rad, 0.0, -street.closing_hz, math.log(street.range_m)
-    # Give or take as much again.
-    spread = std_rad, street.closing_hz, street.closing_hz, street.range_spread
-    return MotionBelief.around(mean, spread)
+        street = self.street
+        mean = self.azimuth_rad, 0.0, -street.closing_hz, math.log(street.range_m)
+        # Give or take as much again.
+        spread = self.std_rad, street.closing_hz, street.closing_hz, street.range_spread
+        return MotionBelief.around(mean, spread)
 
 
 # No slots: what follows from the sides is computed once, and read in every step.

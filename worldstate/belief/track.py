@@ -289,9 +289,9 @@ def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatAr
     at = np.zeros((len(tracks), sides + len(tracks)))
     nearer = np.zeros_like(at)
     at[:, :sides] = site.past_edge(azimuth_rad + 0.5 * way * widths, tracks.azimuth_std_rad, way)
-    placed = tracks.placed
-    range_m = np.hypot(*tracks.place_mean[placed, :2].T)
-    at[placed, :sides] = site.behind(azimuth_rad[placed], tracks.azimuth_std_rad[placed, None], range_m)
+    if (placed := tracks.placed).any():
+        range_m = np.hypot(*tracks.place_mean[placed, :2].T)
+        at[placed, :sides] = site.behind(azimuth_rad[placed], tracks.azimuth_std_rad[placed, None], range_m)
     nearer[:, :sides] = np.where(tracks.seen[:, None], [one.certainty for one in site.sides], 1.0)
     covers = (widths > 0.0) & tracks.seen & (2.0 * widths >= widths[:, None])
     np.fill_diagonal(covers, False)

@@ -39,7 +39,8 @@ def acoustic_update(memory: Memory, measurement: Measurement, weight: float, sit
     if weight <= 0.0 or silent or not len(rows):
         return
     # P(this entity is the source of this window's sound)
-    sounding = np.where(tracks.seen[rows], memory.sides.hypotheses[1], 1.0) * tracks.existence[rows]
+    visible = memory.belief.joint.explanations[1]
+    sounding = np.where(tracks.seen[rows], visible, 1.0) * tracks.existence[rows]
     motion = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
     if not isinstance(bearing, NotUsable):
         hidden = tracks.behind[rows] >= HIDDEN

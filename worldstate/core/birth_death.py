@@ -58,7 +58,9 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
     identity, classes and the approach rate. One alone may be on any side, two are on one each.
     """
     tracks, belief, rows = memory.tracks, memory.belief, _heard_rows(memory.tracks)
-    sides = _unseen(memory, site) if rows else memory.sides
+    if not rows:
+        return
+    sides = _unseen(memory, site)
     for i in rows:
         shares = sides.side_shares(site.street.death) if len(rows) == 1 else ()
         is_open = sum(share > 0.0 for share in shares) > 1

@@ -45,7 +45,7 @@ def update_belief(
     memory: Memory, measurement: Measurement, looks: Iterable[CameraLook], model: FilterModel
 ) -> None:
     """Update the belief of the sides with the evidence of a measurement and with all that cameras saw."""
-    said, site, memory.last.predicted = measurement.sequence, model.site, memory.sides.hypotheses
+    said, site, memory.last.predicted = measurement.sequence, model.site, memory.belief.joint.explanations
     seen = [site.in_sight(one) for one in looks if not isinstance(one.look.answer, Unqueried)]
     memory.belief = informed(memory.belief, measurement, seen, model.context, model.policy, site.settings)
     if said is not None:  # Of other sources the last one holds

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -47,7 +47,7 @@ from worldstate.ground import (
     seconds,
 )
 from worldstate.measurement.measurement import Look, Measurement
-from worldstate.state import Budget, Context
+from worldstate.state import Budget, Context, Priors, Rates
 
 from .budget_watch import BET_S, LOOK_NS, SLACK_NS, BudgetWatch, WatchedHop, budget_of
 
@@ -154,15 +154,15 @@ class StreetBelief:
         """P(a vehicle is in view)."""
         return min(self.joint.in_view, 1.0)
 
-    @cached_property
+    @property
     def posterior(self) -> SequencePosterior:
         """The chances of all times to visible, as one hop of a stream."""
-        return SequencePosterior(self.joint.hidden[None, :, FIRST_BIN:], self.margin_s)
+        return SequencePosterior(self.coming[None], self.margin_s)
 
     @property
     def coming(self) -> FloatArray:
         """Probabilities of the groups of `COMING_S`, shape (K, 9)."""
-        return np.asarray(self.posterior.groups[0])
+        return self.joint.hidden[:, FIRST_BIN:]
 
     @cached_property
     def comes(self) -> FloatArray:
@@ -191,6 +191,9 @@ class StreetBelief:
 
     def since(self, since_ns: int) -> "StreetBelief":
         """Return the belief without sources and sensors that were last read before a time."""
+        last_ns = [*self.read_ns.values(), *(one.stamp_ns for one in self.joint.trust.values())]
+        if min(last_ns, default=since_ns) >= since_ns:
+            return self
         read_ns = {name: ns for name, ns in self.read_ns.items() if ns >= since_ns}
         alone = {name: one for name, one in self.joint.alone.items() if name in read_ns}
         trust = {name: one for name, one in self.joint.trust.items() if one.stamp_ns >= since_ns}
@@ -279,18 +282,31 @@ def _usual(context: Context, share: FloatArray | None) -> FloatArray:
     It is that of the context's priors, or else of a sequence model, once one was read (`share`), or of the
     context's rates.
     """
-    priors, given, k = context.priors, context.hidden_by_side or {}, len(context.directions)
-    rates = priors or context.rates.priors(k)
+    given, hides = context.hidden_by_side or {}, tuple(one.hides for one in context.occluders)
+    of_sides = tuple(given.get(side) for side in context.directions)
+    content = None if share is None else share.tobytes()
+    return _usual_of(context.priors, context.rates, of_sides, hides, content)
+
+
+@lru_cache
+def _usual_of(
+    priors: Priors | None,
+    rates: Rates,
+    given: tuple[float | None, ...],
+    hides: tuple[bool, ...],
+    share: bytes | None,
+) -> FloatArray:
+    k, usual = len(given), priors or rates.priors(len(given))
     # Sides are independent: of P(hidden) each has so much that no vehicle is hidden on any has the rest.
-    each = 1.0 - (1.0 - rates.hidden) ** (1.0 / k)
+    each = 1.0 - (1.0 - usual.hidden) ** (1.0 / k)
     if share is None:
-        seen = rates.visible / max(rates.visible + rates.none, TINY)
-        groups = usual_groups([given.get(side, each) for side in context.directions], seen)
+        seen = usual.visible / max(usual.visible + usual.none, TINY)
+        groups = usual_groups([each if one is None else one for one in given], seen)
     else:
-        usual = None if priors is None else each
-        groups = np.array([context_prior(share, given.get(side, usual)) for side in context.directions])
+        model, own = np.frombuffer(share), None if priors is None else each
+        groups = np.array([context_prior(model, own if one is None else one) for one in given])
     # Nothing is hidden where nothing hides it.
-    groups[[not one.hides for one in context.occluders], :BINS] = TINY
+    groups[~np.array(hides), :BINS] = TINY
     return np.asarray(groups / groups.sum(axis=1, keepdims=True))
 
 
@@ -319,7 +335,7 @@ def carried(
 def _expecting(kept: StreetBelief, context: Context, street: StreetModel) -> StreetBelief:
     """Return the belief at the prior of context and model, which may be another one than a step ago."""
     usual = _usual(context, kept.share)
-    if not np.array_equal(usual, kept.usual):
+    if usual is not kept.usual and not np.array_equal(usual, kept.usual):
         before, after = (StreetPrior.of(one, street).weights for one in (kept.usual, usual))
         kept = replace(kept, joint=kept.joint.at_prior(before, after), usual=usual)
     return replace(kept, groups=_with_traffic(kept, context, street))
@@ -334,7 +350,11 @@ def informed(
     settings: FilterSettings,
 ) -> StreetBelief:
     """Return the belief at a measurement after its evidence and new looks."""
-    street = settings.street
+    street, reading = settings.street, measurement.sequence
+    if measurement.heard.usable and isinstance(reading, SequenceReading):
+        if not kept.has_times:  # The alarm by windows goes by another event
+            kept = replace(kept, recent=(), over_ns=(None,) * kept.k)
+        kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
     before = kept = _expecting(kept, context, street)
     if measurement.heard.usable:
         kept = _read(kept, measurement, context, settings)
@@ -365,10 +385,6 @@ def _read(
     street, masked = settings.street, any(kept.emerged_since(stamp_ns, settings.street.masked_s))
     step_s = seconds(stamp_ns - kept.read_ns[source]) if source in kept.read_ns else math.inf
     if isinstance(reading, SequenceReading):
-        if not kept.has_times:  # The alarm by windows goes by another event
-            kept = replace(kept, recent=(), over_ns=(None,) * kept.k)
-        kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
-        kept = _expecting(kept, context, street)
         joint, sides, memory_s = *_sequence(kept, reading, context, street), street.reading_s
     else:
         if not np.ptp(measurement.signature.log_likelihoods):
@@ -384,13 +400,14 @@ def _read(
             read_ns = kept.read_ns | {source: stamp_ns}
             return kept if masked else replace(kept, joint=kept.joint.told(told**weight), read_ns=read_ns)
         joint, sides, memory_s = usual * told, list(range(kept.k)), street.window_s
-    kept = replace(kept, read_ns=kept.read_ns | {source: stamp_ns})
+    read_ns = kept.read_ns | {source: stamp_ns}
     if masked:
-        return kept
+        return replace(kept, read_ns=read_ns)
     # Of evidence that overlaps, what is new counts.
     new = -math.expm1(-step_s / memory_s)
     joint, heard = joint / joint.sum(), measurement.heard.share
-    return replace(kept, joint=kept.joint.read(source, joint, kept.prior(street), sides, new, heard))
+    after = kept.joint.read(source, joint, kept.prior(street), sides, new, heard)
+    return replace(kept, joint=after, read_ns=read_ns)
 
 
 def _sequence(
@@ -428,7 +445,7 @@ def alerted(kept: StreetBelief, policy: CueingPolicy, street: StreetModel) -> St
     rows = [
         [one[1][k] for one in of_hop if ns is None or one[0] >= ns] for k, ns in enumerate(kept.emerged_ns)
     ]
-    decided, threshold = np.array([float(np.mean(row)) for row in rows]), kept.threshold_nats(policy, street)
+    decided, threshold = np.array([sum(row) / len(row) for row in rows]), kept.threshold_nats(policy, street)
     elsewhere = np.maximum(1.0 - kept.joint.none_comes, TINY) - kept.comes
     # By windows all sides have the same log-odds.
     rank = decided if kept.has_times else kept.comes.round(9)
