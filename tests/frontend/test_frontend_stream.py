@@ -388,6 +388,14 @@ def test_what_lasts_for_ten_seconds_is_the_sound_of_the_place() -> None:
     assert set(shares[:101]) == {1.0} and set(shares[101:200]) == {0.0} and set(shares[203:]) == {1.0}
 
 
+def test_a_hop_that_noise_covers_is_not_heard_though_most_of_the_window_is() -> None:
+    sound = noise_from(SQUARE, 0.5, 16_000, 2.5)
+    sound[17_600:20_800] += 20.0 * np.random.default_rng(1).standard_normal((3200, 4))
+    heard = {one.sample_index: one.heard for one in FrontEnd(SQUARE, 16_000).process(sound)}
+    assert [heard[end] for end in (19_200, 20_800)] == [0.0, 0.0]
+    assert heard[17_600] == heard[40_000] == 1.0 and 0.5 < heard[24_000] < 0.9
+
+
 @pytest.mark.long
 @settings(deadline=None, max_examples=10)
 @given(st.integers(17_600, 30_000), st.integers(3200, 9600), st.booleans())
