@@ -149,7 +149,7 @@ def _least(loss: Callable[[StreetModel], float], name: str) -> float:
 
 
 def _mixture(errors: FloatArray, span_rad: float) -> tuple[float, float, float]:
-    """Return share and deviation of normal errors, the rest anywhere in a span, by EM; and their likelihood."""
+    """Return share and deviation of normal errors, the rest anywhere in a span, and the likelihood, by EM."""
     share, std = 0.5, 0.1
     for _ in range(_ROUNDS):
         own = share * np.exp(-0.5 * (errors / std) ** 2) / (std * math.sqrt(2.0 * math.pi))
