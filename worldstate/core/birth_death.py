@@ -113,15 +113,17 @@ def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) 
     """Return the side on which a hidden entity is born, if one is: of one vehicle the likelier one."""
     tracks, sides, least, every = memory.tracks, memory.sides, site.street.birth, range(len(site.sides))
     heard = _heard_rows(tracks)
+    # The window still holds the sound from before one came into view.
+    masked = memory.belief.emerged_since(memory.stamp_ns, site.street.masked_s)
     taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
     if heard and (len(heard) > 1 or sides.both < least):
         return None
-    if not taken and (sides.hidden_on(None) >= least or any(alarmed)):
+    if not taken and not any(masked) and (sides.hidden_on(None) >= least or any(alarmed)):
         return max(every, key=sides.hidden_on)
     # In view by its sound, while no sensor looks.
-    if not heard and max(memory.belief.shown) >= least:
+    if not heard and not any(masked) and max(memory.belief.shown) >= least:
         return max(every, key=memory.belief.shown.__getitem__)
-    free = [k for k in every if k not in taken and (sides.hidden[k] >= least or alarmed[k])]
+    free = [k for k in every if not masked[k] and k not in taken and (sides.hidden[k] >= least or alarmed[k])]
     return max(free, key=sides.hidden_on, default=None)
 
 
