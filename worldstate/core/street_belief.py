@@ -178,7 +178,7 @@ class StreetBelief:
     def sides(self) -> SideBelief:
         """Marginals of the joint belief over sides and explanations."""
         # The last digits depend on the order of sums, and must not decide at a threshold.
-        in_view = np.maximum(self.joint.emerged_from, np.minimum(self.shown, 1.0 - self.comes))
+        in_view = np.maximum(self.joint.emerged_from, self.shown)
         told, emerged = (tuple(one.round(12).tolist()) for one in (self.comes, in_view))
         return SideBelief(
             told, emerged, told, 1.0 - self.joint.none_comes, self.joint.explanations, self.both_come
