@@ -17,7 +17,7 @@ from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, Seque
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.association import associated, emergence_density, joint_association, reached_edge
 from worldstate.belief.detection import camera_scan, fused
-from worldstate.belief.hidden_bearing import hidden_motion, time_to_visible
+from worldstate.belief.hidden_bearing import hidden_motion, motion_in_view, time_to_visible
 from worldstate.belief.joint_belief import joint_reading
 from worldstate.belief.kinematics.cartesian import CartesianBelief, arc
 from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief
@@ -26,11 +26,13 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks, born
-from worldstate.core.acoustic_update import association_probability
+from worldstate.core.acoustic_update import acoustic_update, association_probability
 from worldstate.core.birth_death import hidden_on
+from worldstate.core.detection_update import _hidden
+from worldstate.core.memory import first_memory
 from worldstate.core.street_belief import ArrivalRate, StreetBelief, carried, informed, of_two
 from worldstate.ground import LEAST_HEARD
-from worldstate.measurement import CameraLook, Heard, Look, Sector
+from worldstate.measurement import Bearing, CameraLook, Heard, Look, Sector
 
 SEEDS, UNIT = st.integers(0, 2**32 - 1), st.floats(0.01, 0.99)
 NATS, LARGE = st.floats(-4.0, 4.0), st.floats(0.0, 9.0)  # Large ones have to be limited
@@ -343,6 +345,35 @@ def test_a_peak_is_the_entitys_own_or_anywhere_ahead(apart, own_path) -> None:
     assert chance == pytest.approx(own / (own + (1.0 - own_path) / math.pi), rel=1e-9)
 
 
+@given(st.floats(-1.0, 1.0), st.floats(-0.6, 0.6), st.floats(0.01, 0.3))
+@settings(max_examples=20)
+def test_a_peak_is_where_the_vehicle_was_as_long_ago_as_bearings_are_late(azimuth, rate, apart) -> None:
+    """As far ahead of that place and behind it, peaks move the vehicle as far, in opposite ways."""
+    motion = MotionBelief.around((azimuth, rate, -0.2, 3.2), (0.1, 0.3, 0.1, 0.3))
+    late_rad, moved = azimuth - SITE.street.bearing_s * rate, list[np.ndarray]()
+    for way in (1.0, -1.0):
+        memory = first_memory(Context(), FilterSettings(), 0)
+        memory.tracks = Tracks.of([replace(born("left", 0, 0.9, 0, SITE), motion=motion)])
+        acoustic_update(
+            memory, replace(said(1), bearing=Bearing(late_rad + way * apart, 0.3, 3.0)), 1.0, SITE
+        )
+        moved.append(way * (memory.tracks.mean[0] - motion.mean))
+    assert moved[0] == pytest.approx(moved[1], abs=1e-9) and moved[0][0] > 1e-4
+
+
+@given(UNIT, UNIT, UNIT)
+@settings(max_examples=20)
+def test_a_miss_makes_an_occluder_likelier_and_a_detection_denies_it_but_for_what_a_radar_finds(
+    before, detected, chance
+) -> None:
+    tracks = Tracks.of([replace(seen(0.1, 0.9), behind=before)])
+    missed = before / (before + (1.0 - before) * (1.0 - detected))
+    for by_radar, rate in ((False, 0.0), (True, SITE.street.hidden_return)):
+        found = before * rate / (before * rate + 1.0 - before)
+        (after,) = _hidden(tracks, np.array([detected]), np.array([chance]), by_radar, SITE.street)
+        assert after == pytest.approx(chance * found + (1.0 - chance) * missed)
+
+
 @given(
     st.floats(9.0, 15.0), st.floats(12.0, 30.0), st.floats(-2.0, 2.0), st.floats(-10.0, -4.0),
     st.floats(-2.0, 9.0), st.floats(-0.3, 0.3), st.floats(4.0, 9.0),
@@ -374,6 +405,19 @@ def test_one_only_heard_goes_towards_the_axis_at_the_pace_of_its_lane(group) -> 
         assert way * moved.azimuth_rad > 0.56
         expected = -way * side.pace_hz * math.cos(moved.azimuth_rad) ** 2
         assert moved.mean[AZIMUTH_RATE] == pytest.approx(expected, rel=1e-9)
+
+
+@given(SEEDS)
+@settings(max_examples=10)
+def test_a_vehicle_in_view_has_the_mean_of_its_likeliest_side_and_the_errors_of_all(seed) -> None:
+    rng, before = np.random.default_rng(seed), LEFT.prior()
+    coming, shares = drawn(seed)[:, :COMING], rng.dirichlet(np.ones(2))
+    pairs = zip(coming, SITE.sides, strict=True)
+    each = [hidden_motion(one, 0.0, side, before) for one, side in pairs]
+    found, mean = motion_in_view(coming, shares, SITE, before), each[int(shares.argmax())].mean
+    errors = [one.covariance + np.outer(one.mean - mean, one.mean - mean) for one in each]
+    np.testing.assert_allclose(found.mean, mean)
+    np.testing.assert_allclose(found.covariance, shares[0] * errors[0] + shares[1] * errors[1], atol=1e-12)
 
 
 def test_a_cue_names_an_entity_of_its_own_side_before_one_of_unknown_side() -> None:

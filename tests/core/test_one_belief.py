@@ -20,6 +20,7 @@ from worldstate.belief.street_model import StreetModel
 from worldstate.ground import LEAST_HEARD
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Heard, Look, Odometry, Position, PositionScan
+from worldstate.state import Priors
 
 SEEDS = st.integers(0, 2**32 - 1)
 SILENT = NotUsable("not scripted")
@@ -85,9 +86,13 @@ def test_every_snapshot_holds_to_the_laws(sequence: bool, seed: int) -> None:
 @given(SEEDS)
 @settings(max_examples=6, deadline=None)
 def test_an_alarm_depends_on_time_not_on_how_many_measurements_carry_it(seed: int) -> None:
-    """Empty messages, odometry and a source that says nothing, with the hops and between them."""
+    """Empty messages, odometry, a source without evidence and a camera that misses all, at hops and between.
+
+    The looks of that camera enter the mean that decides: of each hop the last one counts.
+    """
     rng, flat = np.random.default_rng(seed), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
-    alone = crowded = WorldFilter()
+    # The traffic that is seen, which a camera that looks counts, moves no prior that is given.
+    alone = crowded = WorldFilter(Context(priors=Priors(0.2, 0.3, 0.5)))
     near_ns = [0, 0]  # When what decides was last so near to the threshold that dynamics may cross it
     for number in range(1, 30):
         said = replace(hop(rng, number, sequence=True), sightings=())
@@ -101,8 +106,9 @@ def test_an_alarm_depends_on_time_not_on_how_many_measurements_carry_it(seed: in
         for later_ns in sorted(rng.choice([0, *range(10**7, 9 * 10**7, 10**7)], rng.integers(0, 4)).tolist()):
             at_ns = said.stamp_ns + later_ns
             nothing = Measurement(at_ns, flat, Unqueried("-"), SILENT, SILENT, source="second")
-            extra = (nothing, PositionScan("v2x", at_ns), Odometry("wheels", at_ns, 0.0))
-            crowded = crowded.update(extra[rng.integers(3)])
+            blind = replace(nothing, look=Look("blind", at_ns, Absent(1.0 - 1e-12)))
+            extra = (nothing, PositionScan("v2x", at_ns), Odometry("wheels", at_ns, 0.0), blind)
+            crowded = crowded.update(extra[rng.integers(4)])
 
 
 def test_what_a_risk_has_denied_does_not_decide_once_time_has_lifted_the_risk() -> None:
@@ -289,6 +295,7 @@ def test_a_second_vehicle_believed_apart_is_not_unheard_because_the_first_masks_
     right = {one.direction: one for one in before.entities}["right"]
     now = {one.id: one for one in world.state.entities if one.status == "hidden"}[right.id]
     assert now.existence_probability > 0.95 * right.existence_probability
+    assert now.direction == "right"  # What is in view on the left is the other one
     # It was believed to come within two seconds: a part of it may have come by now.
     assert cue_of(world.state, "right").risk > 0.8 * cue_of(before, "right").risk
 

@@ -419,16 +419,27 @@ def test_every_number_of_the_belief_acts_on_a_pass(name: str) -> None:
     assert not np.allclose(passed_by(changed), passed_by(STREET), atol=1e-6)
 
 
-@settings(max_examples=8, deadline=None)
+@pytest.mark.parametrize("kind", ["sequence", "posterior", "likelihood"])
+@settings(max_examples=6, deadline=None)
 @given(SEEDS)
-def test_for_a_second_and_a_half_after_a_pass_what_is_heard_is_the_vehicle_in_view(seed: int) -> None:
-    said, moved = drawn(np.random.default_rng(seed), 2), list[bool]()
-    before = run(WorldFilter(), [heard(hop, said[0]) for hop in range(8)])[-1]
+def test_for_a_second_and_a_half_after_a_pass_what_is_heard_is_the_vehicle_in_view(
+    kind: str, seed: int
+) -> None:
+    """Of readings, of windows of which the new part counts, and of windows as likelihoods."""
+    rng, moved = np.random.default_rng(seed), list[bool]()
+    said, nats = drawn(rng, 2), rng.uniform(-3.0, 3.0, (2, 4)).tolist()
+
+    def at(hop: int, k: int) -> Measurement:
+        one, (left, right, visible, none) = heard(hop, said[k] if kind == "sequence" else None), nats[k]
+        return replace(one, signature=SignatureEvidence(("left", "right"), (left, right), visible, none))
+
+    windows = FilterSettings(windows="likelihood" if kind == "likelihood" else "posterior")
+    before = run(WorldFilter(settings=windows), [at(hop, 0) for hop in range(8)])[-1]
     kept = before.memory.belief.handed_over({0: 0.02}, (), before.stamp_ns, STREET)
     masked = replace(before, memory=replace(before.memory, belief=kept), lag=None)
     for after_s in (0.1, 1.2, 1.5):
-        at = round(masked.stamp_ns * 1e-8 + 10 * after_s)
-        risks = [masked.update(heard(at, one)).belief.risks for one in said]
+        hop = round(masked.stamp_ns * 1e-8 + 10 * after_s)
+        risks = [masked.update(at(hop, k)).belief.risks for k in (0, 1)]
         moved.append(not np.allclose(*risks, atol=1e-9))
     assert moved == [False, False, True]
 
@@ -556,6 +567,21 @@ def test_what_sounds_in_view_is_an_entity_though_it_was_none_before_if_no_camera
         measured = [heard(hop, one, UNASKED if hop < 5 else answer) for hop, one in enumerate(said)]
         world = run(WorldFilter(settings=EXACT), measured)
         assert not world[4].state.entities and len(world[-1].state.entities) == found
+
+
+def test_what_a_camera_has_seen_come_is_one_entity_if_no_camera_looks_any_more() -> None:
+    """Its sound goes on, and is that of the vehicle which is tracked, not of another one."""
+    world, said = WorldFilter(settings=EXACT), approach()
+    for hop, one in enumerate(said + said[-1:] * 8, 1):
+        boxes = (Sighting(0.53 - 0.04 * (hop - 31), 0.02, "car", 0.9),) if 31 <= hop <= 34 else ()
+        answer = UNASKED if hop > 34 else Present(0.04, 0.01) if boxes else Absent(0.04, 0.01)
+        look = Look("camera", hop * 10**8, answer)
+        world = world.update(replace(heard(hop, one, answer), look=look, sightings=boxes))
+        if hop == 30:
+            (before,) = world.state.entities
+        elif hop > 30:
+            (now,) = world.state.entities
+            assert now.id == before.id and now.status != "hidden"
 
 
 def test_who_will_read_a_sequence_waits_for_it() -> None:

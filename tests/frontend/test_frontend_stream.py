@@ -18,7 +18,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.bearing import direct_probability, srp_phat
 from worldstate.frontend.direction.feature import feature_nfft
-from worldstate.frontend.hop_spectra import BANDS, NoiseMeter
+from worldstate.frontend.hop_spectra import BANDS, LevelMeter, NoiseMeter
 from worldstate.frontend.settings import ELEVATIONS_RAD, FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -161,6 +161,15 @@ def test_band_levels_of_white_noise_and_a_tone() -> None:
     levels = FrontEnd(SQUARE, RATE).process(tone)[0].band_log_energy
     assert np.exp(levels).max() == pytest.approx(0.5, rel=0.02)
     assert np.sort(levels)[-3] < np.log(1e-6)
+
+
+def test_the_level_of_a_hop_is_that_of_the_frames_without_lost_samples() -> None:
+    loud, quiet = (gain * np.random.default_rng(0).standard_normal((1024, 4)) for gain in (1.0, 0.1))
+    both, alone = (LevelMeter(4, RATE, FrontEndSettings(nfft=512)) for _ in range(2))
+    # Of seven frames of 512 samples, 256 apart, the last three hold no loud sample.
+    heard = np.array([False] * 4 + [True] * 3)
+    level = both.push(np.vstack([loud, quiet]), heard=heard)
+    np.testing.assert_allclose(level, alone.push(quiet), atol=1e-6)
 
 
 def test_silence_says_so() -> None:
@@ -386,6 +395,14 @@ def test_what_lasts_for_ten_seconds_is_the_sound_of_the_place() -> None:
     meter, level = NoiseMeter(), np.full(BANDS, -12.0)
     shares = [meter.push(level + (3.0 if hop > 100 else 0.0), 0.5)[0] for hop in range(230)]
     assert set(shares[:101]) == {1.0} and set(shares[101:200]) == {0.0} and set(shares[203:]) == {1.0}
+
+
+def test_a_hop_that_noise_covers_is_not_heard_though_most_of_the_window_is() -> None:
+    sound = noise_from(SQUARE, 0.5, 16_000, 2.5)
+    sound[17_600:20_800] += 20.0 * np.random.default_rng(1).standard_normal((3200, 4))
+    heard = {one.sample_index: one.heard for one in FrontEnd(SQUARE, 16_000).process(sound)}
+    assert [heard[end] for end in (19_200, 20_800)] == [0.0, 0.0]
+    assert heard[17_600] == heard[40_000] == 1.0 and 0.5 < heard[24_000] < 0.9
 
 
 @pytest.mark.long
