@@ -71,8 +71,7 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
 
     .. math:: \dot\theta = -\frac{v}{d} \cos^2\theta, \qquad \frac{\dot r}{r} = \dot\theta \tan\theta
 
-    and stands at the edge, give or take. Of a hidden one what was heard of its approach
-    rate is kept.
+    and stands at the edge, give or take. Of a hidden one what was heard of its approach rate is kept.
     """
     hidden_rad, hidden_std = hidden_bearing(coming, side)
     in_view_rad = side.edge_azimuth_rad

@@ -101,9 +101,8 @@ class StreetBelief:
         never, k = (None,) * len(context.directions), len(context.directions)
         usual, watch = _usual(context, None), BudgetWatch(over_ns=never, emerged_ns=never)
         joint = JointBelief(StreetPrior.of(usual, street).weights)
-        alarm: tuple[float, ...] = (_LEAST_NATS,) * k
-        first = cls(joint, usual, usual, never, alarm, never, (ArrivalRate(),) * k, watch=watch)
-        return replace(first, shown=(0.0,) * k)
+        alarm, shown = (_LEAST_NATS,) * k, (0.0,) * k
+        return cls(joint, usual, usual, never, alarm, never, (ArrivalRate(),) * k, shown=shown, watch=watch)
 
     def check(self, directions: int) -> None:
         """Refuse what a file cannot have been written with, for so many approach sides."""
