@@ -359,7 +359,7 @@ def test_every_snapshot_of_a_stream_holds_to_the_laws(seed: int, tmp_path: Path)
     """Of fifteen minutes each, two hours together."""
     streets = [junction_named(name) for name in ("SA1", "SA2", "SB1", "SB2")]
     settings = StreamSettings(streets[seed % 4], 15.0, seed, traffic_named("pairs"), sample_rate_hz=6000.0)
-    (heard,) = hear_stream(settings, ovad_array())
+    (heard,) = hear_stream(settings, [ovad_array()])
     heard.save(tmp_path / "stream.npz")
     model, world, before = read_model(), WorldFilter(), None
     street = street_listener(model.domain, None, None)

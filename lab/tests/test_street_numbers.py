@@ -68,7 +68,7 @@ def test_tracks_single_boxes_and_growth_are_counted(growth: float, vehicles: int
 @pytest.mark.slow
 def test_the_command_fits_streams_and_a_corner(tmp_path, capsys) -> None:
     street = StreamSettings(junction_named("SA1"), 1.2, 3, traffic_named("pairs"), sample_rate_hz=6000.0)
-    (heard,) = hear_stream(street, ovad_array())
+    (heard,) = hear_stream(street, [ovad_array()])
     heard.save(path := tmp_path / "stream.npz")
     corner = write_corner(tmp_path / "corner", np.random.default_rng(1))
     assert main(["street", str(path), "--sequences", str(corner), "--json"]) == 0

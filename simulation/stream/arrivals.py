@@ -1,6 +1,7 @@
 """Arrivals: every flow is a Poisson process, every arrival one vehicle or several."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,11 +47,18 @@ class SoundEvent:
 
     sound: SoundSettings
     start_s: float  # Time of the stream at which its clock is 0
+    gusty: tuple[tuple[int, ...], ...] = ()  # Of gusts: the channels that they hit of each array
 
     @property
     def end_s(self) -> float:
         """Time of the stream at which it is over, with what comes late."""
         return self.start_s + self.sound.end_s + SOUND_MARGIN_S
+
+    def at(self, array: int) -> "SoundEvent":
+        """Return it as it is at one of the arrays."""
+        if not self.gusty:
+            return self
+        return replace(self, sound=replace(self.sound, channels=self.gusty[array]))
 
 
 Event = VehicleEvent | SoundEvent
@@ -130,15 +138,27 @@ def _later(traffic: Traffic, rng: np.random.Generator) -> float:
     return float(rng.uniform(-traffic.apart_s, traffic.apart_s))
 
 
-def draw_sounds(settings: StreamSettings, microphones: int, rng: np.random.Generator) -> list[SoundEvent]:
-    """Draw all sounds of a stream that are no vehicle's, each kind a Poisson process of its own."""
+def draw_sounds(
+    settings: StreamSettings, arrays: Sequence[int], rng: np.random.Generator
+) -> list[SoundEvent]:
+    """Draw all sounds of a stream that are no vehicle's, each kind a Poisson process of its own.
+
+    `arrays` are numbers of microphones.
+    """
     events: list[SoundEvent] = []
     kinds = settings.traffic.sounds
     for (kind, rate), own in zip(sorted(kinds.items()), rng.spawn(len(kinds)), strict=True):
         for arrival_s in own.uniform(0.0, settings.duration_s, own.poisson(rate * settings.minutes / 60.0)):
             empty = SimulationSettings(settings.site, "none", duration_s=own.uniform(*SOUND_S))
-            sound = with_sounds(empty, [kind], microphones, own).sounds[0]
-            events.append(SoundEvent(replace(sound, start_s=SOUND_MARGIN_S), float(arrival_s)))
+            gusts = kind == "gusts"
+            # Gusts draw more or less by the number of microphones: what is drawn next must not depend on it.
+            draws = [deepcopy(one) for one in own.spawn(1) * len(arrays)] if gusts else [own]
+            at = [
+                with_sounds(empty, [kind], microphones, one).sounds[0]
+                for microphones, one in zip(arrays, draws, strict=False)
+            ]
+            gusty = tuple(one.channels for one in at) if gusts else ()
+            events.append(SoundEvent(replace(at[0], start_s=SOUND_MARGIN_S), float(arrival_s), gusty))
     return sorted(events, key=lambda event: event.start_s)
 
 

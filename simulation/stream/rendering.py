@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, add_vehicle
+from worldstate.simulation.emitters.placed_sound import WEATHER, add_signal, add_sound, add_vehicle
 from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
@@ -34,12 +34,38 @@ from .settings import StreamSettings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Microphones:
-    """Where the microphones are and how they differ."""
+    """Where the microphones of one or several arrays are and how they differ."""
 
     positions_m: FloatArray  # shape (M, 3): In `base_link`, z above the road
     skew_s: FloatArray  # shape (M,): Phase mismatch as a delay
     gains: FloatArray  # shape (M,): About 1
     sample_rate_hz: float
+    sizes: tuple[int, ...] = ()  # Microphones of each array, one after another; empty: all are one array's
+
+    @property
+    def slices(self) -> list[slice]:
+        """Channels of each array."""
+        ends = np.cumsum(self.sizes or (len(self.positions_m),)).tolist()
+        return [slice(first, last) for first, last in zip([0, *ends], ends, strict=False)]
+
+    @property
+    def arrays(self) -> list["Microphones"]:
+        """The microphones of each array alone."""
+        rate = self.sample_rate_hz
+        return [
+            Microphones(self.positions_m[own], self.skew_s[own], self.gains[own], rate) for own in self.slices
+        ]
+
+    @classmethod
+    def joined(cls, arrays: Sequence["Microphones"]) -> "Microphones":
+        """Return the microphones of several arrays, which all have their centre in one place."""
+        return cls(
+            np.concatenate([one.positions_m for one in arrays]),
+            np.concatenate([one.skew_s for one in arrays]),
+            np.concatenate([one.gains for one in arrays]),
+            arrays[0].sample_rate_hz,
+            tuple(len(one.gains) for one in arrays),
+        )
 
     def receiver(self, knots_s: FloatArray, ego: EgoMotion = STANDING) -> Receiver:
         """Return these microphones, listening between knots, shape (K + 1,)."""
@@ -234,7 +260,8 @@ class Block:
     """Sound from one sample on, and the loudness of the events that are in it from their beginning."""
 
     pressure_pa: Float32Array  # shape (M, n)
-    loudness_db: dict[int, FloatArray]  # shape (2, R): At the rows of every event, of all and of `BAND_HZ`
+    # shape (arrays, 2, R): At the rows of every event, of all and of `BAND_HZ`, at each array
+    loudness_db: dict[int, FloatArray]
 
 
 def row_times(event: Event, settings: StreamSettings) -> FloatArray:
@@ -283,26 +310,43 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
         if not ego.stands:
             _add_ego(sound, scene)
         for number, event in piece.events.items():
-            rng = settings.generator(EVENT, number)
-            alone = event_sound(event, settings.site, settings.preset, scene.microphones, rng, ego, within)
-            rows_s = row_times(event, settings)
-            levels = (loudness_db(alone, rows_s, rate, banded=banded) for banded in (False, True))
-            loudness[number] = np.stack([*levels])
+            alone, rows_s = _event_alone(scene, number, event), row_times(event, settings)
+            at = [EventSound(alone.first, alone.pressure_pa[own]) for own in scene.microphones.slices]
+            loudness[number] = np.array(
+                [[loudness_db(one, rows_s, rate, banded=banded) for banded in (False, True)] for one in at]
+            )
             heard = alone.pressure_pa[:, max(-alone.first, 0) :]
-            at = max(alone.first, 0) - begin
-            sound[:, at : at + heard.shape[1]] += heard
+            first = max(alone.first, 0) - begin
+            sound[:, first : first + heard.shape[1]] += heard
     return Block(sound, loudness)
 
 
+def _event_alone(scene: StreamScene, number: int, event: Event) -> EventSound:
+    """Render one event at all arrays; weather at each by itself, for drops and gusts hit microphones."""
+    settings, microphones = scene.settings, scene.microphones
+    street, drive = (settings.site, settings.preset), (settings.ego, scene.within_s)
+    if not isinstance(event, SoundEvent) or event.sound.kind not in WEATHER:
+        return event_sound(event, *street, microphones, settings.generator(EVENT, number), *drive)
+    heard = [
+        event_sound(event.at(array), *street, one, settings.generator(EVENT, number), *drive)
+        for array, one in enumerate(microphones.arrays)
+    ]
+    return EventSound(heard[0].first, np.concatenate([one.pressure_pa for one in heard]))
+
+
+# What every microphone hears by itself is drawn array by array from the same generator: what an array hears
+# does not depend on the arrays beside it.
 def _add_ambience(sound: Float32Array, scene: StreamScene, number: int) -> None:
-    rng = scene.settings.generator(AMBIENCE, number)
-    piece = ambience_piece(scene, scene.piece, rng, begins=number == 0)
-    sound[:, : piece.shape[1]] += piece
+    for own, microphones in zip(scene.microphones.slices, scene.microphones.arrays, strict=True):
+        rng = scene.settings.generator(AMBIENCE, number)
+        piece = ambience_piece(replace(scene, microphones=microphones), scene.piece, rng, begins=number == 0)
+        sound[own, : piece.shape[1]] += piece
 
 
 def _add_ego(sound: Float32Array, scene: StreamScene) -> None:
     """Add what the ego itself sounds like over a drive."""
     settings = scene.settings
     knots = np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz
-    receiver = scene.microphones.receiver(knots, settings.ego)
-    add_ego(sound, receiver, settings.site, settings.preset, settings.generator(EGO_NOISE))
+    for own, microphones in zip(scene.microphones.slices, scene.microphones.arrays, strict=True):
+        receiver = microphones.receiver(knots, settings.ego)
+        add_ego(sound[own], receiver, settings.site, settings.preset, settings.generator(EGO_NOISE))

@@ -20,7 +20,7 @@ from worldstate.simulation.dataset.recording import FULL_SCALE_PA, put_in_place,
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 
 from .arrivals import SoundEvent, draw_events, draw_sounds
-from .rendering import Block, StreamScene, draw_microphones, render_blocks
+from .rendering import Block, Microphones, StreamScene, draw_microphones, render_blocks
 from .settings import StreamSettings
 from .truth import (
     EVENTS_NAME,
@@ -41,7 +41,7 @@ class DrawnStream:
     """Arrivals and microphones of a stream; its sound is written or listened to as it is rendered."""
 
     scene: StreamScene
-    array: MicrophoneArray
+    arrays: tuple[MicrophoneArray, ...]
     vehicles: tuple[VehicleTruth, ...]
     sounds: tuple[SoundEvent, ...]
 
@@ -50,21 +50,25 @@ class DrawnStream:
         return render_blocks(self.scene, [*(one.event for one in self.vehicles), *self.sounds], jobs)
 
     def recorded(self, block: Block) -> Float32Array:
-        """Return what the converters make of a block, shape (n, M), full scale 1."""
+        """Return what the converters of all arrays make of a block, shape (n, M), full scale 1."""
         # Gains are the converters': they come after everything that sounds, and are in no level of the truth.
         gains = (self.scene.microphones.gains / FULL_SCALE_PA).astype(np.float32)[:, None]
         return np.asarray(np.clip(block.pressure_pa * gains, -1.0, 1.0).T)
 
 
-def draw_stream(settings: StreamSettings, array: MicrophoneArray) -> DrawnStream:
-    """Draw vehicles, other sounds, background and microphones of a stream, each from its own generator."""
+def draw_stream(settings: StreamSettings, *arrays: MicrophoneArray) -> DrawnStream:
+    """Draw vehicles, other sounds, background and microphones of a stream, each from its own generator.
+
+    Several arrays stand in one place, as if each of them were there alone.
+    """
     events = draw_events(settings, settings.generator(ARRIVALS))
-    microphones = draw_microphones(settings, array, settings.generator(CHANNELS))
+    drawn = [draw_microphones(settings, one, settings.generator(CHANNELS)) for one in arrays]
+    sizes = [one.n_microphones for one in arrays]
     return DrawnStream(
-        StreamScene.drawn(settings, microphones, settings.generator(LEVEL)),
-        array,
+        StreamScene.drawn(settings, Microphones.joined(drawn), settings.generator(LEVEL)),
+        arrays,
         tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events)),
-        tuple(draw_sounds(settings, array.n_microphones, settings.generator(SOUNDS))),
+        tuple(draw_sounds(settings, sizes, settings.generator(SOUNDS))),
     )
 
 
@@ -195,7 +199,7 @@ def write_stream(
         temporary = Path(hidden) / target.name
         temporary.mkdir()
         heard, loudness = _write_sound(temporary / AUDIO_NAME, stream, jobs, progress)
-        write_array_xml(temporary / ARRAY_NAME, stream.array)
+        write_array_xml(temporary / ARRAY_NAME, stream.arrays[0])
         _write_beside(temporary, stream, loudness)
         put_in_place(target, temporary)
     return WrittenStream(target, settings, stream.vehicles, stream.sounds, heard)
@@ -214,8 +218,8 @@ def _write_sound(
     ):
         for block in blocks:
             file.write(stream.recorded(block))
-            heard.add(block.pressure_pa[stream.array.middle])
-            loudness |= block.loudness_db
+            heard.add(block.pressure_pa[stream.arrays[0].middle])
+            loudness |= {number: levels[0] for number, levels in block.loudness_db.items()}
             if progress is not None:
                 progress(block.pressure_pa.shape[1] / rate)
     return heard, loudness

@@ -40,11 +40,24 @@ def test_positions_are_off_by_five_millimetres_in_every_direction() -> None:
 
 def test_one_rendering_is_heard_by_every_array_as_it_would_be_alone() -> None:
     settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
-    right, turned, _ = hear_stream(settings, ARRAY, list(mountings(ARRAY, np.random.default_rng(1)).values()))
-    (alone,) = hear_stream(settings, ARRAY)
+    mounted = list(mountings(ARRAY, np.random.default_rng(1)).values())
+    right, turned, _ = hear_stream(settings, [ARRAY], [mounted])
+    (alone,) = hear_stream(settings, [ARRAY])
     for name, column in alone.hops.columns.items():
         np.testing.assert_array_equal(right.hops.columns[name], column, err_msg=name)
     assert not np.array_equal(turned.hops.feature, right.hops.feature)
+
+
+def test_what_is_rendered_for_one_array_is_kept_for_those_beside_it(tmp_path, monkeypatch) -> None:
+    """A second array of one call waits for no street to be rendered again, and hears what it would alone."""
+    settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
+    board = MicrophoneArray(ARRAY.positions_m[:3] * [1.0, 0.5, 1.0])
+    (expected,) = hear_stream(settings, [board])
+    list(commission.heard_streams([settings], ARRAY, tmp_path, beside=[board]))
+    monkeypatch.delattr(commission, "hear_stream")
+    (kept,) = commission.heard_streams([settings], board, tmp_path)
+    np.testing.assert_allclose(kept.hops.feature, expected.hops.feature, atol=1e-5)
+    np.testing.assert_array_equal(kept.hops.time_s, expected.hops.time_s)
 
 
 def test_wrong_mountings_are_heard_in_as_many_processes_as_asked(tmp_path, monkeypatch) -> None:

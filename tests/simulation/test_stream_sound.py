@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.signal import welch
 from worldstate_lab.trials.trial import find_takes
 
@@ -21,6 +23,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation import preset, site
+from worldstate.simulation.scene.junction import drawn_site
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.presets import site_ambience
 from worldstate.simulation.scene.settings import SoundSettings
@@ -39,9 +42,9 @@ from worldstate.simulation.stream.rendering import (
     render_piece,
     row_times,
 )
-from worldstate.simulation.stream.settings import StreamSettings, traffic_named
+from worldstate.simulation.stream.settings import StreamSettings, Traffic, traffic_named
 from worldstate.simulation.stream.truth import visible_s
-from worldstate.simulation.stream.writing import write_stream
+from worldstate.simulation.stream.writing import draw_stream, write_stream
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
 # Nothing that swells or fades by itself: what is left is stationary.
@@ -120,7 +123,7 @@ def test_what_a_second_vehicle_adds_is_the_difference_of_scenes_with_it_and_with
         for block in (empty, first, both)
     )
     p1, p2 = (
-        halves(both.loudness_db[number][1], row_times(event, scene.settings))
+        halves(both.loudness_db[number][0, 1], row_times(event, scene.settings))
         for number, event in enumerate(events)
     )
     added = 10.0 * np.log10(1.0 + p2 / (p1 + background))
@@ -172,6 +175,31 @@ def test_pieces_do_not_depend_on_which_were_rendered_before() -> None:
     for one, other in zip(forth, reversed(back), strict=True):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(forth[0][:, :1000], forth[1][:, :1000])
+
+
+@pytest.mark.parametrize("place", ["SB1", "TA101", "DB102"])
+@given(seed=st.integers(0, 10_000), microphones=st.lists(st.integers(1, 5), min_size=2, max_size=2))
+@settings(max_examples=2, deadline=None)
+def test_what_an_array_hears_does_not_depend_on_the_arrays_beside_it(
+    place: str, seed: int, microphones: list[int]
+) -> None:
+    """Microphones hear wind, drops and gusts by themselves, each array as if it were there alone."""
+    traffic = Traffic("all", {"left": 1200, "joins": 600}, sounds={"gusts": 1200, "rain": 600, "voice": 600})
+    moment = StreamSettings(drawn_site(place), 0.08, seed, traffic, sample_rate_hz=2000.0)
+    draw = np.random.default_rng(seed)
+    arrays = [MicrophoneArray(draw.uniform(-0.3, 0.3, (number + 1, 3))) for number in microphones]
+    beside = draw_stream(moment, *arrays)
+    blocks = list(beside.blocks())
+    together = np.concatenate([beside.recorded(block) for block in blocks])
+    for number, (array, channels) in enumerate(zip(arrays, beside.scene.microphones.slices, strict=True)):
+        alone = draw_stream(moment, array)
+        heard = list(alone.blocks())
+        expected = np.concatenate([alone.recorded(block) for block in heard])
+        assert expected.std() > 0.0
+        np.testing.assert_allclose(together[:, channels], expected, atol=1e-5 * np.abs(expected).max())
+        for mine, every in zip(heard, blocks, strict=True):
+            for event, levels in mine.loudness_db.items():
+                np.testing.assert_allclose(every.loudness_db[event][number], levels[0], atol=1e-3)
 
 
 def test_memory_does_not_grow_with_the_length_of_a_stream() -> None:

@@ -188,7 +188,7 @@ def test_other_sounds_come_at_their_rate_and_rain_takes_boxes() -> None:
     rates = {"rain": 60.0, "voice": 240.0, "siren": 30.0}
     traffic = replace(traffic_named("busy"), sounds=rates)
     settings = StreamSettings(site("SB1"), 60.0, traffic=traffic)
-    sounds = draw_sounds(settings, 4, np.random.default_rng(1))
+    sounds = draw_sounds(settings, [4], np.random.default_rng(1))
     for kind, rate in rates.items():
         number = sum(one.sound.kind == kind for one in sounds)
         assert abs(number - rate) < 4.5 * np.sqrt(rate)

@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, fields, replace
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -71,22 +72,40 @@ FitWindows = Callable[[Sequence[HeardStream]], EnsembleModel]
 
 
 def heard_streams(
-    plan: Sequence[StreamSettings], array: MicrophoneArray, folder: Path, jobs: int = 1
+    plan: Sequence[StreamSettings],
+    array: MicrophoneArray,
+    folder: Path,
+    jobs: int = 1,
+    beside: Sequence[MicrophoneArray] = (),
 ) -> Generator[HeardStream, None, None]:
-    """Yield every stream of a plan, listened to now or, by the same settings and array, before."""
+    """Yield every stream of a plan, listened to now or, by the same settings and array, before.
+
+    What is rendered now is heard and kept for the arrays beside, too: a small one adds a sixth of
+    what it takes alone.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    for (one,) in in_processes(partial(_heard, array, [array], folder), plan, jobs):
+    arrays = [array, *beside]
+    for (one,) in in_processes(partial(_heard, arrays, [[one] for one in arrays], folder), plan, jobs):
         yield one
 
 
 def _heard(
-    array: MicrophoneArray, believed: Sequence[MicrophoneArray], folder: Path, settings: StreamSettings
+    arrays: Sequence[MicrophoneArray],
+    believed: Sequence[Sequence[MicrophoneArray]],
+    folder: Path,
+    settings: StreamSettings,
 ) -> list[HeardStream]:
-    paths = [_path(array, one, folder, settings) for one in believed]
-    if not all(path.is_file() for path in paths):
-        for path, heard in zip(paths, hear_stream(settings, array, believed), strict=True):
-            heard.save(path)
-    return [HeardStream.load(path) for path in paths]
+    """Return what the first array hears, as each that it is believed to be; keep what all of them hear."""
+    paths = [
+        [_path(one, other, folder, settings) for other in some]
+        for one, some in zip(arrays, believed, strict=True)
+    ]
+    missing = [number for number, some in enumerate(paths) if not all(path.is_file() for path in some)]
+    if missing:
+        heard = hear_stream(settings, [arrays[one] for one in missing], [believed[one] for one in missing])
+        for one, path in zip(heard, chain.from_iterable(paths[number] for number in missing), strict=True):
+            one.save(path)
+    return [HeardStream.load(path) for path in paths[0]]
 
 
 def _path(array: MicrophoneArray, believed: MicrophoneArray, folder: Path, settings: StreamSettings) -> Path:
@@ -186,10 +205,13 @@ def commission(
     excluded_lists: Sequence[str] = (),
     quiet: Sequence[Path] = (),
     recorded: RecordedClips | None = None,
+    beside: Sequence[MicrophoneArray] = (),
     jobs: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
     """Make a model for an array from simulated streets, and from labelled windows where there are any.
+
+    Streams are heard and kept in the folder for the arrays beside, too.
 
     Recordings without vehicles set the alarm in place of the simulated streets without hazards; guard and
     road users are learned from recorded clips as well. The model says where the labelled windows and the
@@ -202,7 +224,7 @@ def commission(
     domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
     real = None if table is None else windows_of_array(table, settings, domain)
     calm = quiet_streams(quiet, array, settings.onsets_per_hour) if quiet else []
-    for one in heard_streams(plan, array, folder, jobs):
+    for one in heard_streams(plan, array, folder, jobs, beside):
         streams.append(one)
         on_step()
     open_field = open_field_windows(
@@ -214,14 +236,14 @@ def commission(
         return fitted(*_table_and_beside(real, open_field, domain, some))
 
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, jobs, on_step)
-    windows, beside = _table_and_beside(real, open_field, domain, streams)
+    windows, simulated = _table_and_beside(real, open_field, domain, streams)
     model = train_model(
         windows,
         TrainingSettings(seed=settings.seed, repeats=1),
         dataset=SIMULATED if real is None else f"{source}; {SIMULATED}",
         group="dynamic" if settings.moving_ego else "static",
         excluded_lists=(*excluded_lists, *settings.leave_out),
-        simulated=beside,
+        simulated=simulated,
     )
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out. With recorded
@@ -345,12 +367,13 @@ def exam_of(
     settings: CommissionSettings,
     folder: Path,
     *,
+    beside: Sequence[MicrophoneArray] = (),
     jobs: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> list[ExaminedStream]:
     """Let a model hear streams of the five junctions with a name, which it has not learned."""
     examined = []
-    for one in heard_streams(exam_streams(settings), array, folder, jobs):
+    for one in heard_streams(exam_streams(settings), array, folder, jobs, beside):
         examined.append(_examined(model, one))
         on_step()
     return examined
@@ -370,6 +393,6 @@ def exam_of_mountings(
 ) -> Iterator[dict[str, ExaminedStream]]:
     """Let a model hear each stream of a junction as it would believe every wrong mounting of its array."""
     mounted = mountings(array, np.random.default_rng(settings.seed))
-    hear = partial(_heard, array, list(mounted.values()), folder)
+    hear = partial(_heard, [array], [list(mounted.values())], folder)
     for heard in in_processes(hear, mounting_streams(settings), jobs):
         yield {name: _examined(model, one) for name, one in zip(mounted, heard, strict=True)}

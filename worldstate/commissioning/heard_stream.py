@@ -239,19 +239,35 @@ class HeardStream:
 
 
 def hear_stream(
-    settings: StreamSettings, array: MicrophoneArray, believed: Sequence[MicrophoneArray] = ()
+    settings: StreamSettings,
+    arrays: Sequence[MicrophoneArray],
+    believed: Sequence[Sequence[MicrophoneArray]] = (),
 ) -> list[HeardStream]:
-    """Render a stream and listen to it, block by block, with each array that is believed to hear it."""
-    stream, loudness = draw_stream(settings, array), dict[int, FloatArray]()
+    """Render a stream once for several arrays and listen to it, block by block, with each of them.
+
+    What an array hears does not depend on the others. `believed` holds for each array what it is believed to
+    be, one stream each; by default itself.
+    """
+    stream, loudness = draw_stream(settings, *arrays), dict[int, FloatArray]()
+    slices = stream.scene.microphones.slices
+    ears = [
+        (number, slices[number], array)
+        for number, some in enumerate(believed or [[one] for one in arrays])
+        for array in some
+    ]
     about = {
         **{"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
         "sample_rate_hz": settings.sample_rate_hz,
     }
     with closing(stream.blocks()) as blocks:
         samples = _recorded(stream, blocks, loudness)
-        told = _heard_hops(samples, believed or [array], settings.sample_rate_hz, settings.name, about)
-    truth = _truth(stream.vehicles, loudness)
-    return [HeardStream(one, *truth) for one in told]
+        heard_by = [(channels, array) for _, channels, array in ears]
+        told = _heard_hops(samples, heard_by, settings.sample_rate_hz, settings.name, about)
+    truths = [
+        _truth(stream.vehicles, {event: levels[number] for event, levels in loudness.items()})
+        for number in range(len(arrays))
+    ]
+    return [HeardStream(one, *truths[number]) for one, (number, *_) in zip(told, ears, strict=True)]
 
 
 def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
@@ -259,7 +275,8 @@ def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
     with open_sound(sound, array.n_microphones, channels=array.channels) as audio:
         about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
         blocks = audio.blocks(round(audio.sample_rate_hz))
-        (hops,) = _heard_hops(blocks, [array], audio.sample_rate_hz, sound.name, about)
+        every = [(slice(None), array)]
+        (hops,) = _heard_hops(blocks, every, audio.sample_rate_hz, sound.name, about)
     return HeardStream(hops, *_truth((), {}))
 
 
@@ -274,25 +291,30 @@ def _recorded(
 
 def _heard_hops(
     blocks: Iterable[Float32Array],
-    arrays: Sequence[MicrophoneArray],
+    ears: Sequence[tuple[slice, MicrophoneArray]],
     sample_rate_hz: float,
     name: str,
     about: Mapping[str, object],
 ) -> list[HopTable]:
     chosen = listening_settings(sample_rate_hz)
-    front_ends = [FrontEnd(array, sample_rate_hz, chosen) for array in arrays]
-    frames: list[list[AcousticFrame]] = [[] for _ in arrays]
-    middle: list[Float32Array] = []
+    front_ends = [FrontEnd(array, sample_rate_hz, chosen) for _, array in ears]
+    frames: list[list[AcousticFrame]] = [[] for _ in ears]
+    middles: list[list[Float32Array]] = [[] for _ in ears]
     for samples in blocks:
-        middle.append(samples[:, arrays[0].middle].copy())
-        for heard, front_end in zip(frames, front_ends, strict=True):
-            heard += front_end.process(samples)
+        for heard, middle, front_end, (channels, array) in zip(
+            frames, middles, front_ends, ears, strict=True
+        ):
+            own = samples[:, channels]
+            middle.append(own[:, array.middle].copy())
+            heard += front_end.process(own)
     for heard, front_end in zip(frames, front_ends, strict=True):
         heard += front_end.finish()
     if not frames[0]:
         raise InvalidArgumentError(f"{name}: expected more than a second of sound")
-    whole = np.concatenate(middle)
-    return [HopTable(_columns(heard, whole), name=name, about=about) for heard in frames]
+    return [
+        HopTable(_columns(heard, np.concatenate(middle)), name=name, about=about)
+        for heard, middle in zip(frames, middles, strict=True)
+    ]
 
 
 def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
