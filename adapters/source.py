@@ -402,9 +402,10 @@ def open_source(
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     told = moving_ego or (ego is not None and ego.moves)
     moves = bool(told or (recording and recording.moving_ego) or context.ego_speed_mps)
-    known = model if isinstance(model, Model) else read_model(model, moving_ego=moves)
+    given = _read(array, read_array)
+    known = model if isinstance(model, Model) else read_model(model, moving_ego=moves, array=given)
     sequence, policy = _alarm_of(known, settings, moves)
-    heard_by, policy = _array_and_policy(sound, known, policy, _read(array, read_array), settings, moves)
+    heard_by, policy = _array_and_policy(sound, known, policy, given, settings, moves)
     if camera is None and (detections, detector) != (None, None):
         check_mounting(heard_by)
     if not set(SIDES) & set(context.directions):

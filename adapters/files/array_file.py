@@ -24,10 +24,12 @@ from worldstate.frontend.array.microphone_array import (
 )
 from worldstate.ground import FloatArray, InputFileError, InvalidArgumentError
 
-from .array_match import by_number
+from .array_match import by_number, microphone_order
 from .file_io import read_bytes, write_text
 
 _LOG = logging.getLogger(__name__)
+DATA = Path(str(files("worldstate"))) / "data"
+MODELS, PACKED = DATA / "models", ".json.gz"  # Beside the two models of the roof array
 
 Axes = Literal["acoular", "base_link"]
 # The coordinates x, y and z of a microphone as a file has them.
@@ -155,9 +157,30 @@ def named_arrays() -> dict[str, dict[str, Any]]:
     >>> ", ".join(named_arrays())
     'respeaker-4, respeaker-6, respeaker-usb, uma-8, uma-16, xmos'
     """
-    text = (files("worldstate") / "data" / "arrays.json").read_text("utf-8")
+    text = (DATA / "arrays.json").read_text("utf-8")
     known: dict[str, dict[str, Any]] = json.loads(text)
     return known
+
+
+def shipped_models() -> list[str]:
+    """Return the names of the models that ship beside the two of the roof array."""
+    return sorted(one.name.removesuffix(PACKED) for one in MODELS.glob(f"*{PACKED}"))
+
+
+def file_of_model(
+    path: str | Path | None = None, array: MicrophoneArray | None = None, *, moving_ego: bool = False
+) -> Path:
+    """Return the file that `read_model` reads with these arguments."""
+    named = shipped_models()
+    if path is not None and (str(path) not in named or Path(path).exists()):
+        return Path(path)
+    boards = named_arrays() if path is None and array is not None else {}
+    for name in boards.keys() & {*named}:
+        if array is not None and microphone_order(np.array(boards[name]["positions_m"]), array) is not None:
+            path = name
+    if path is not None:
+        return MODELS / f"{path}{PACKED}"
+    return DATA / ("moving_model.json" if moving_ego else "default_model.json")
 
 
 def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array") -> None:

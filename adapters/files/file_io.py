@@ -6,6 +6,7 @@ points to is replaced, and the link stays. Devices, pipes and folders are never 
 """
 
 import csv
+import gzip
 import io
 import itertools
 import json
@@ -16,6 +17,7 @@ import shutil
 import stat
 import uuid
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import fields, is_dataclass
@@ -87,9 +89,10 @@ def check_target(path: str | Path) -> Path:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 with plain newlines, whole or not at all."""
+    """Write `text` as UTF-8 with plain newlines, whole or not at all; packed if the name ends in .gz."""
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        data = text.encode()
+        temporary.write_bytes(gzip.compress(data, mtime=0) if temporary.suffix == ".gz" else data)
 
 
 def write_json(path: str | Path, value: object, indent: int | None = None) -> None:
@@ -337,13 +340,28 @@ def plain_file(path: str | Path, what: str) -> BinaryIO:
     return file
 
 
+UNREADABLE = (OSError, EOFError, zlib.error)  # Of a disk, or of a packed file
+
+
+@contextmanager
+def unpacked_file(path: str | Path, what: str) -> Iterator[BinaryIO]:
+    """Lend an open file; if its name ends in .gz, what is packed in it, unpacked as far as it is read."""
+    with plain_file(path, what) as file:
+        if Path(path).suffix != ".gz":
+            yield file
+            return
+        with gzip.GzipFile(fileobj=file) as packed, io.BufferedReader(packed) as unpacked:
+            yield unpacked
+
+
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
-    """Return what a file of at most so many bytes holds."""
+    """Return what a file, unpacked if its name ends in .gz, of at most so many bytes holds."""
     try:
-        with plain_file(path, what) as file:
+        with unpacked_file(path, what) as file:
             data = file.read(max_bytes + 1)
-    except OSError as error:
-        raise InputFileError(path, f"expected {what} ({error.strerror})") from error
+    except UNREADABLE as error:
+        problem = getattr(error, "strerror", None) or error
+        raise InputFileError(path, f"expected {what} ({problem})") from error
     if len(data) > max_bytes:
         raise InputFileError(path, f"expected {what} of at most {max_bytes >> 20} MiB")
     return data

@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
-from importlib.resources import as_file, files
 from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -17,9 +16,11 @@ from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.ensemble import AnySignature
 from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.belief.street_model import StoredStreet, StreetModel
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Via, encode
 
+from .array_file import file_of_model
 from .file_io import read_record, refused_as_file, write_text
 
 # Of a number of a model file. The largest that ships is a sample rate; a sum of thousands of products of two
@@ -112,15 +113,20 @@ class Model:
         return self.signature.domain
 
 
-def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> Model:
+def read_model(
+    path: str | Path | None = None, *, moving_ego: bool = False, array: MicrophoneArray | None = None
+) -> Model:
     """Read a model; without a path, the one that ships with the package.
 
     Parameters
     ----------
     path : str or Path, optional
-        JSON file.
+        JSON file, packed if its name ends in .gz, or the name of one that ships (`worldstate model list`).
     moving_ego : bool
-        Of the two that ship, the one that was made for an ego that drives; for one that stands otherwise.
+        Of the two for the roof array, the one that was made for an ego that drives; for one that stands
+        otherwise.
+    array : MicrophoneArray, optional
+        What hears. If a model ships for a board with these microphones, it is read.
 
     Returns
     -------
@@ -140,14 +146,15 @@ def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> M
     >>> [read_model(moving_ego=moving).domain.ego_motion for moving in (False, True)]
     ['standing', 'moving']
     """
-    if path is not None:
+    file = file_of_model(path, array, moving_ego=moving_ego)
+    if path is not None and file == Path(path):
         model = read_record(Model, path, "model")
         with refused_as_file(path):
             for name in ("signature", "policies", "sequence", "guard", "road_users"):
                 if not (most := _largest(getattr(model, name))) <= LARGEST:
                     raise InvalidArgumentError(f"{name}: expected numbers up to {LARGEST:g}, got {most:g}")
         return model
-    shipped = _shipped("moving_model.json" if moving_ego else "default_model.json")
+    shipped = _shipped(file)
     # All else of it is read-only.
     figures = dict(shipped.provenance.figures)
     return replace(shipped, provenance=replace(shipped.provenance, figures=figures), street=StreetModel())
@@ -164,10 +171,9 @@ def _largest(value: Any) -> float:
 
 
 @cache
-def _shipped(name: str) -> Model:
+def _shipped(path: Path) -> Model:
     # Read once a process: a quarter of a second for every listener otherwise.
-    with as_file(files("worldstate") / "data" / name) as path:
-        return read_record(Model, path, "model")
+    return read_record(Model, path, "model")
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -176,7 +182,7 @@ def save_model(path: str | Path, model: Model) -> None:
     Parameters
     ----------
     path : str or Path
-        Exactly this file.
+        Exactly this file; packed if its name ends in .gz.
     model : Model
         What to write.
 

@@ -1,7 +1,9 @@
 """Model files: what is written is read back to the bit; whatever is damaged is refused by name."""
 
 import copy
+import gzip
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +13,9 @@ from hypothesis import strategies as st
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.published_signature import SignatureModel
-from worldstate.adapters.files.file_io import refused_as_file
+from worldstate.adapters.files import array_file
+from worldstate.adapters.files.array_file import named_arrays, read_array
+from worldstate.adapters.files.file_io import MAX_BYTES, refused_as_file
 from worldstate.adapters.files.model_file import (
     Model,
     read_model,
@@ -19,6 +23,7 @@ from worldstate.adapters.files.model_file import (
 )
 from worldstate.belief.street_model import Number, StreetModel, StreetNumbers
 from worldstate.core.filter import WorldFilter
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, SchemaVersionError, WorldstateError
 from worldstate.ground.serialisation import decode, encode
 
@@ -39,7 +44,8 @@ def published():
     return replace(shipped, signature=signature, sequence=sequence)
 
 
-DEFAULT = encode(published())
+DEFAULT, DOMAIN = encode(published()), read_model().domain
+PACKED_MODEL = gzip.compress(json.dumps(DEFAULT).encode())
 
 
 def paths(value, here=()):
@@ -119,6 +125,68 @@ def test_written_and_read_back_to_the_bit(tmp_path):
     assert encode(again) == DEFAULT
     X = np.random.default_rng(0).random((5, 60))
     np.testing.assert_array_equal(again.signature.predict_proba(X), published().signature.predict_proba(X))
+
+
+def test_a_packed_file_is_as_the_plain_one_and_is_the_same_whenever_it_is_written(tmp_path):
+    names = ("m.json", "m.json.gz", "again.json.gz")
+    for name in names:
+        save_model(tmp_path / name, published())
+    plain, packed, again = ((tmp_path / name).read_bytes() for name in names)
+    assert gzip.decompress(packed) == plain and packed == again and len(packed) < len(plain) / 2
+    assert encode(read_model(tmp_path / "m.json.gz")) == DEFAULT
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40, deadline=None)
+@given(cut=st.floats(0, 0.999), flipped=st.none() | st.floats(0, 0.999))
+def test_a_packed_file_that_is_damaged_is_refused_by_name(tmp_path, cut, flipped):
+    data = bytearray(PACKED_MODEL)
+    if flipped is None:
+        del data[int(cut * len(data)) :]
+    else:
+        data[int(flipped * len(data))] ^= 0xFF
+    (tmp_path / "bad.json.gz").write_bytes(data)
+    try:
+        model = read_model(tmp_path / "bad.json.gz")
+    except InputFileError as error:
+        assert "bad.json.gz" in str(error)
+    else:  # A header's time stamp and its like are not checked
+        assert encode(model) == DEFAULT
+
+
+def test_a_packed_file_is_unpacked_no_further_than_a_plain_one_is_read(tmp_path):
+    """A gigabyte of blanks packs to a megabyte."""
+    bomb, unpacked = tmp_path / "bomb.json.gz", b" " * (1 << 20)
+    with gzip.open(bomb, "wb", compresslevel=1) as file:
+        for _ in range(1024):
+            file.write(unpacked)
+    tracemalloc.start()
+    with pytest.raises(InputFileError, match=r"bomb\.json\.gz: expected a model file of at most"):
+        read_model(bomb)
+    assert tracemalloc.get_traced_memory()[1] < 3 * MAX_BYTES
+    tracemalloc.stop()
+
+
+BOARDS = st.sampled_from(sorted(named_arrays()))
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20, deadline=None)
+@given(ships=BOARDS, other=BOARDS, moved_m=st.floats(-1.0, 1.0), seed=st.integers(0, 100))
+def test_the_model_that_ships_for_a_board_is_found_by_its_microphones(
+    tmp_path_factory, monkeypatch, ships, other, moved_m, seed
+):
+    """By name or as a file with its channels in any order; another board has the model of the roof."""
+    monkeypatch.setattr(array_file, "MODELS", tmp_path_factory.mktemp("models"))
+    board = read_array(ships)
+    domain = replace(published().signature.domain or DOMAIN, array=ships, positions_m=board.positions_m)
+    made = replace(published(), signature=replace(published().signature, domain=domain))
+    save_model(array_file.MODELS / f"{ships}.json.gz", made)
+    shuffled = np.random.default_rng(seed).permutation(board.positions_m) + moved_m
+    for array in (board, MicrophoneArray(shuffled, "mine.csv")):
+        assert read_model(array=array).domain.array == ships
+    assert read_model(ships).domain.array == ships
+    assert read_model().domain.array.startswith("OVAD")
+    expected = ships if other == ships else "OVAD (Schulz et al. 2021)"
+    assert read_model(array=read_array(other)).domain.array == expected
 
 
 def test_the_numbers_of_the_belief_come_back_with_their_sources(tmp_path):

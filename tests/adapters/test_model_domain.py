@@ -15,10 +15,11 @@ from conftest import Approach
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.datasets.ovad import choose_array
+from worldstate.adapters.files import array_file as arrays
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
-from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.adapters.listener import listen, measure_steps
+from worldstate.adapters.listener import Listener, listen, measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
@@ -72,6 +73,26 @@ RIGHT = {
     "reversed": HERE[::-1],
     "shuffled": SHUFFLED,
 }
+
+
+def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(tmp_path, monkeypatch, capsys) -> None:
+    """Without a model the refusal names how one is made, in a program and on the command line."""
+    monkeypatch.setattr(arrays, "MODELS", tmp_path)
+    sound = 0.01 * np.random.default_rng(0).standard_normal((40_000, 7))
+    soundfile.write(tmp_path / "own.wav", sound, 16_000)
+    run = ["run", str(tmp_path / "own.wav"), "--array", "xmos", "--channels", "1-7", "--json"]
+    with pytest.raises(OutOfDomainError, match="worldstate model make"):
+        Listener("xmos", 16_000)
+    assert main(run) == 2 and "worldstate model make" in capsys.readouterr().err
+    model = read_model()
+    domain = replace(model.domain, array="xmos", positions_m=read_array("xmos").positions_m)
+    made = replace(model, signature=replace(model.signature, domain=domain))
+    save_model(tmp_path / "xmos.json.gz", made)
+    states = Listener("xmos", 16_000).push(sound)
+    assert [state.stamp_ns for state in states] == [10**9 + 10**8 * hop for hop in range(15)]
+    assert main(run) == 0
+    with pytest.raises(OutOfDomainError, match="not the array of the model"):
+        Listener("uma-8", 16_000)
 
 
 @pytest.fixture

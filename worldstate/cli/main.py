@@ -19,8 +19,9 @@ from worldstate.ground.errors import InvalidArgumentError
 # examples; each keeps its heavy imports inside `run`.
 COMMANDS = (
     *("demo", "run", "live", "explain"),
-    *("array check", "array bounds", "array bearings", "array align"),
-    *("model make", "model fit", "model threshold", "model features", "model detector", "model show"),
+    *("array check", "array bounds", "array bearings", "array align", "array list"),
+    *("model make", "model fit", "model threshold", "model features", "model detector"),
+    *("model show", "model list"),
     *("street learn", "street label"),
     *("log plot", "log view", "log replay", "log upgrade"),
     *("sim make", "sim to-bag"),

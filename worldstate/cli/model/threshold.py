@@ -47,8 +47,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         alphas=tuple(arguments.alpha),
         sustain_hops=arguments.sustain_hops,
     )
-    model = adapters.read_model(arguments.model)
-    streams = listening.read_streams(arguments.inputs, inputs.given_array(arguments), arguments.model)
+    array = inputs.given_array(arguments)
+    model = adapters.read_model(arguments.model, array=array)
+    streams = listening.read_streams(arguments.inputs, array, arguments.model)
     if arguments.save_streams is not None:
         save_tables(arguments.save_streams, streams)
     done = operations.calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)

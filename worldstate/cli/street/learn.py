@@ -92,8 +92,8 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     from worldstate.adapters.audio.sound_file import as_sound, open_sound
     from worldstate.operations.labelling.street_passes import heard_street, watched_recording
 
-    model = adapters.read_model(arguments.model)
     source, detections = sensors.camera_source(arguments, as_sound((path,)))
+    model = adapters.read_model(arguments.model, array=source.array)
     with open_sound(source.sound, channels=source.array.channels) as audio:
         duration_s = audio.duration_s
     watched = watched_recording(detections, source.camera, source.settings.boxes, duration_s)

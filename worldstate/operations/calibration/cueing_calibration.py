@@ -295,7 +295,7 @@ def read_input(
     path: Path, *, array: MicrophoneArray | None = None, model: Path | None = None
 ) -> list[HopTable]:
     """Listen to a recording or read streams; a sound file counts as hazard-free."""
-    chosen = read_model(model)
+    chosen = read_model(model, array=array)
     # What was heard are this signature's scores: another one's thresholds cannot be set on them.
     about = {"signature": crc32(json.dumps(encode(chosen.signature)).encode())}
     if path.suffix == ".npz":
