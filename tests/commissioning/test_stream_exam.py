@@ -391,6 +391,21 @@ def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_w
     assert not set(learned.values()) & set(exams.values())
 
 
+def test_a_model_learns_each_flow_in_weather_that_varies_and_is_examined_in_the_published_one() -> None:
+    learned, exam = learned_streams(CommissionSettings()), exam_streams(CommissionSettings())
+    came = {flow for one in learned for flow, rate in one.traffic.per_hour.items() if rate}
+    assert came >= {"left", "both", "queue", "stops", "turns_away", "far", "distant", "leaves", "stands"}
+    for renderer in "ST":
+        mine = [one for one in learned if one.site.name[0] == renderer]
+        assert {one.traffic.hazard_free for one in mine} == {True, False}
+        above = [one.drawn_preset.wind_100hz_db - one.preset.wind_100hz_db for one in mine]
+        assert np.ptp(above) > 10.0
+        assert all(one.traffic.sounds["wind"] for one in mine)
+    assert any(one.rain_db is not None for one in learned)
+    assert {one.traffic.name for one in exam} == {"pairs", "no-hazard"}
+    assert all(one.drawn_preset == one.preset and one.rain_db is None for one in exam)
+
+
 def test_a_moving_ego_drives_again_and_again_and_no_drive_is_another() -> None:
     chosen = CommissionSettings(moving_ego=True, junctions=3, approach_minutes=1.5, hazard_free_minutes=1.0)
     learned, exam = learned_streams(chosen), exam_streams(chosen)
