@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import butter, lfilter, sosfilt
 from snapshot_laws import broken_laws
+from worldstate_lab.cli import scenarios
+from worldstate_lab.cli.scenarios import scenario_figures
 from worldstate_lab.cli.streams import worst_of
 from worldstate_lab.passes.followed_stream import (
     EVERYBODY,
@@ -155,8 +158,9 @@ def stated(made_up: HeardStream, chance: float, *, masked: bool = False) -> Pass
     n = len(made_up.hops)
     none = np.zeros((n, 2), bool)
     within, times = np.full((n, 2, 4), chance), np.full((n, 2, 3), np.nan)
+    heard_all, nothing = (np.full(n, masked), np.zeros(n, bool)), ((),) * n
     follow = FollowedStream(
-        made_up.hops.time_s, none, none * 0.0, within, times, np.full(n, masked), ((),) * n, frozenset(), ()
+        made_up.hops.time_s, none, none * 0.0, within, times, *heard_all, nothing, frozenset(), ()
     )
     return PassedStream(made_up, stream_truth(made_up), follow)
 
@@ -265,6 +269,44 @@ def test_the_worst_junction_is_the_worst_of_those_with_eight_cases() -> None:
     )
     worst = worst_of({"SA1": few, "SB1": bad, "SB2": good})
     assert (worst["detected"], worst["a: skill"], worst["hours"]) == (0.5, 0.5, None)
+
+
+@given(seed=st.integers(0, 2**32))
+@settings(max_examples=20)
+def test_a_scenario_counts_approaches_and_what_is_unheard_in_gusts_and_outside(seed: int) -> None:
+    rng, streams = np.random.default_rng(seed), []
+    for vehicles in ([("left", "left", 15.0), ("right", "right", 40.0)], [("from_ahead", "left", 20.0)]):
+        passed = stated(stream(vehicles), 0.1)
+        n = len(passed.heard.hops)
+        passed.followed.unheard[:], passed.followed.advisory[:, 0] = rng.random((2, n)) < rng.random((2, 1))
+        streams.append((passed, rng.random(n) < 0.3))
+    found, counts = scenario_figures(streams), np.zeros((2, 2))
+    for passed, in_gust in streams:
+        for gust, unheard in zip(in_gust, passed.followed.unheard, strict=True):
+            counts[int(gust)] += (unheard, 1)
+    assert found["approaches"] == 2
+    assert found["unheard_in_gusts"] == pytest.approx(counts[1, 0] / counts[1, 1])
+    assert found["unheard_else"] == pytest.approx(counts[0, 0] / counts[0, 1])
+    hazards, free = (one.followed.advisory[:, 0] for one, _ in streams)
+    time_s = streams[0][0].followed.time_s
+    at_t0 = [hazards[np.flatnonzero(time_s < t0_s - 0.05)[-1]] for t0_s in (15.0, 40.0)]
+    assert found["advised_at_t0"] == np.mean(at_t0)
+    onsets = int(free[0]) + int((free[1:] & ~free[:-1]).sum())
+    assert found["onsets_per_hour"] == pytest.approx(onsets / (len(free) / 36_000.0))
+
+
+@pytest.mark.long
+def test_the_hops_of_gusts_are_those_in_which_the_wind_is_loud(tmp_path: Path) -> None:
+    gusty = replace(traffic_named("no-hazard-gusts"), per_hour={}, sounds={"wind": 300.0})
+    plan = StreamSettings(junction_named("SB2"), 0.7, 3, gusty, sample_rate_hz=6000.0)
+    (rendered, in_gust), (again, _) = (scenarios.followed(plan, read_model(), tmp_path) for _ in range(2))
+    np.testing.assert_array_equal(rendered.followed.risk, again.followed.risk)
+    assert 30 < in_gust.sum() < len(in_gust) - 30
+    # Below 150 Hz wind is all there is: without vehicles the level tells the hops apart.
+    samples = rendered.heard.hops.middle.astype(float)
+    low = sosfilt(butter(4, 150.0, fs=6000.0, output="sos"), samples.ravel()).reshape(samples.shape)
+    power = lfilter(np.full(10, 0.1), 1.0, np.square(low).mean(axis=1))
+    assert (power[in_gust][:, None] > power[~in_gust]).mean() > 0.8
 
 
 def test_the_guard_speaks_in_the_exam_as_in_a_run(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from worldstate.simulation.sound.scatter import add_scattered, scattering
 from worldstate.simulation.sound.static_field import StreetSound, add_late_sound
 
 from .emitter import emitted
-from .weather import add_gusts, add_rain
+from .weather import add_gusts, add_rain, add_wind
 
 # From so many reflections on a vehicle is one point; its parts would cost three times as much. Not from 2 on:
 # whether the second image is lit, on the vehicle's own side, hangs on a metre.
@@ -77,7 +77,7 @@ SILENT_BLOCKS = 8
 GROUND_GAIN = np.sqrt(2.0)
 # What stands in neither street is heard over the roofs: two storeys high, as near to the array as this.
 ROOF_HEIGHT_M, ROOF_AWAY_M = 7.0, 4.0
-WEATHER = {"rain": add_rain, "gusts": add_gusts}  # Heard at the microphones, from no place
+WEATHER = {"rain": add_rain, "gusts": add_gusts, "wind": add_wind}  # Heard at the microphones, from no place
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Weather at the microphones: rain round each of them and from the whole street, and gusts."""
+"""Weather at the microphones: rain round each of them and from the whole street, gusts and wind."""
 
 from functools import cache
 
@@ -9,7 +9,13 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, level_curve
 from worldstate.simulation.scene.settings import SoundSettings
-from worldstate.simulation.sound.background import noise_frequencies, shaped_noise, wind_density
+from worldstate.simulation.sound.background import (
+    ROOF_FLOOR_HZ,
+    ROOF_SLOPE,
+    noise_frequencies,
+    shaped_noise,
+    wind_density,
+)
 from worldstate.simulation.sound.receiver import Receiver
 from worldstate.simulation.sound.static_field import (
     StaticSources,
@@ -107,3 +113,17 @@ def add_gusts(
         within = [(begin + a, begin + min(b, sound.duration_s)) for a, b in spans if a < sound.duration_s]
         blowing = gate(samples, rate, within, GUST_RAMP_S).astype(np.float32)
         static.out[channel] += blowing * shaped_noise(density, samples, draws)
+
+
+def add_wind(
+    static: StaticSources, sound: SoundSettings, receiver: Receiver, rng: np.random.Generator
+) -> None:
+    """Add one swell of wind to all microphones at once; the noise of each differs from that of the others."""
+    rate, samples = receiver.sample_rate_hz, static.out.shape[1]
+    level_db = sound.what.level_db + sound.level_offset_db
+    density = wind_density(level_db, noise_frequencies(samples, rate), ROOF_SLOPE, ROOF_FLOOR_HZ) * rate
+    begin = sound.start_s - receiver.knots_s[0]
+    # It swells for half of its time and then dies away.
+    swell = gate(samples, rate, [(begin, begin + sound.duration_s)], sound.duration_s).astype(np.float32)
+    for channel, draws in zip(static.out, rng.spawn(len(static.out)), strict=True):
+        channel += swell * shaped_noise(density, samples, draws)

@@ -14,7 +14,7 @@ from worldstate.ground.checks import check_ranges, finite_array, in_range, one_o
 
 from .junction import MOVING_SITES, Site, Way, place_of, site
 from .kinds import FLAT, Octaves, VehicleKind, vehicle_kind
-from .presets import Preset, preset
+from .presets import Preset, preset, site_ambience
 from .vehicle import EgoMotion, along
 
 PLACE, VEHICLE, MICROPHONES = "a place", "a vehicle", "the microphones"
@@ -82,6 +82,8 @@ _TABLE = (
     SoundKind("rain", "rain on roof and street", 58.0, origin=MICROPHONES),
     # In the octave of 100 Hz, unweighted, as `ego_sound` has it at 10 m/s behind a windscreen and 6 dB more.
     SoundKind("gusts", "gusts at one to three microphones", 82.0, origin=MICROPHONES),
+    # The same measure: the wind of the preset `street-6`, 60.5 dB, and the middle of what it swells by.
+    SoundKind("wind", "one swell of wind at all microphones", 77.0, origin=MICROPHONES),
 )
 SOUNDS = {kind.name: kind for kind in _TABLE}
 SIGNALS = tuple(kind.name for kind in _TABLE if kind.origin == VEHICLE)
@@ -442,6 +444,8 @@ FAR_M, BELL_M = (60.0, 200.0), (80.0, 250.0)
 FROM_WALL_M = 0.6
 LENS_SHARE, LENS_MISSED = 0.5, (0.2, 0.8)  # every other rain soils the lens, too
 MAX_GUSTY = 3
+# How long wind swells and dies away, and by how much over the mean wind of the site, dB (assumed).
+SWELL_S, SWELL_DB = (1.0, 5.0), (8.0, 25.0)
 
 
 def with_sounds(
@@ -477,6 +481,10 @@ def _drawn(
         # Neighbours: a gust is as wide as an arm.
         first = int(rng.integers(microphones - count + 1))
         return SoundSettings(kind, start, long, channels=tuple(range(first, first + count)))
+    if kind == "wind":
+        mean_db = settings.preset.wind_100hz_db + site_ambience(settings.site, settings.preset).wind_db
+        over_db = mean_db + rng.uniform(*SWELL_DB) - sound_kind(kind).level_db
+        return SoundSettings(kind, start, min(rng.uniform(*SWELL_S), whole), level_offset_db=over_db)
     if kind == "rain":
         missed = rng.uniform(*LENS_MISSED) if rng.random() < LENS_SHARE else 0.0
         return SoundSettings(kind, start, long, lens_missed=missed)

@@ -20,7 +20,7 @@ from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, d
 from .settings import HAZARDS, StreamSettings, Traffic
 
 TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
-LONGEST_QUEUE = 8
+LONGEST_QUEUE, FAR = 8, ("far", "distant")
 AROUND_DRIVE_S = 20.0  # a vehicle that arrives so long before or after a drive is still heard in it
 STANDING = EgoMotion()
 SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # the fades of an event lie beside the sound
@@ -104,14 +104,15 @@ def _turns(settings: StreamSettings, rng: np.random.Generator) -> dict[str, Floa
 def _arrival(
     flow: str, arrival_s: float, settings: StreamSettings, rng: np.random.Generator
 ) -> Iterator[VehicleEvent]:
-    traffic, arms = settings.traffic, {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
+    traffic, preset = settings.traffic, settings.drawn_preset
+    arms = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
     if flow == "queue":
         arms[flow] = ((LEFT,), (RIGHT,))[rng.integers(2)]
     for arm in arms.get(flow, (None,)):
         kind = _kind(traffic, rng)
         # A bicycle two streets away is not heard.
-        heard = vehicle_kind("light") if flow == "far" and kind.name == "bicycle" else kind
-        driver = draw_driver(settings.site, heard, settings.preset, rng, arm)
+        heard = vehicle_kind("light") if flow in FAR and kind.name == "bicycle" else kind
+        driver = draw_driver(settings.site, heard, preset, rng, arm)
         signal = _signal(traffic, heard, rng)
         if signal:
             driver = replace(driver, reach_m=EARSHOT_M[1])  # louder than its tyres
@@ -149,7 +150,8 @@ def draw_sounds(
     kinds = settings.traffic.sounds
     for (kind, rate), own in zip(sorted(kinds.items()), rng.spawn(len(kinds)), strict=True):
         for arrival_s in own.uniform(0.0, settings.duration_s, own.poisson(rate * settings.minutes / 60.0)):
-            empty = SimulationSettings(settings.site, "none", duration_s=own.uniform(*SOUND_S))
+            lasts_s, preset = own.uniform(*SOUND_S), settings.drawn_preset
+            empty = SimulationSettings(settings.site, "none", duration_s=lasts_s, preset=preset)
             gusts = kind == "gusts"
             # Gusts draw more or less by the number of microphones: what is drawn next must not depend on it.
             draws = [deepcopy(one) for one in own.spawn(1) * len(arrays)] if gusts else [own]

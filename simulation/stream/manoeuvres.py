@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -187,9 +188,9 @@ def emerges(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     return _through(driver, limits)
 
 
-def waits(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+def waits(driver: Driver, rng: np.random.Generator, stands_s: tuple[float, float] = (4.0, 25.0)) -> Manoeuvre:
     """Stand before the corner for some time, then come out."""
-    return _through(driver, [SpeedLimit(-rng.uniform(1.0, 6.0), 0.0, rng.uniform(4.0, 25.0))])
+    return _through(driver, [SpeedLimit(-rng.uniform(1.0, 6.0), 0.0, rng.uniform(*stands_s))])
 
 
 def turns_away(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
@@ -246,9 +247,11 @@ def parks(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     return Manoeuvre(driver.arm, motion, motion.reaches_s(-0.1))
 
 
-def passes_far(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+def passes_far(
+    driver: Driver, rng: np.random.Generator, away_m: tuple[float, float] = (40.0, 80.0)
+) -> Manoeuvre:
     """Cross the arm on another street, far from the corner."""
-    y, heading = driver.side * rng.uniform(40.0, 80.0), 1.0 if rng.random() < 0.5 else -1.0
+    y, heading = driver.side * rng.uniform(*away_m), 1.0 if rng.random() < 0.5 else -1.0
     middle = driver.site.corner_ahead_m + 0.5 * driver.site.street_width_m
     route = along([[middle - heading, y], [middle + heading, y]], 1.0)
     elsewhere = replace(driver, speed_mps=float(rng.uniform(*SPEEDS_MPS)))
@@ -287,6 +290,9 @@ MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
     "stands": stands,
     "leaves": drives_off,
     "joins": joins,
+    # New flows stand last: a flow draws by its number.
+    "stops": partial(waits, stands_s=(2.0, 10.0)),
+    "distant": partial(passes_far, away_m=(60.0, 120.0)),
 }
 
 

@@ -16,10 +16,12 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.emitters.placed_sound import WEATHER, add_signal, add_sound, add_vehicle
+from worldstate.simulation.emitters.weather import add_rain
 from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.presets import Ambience, Preset, recording_ambience, site_ambience
+from worldstate.simulation.scene.settings import SoundSettings
 from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
@@ -100,8 +102,9 @@ class StreamScene:
         cls, settings: StreamSettings, microphones: Microphones, rng: np.random.Generator
     ) -> "StreamScene":
         """Draw what a stream makes of its site's ambience, which stays the same through the stream."""
-        usual = site_ambience(settings.site, settings.preset)
-        return cls(settings, recording_ambience(usual, settings.preset, rng), microphones)
+        preset = settings.drawn_preset
+        ambience = recording_ambience(site_ambience(settings.site, preset), preset, rng)
+        return cls(settings, ambience, microphones)
 
     @property
     def piece(self) -> int:
@@ -127,7 +130,15 @@ def ambience_piece(
     sound = np.zeros((len(scene.microphones.positions_m), samples + overlap), np.float32)
     receiver = scene.microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz)
     add = add_traced_background if settings.site.is_traced else add_background
-    add(sound, receiver, settings.site, settings.preset, rng, scene.ambience)
+    add(sound, receiver, settings.site, settings.drawn_preset, rng, scene.ambience)
+    if settings.rain_db is not None:
+        # From a second before the piece to a second after it: a shower sets in and ends slowly.
+        lasts_s = sound.shape[1] / settings.sample_rate_hz + 2.0
+        static = StaticSources(sound, settings.sample_rate_hz)
+        add_rain(
+            static, SoundSettings("rain", -1.0, lasts_s, level_offset_db=settings.rain_db), receiver, rng
+        )
+        static.render()
     rise = np.sin(0.5 * np.pi * (np.arange(overlap) + 0.5) / overlap).astype(np.float32)
     if not begins:
         sound[:, :overlap] *= rise
@@ -324,7 +335,7 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
 def _event_alone(scene: StreamScene, number: int, event: Event) -> EventSound:
     """Render one event at all arrays; weather at each by itself, for drops and gusts hit microphones."""
     settings, microphones = scene.settings, scene.microphones
-    street, drive = (settings.site, settings.preset), (settings.ego, scene.within_s)
+    street, drive = (settings.site, settings.drawn_preset), (settings.ego, scene.within_s)
     if not isinstance(event, SoundEvent) or event.sound.kind not in WEATHER:
         return event_sound(event, *street, microphones, settings.generator(EVENT, number), *drive)
     heard = [

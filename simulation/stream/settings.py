@@ -1,7 +1,8 @@
 """What a stream is, before anything is drawn."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SAMPLE_RATE_HZ,
 from worldstate.simulation.scene.vehicle import EgoMotion
 
 # What a flow is, is drawn in `manoeuvres.py`; these bring vehicles out of a hidden arm.
-HAZARDS = ("left", "right", "both", "waits", "queue")
-FLOWS = (*HAZARDS, "turns_away", "parks", "far", "from_behind", "from_ahead", "stands", "leaves", "joins")
+HAZARDS = ("left", "right", "both", "waits", "queue", "stops")
+_ELSEWHERE = ("turns_away", "parks", "far", "distant", "stands", "leaves", "joins")
+FLOWS = (*HAZARDS, *_ELSEWHERE, "from_behind", "from_ahead")
 MOST_PER_HOUR = 3600.0
 # Cars, delivery vans and lorries, electric cars, bicycles and kick scooters of a side street; assumed, not
 # counted.
@@ -27,7 +29,7 @@ TOWN_KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Arrivals an hour of every flow, each a Poisson process of its own unless hazards are evenly spaced."""
+    """Weather, and arrivals an hour of every flow: Poisson processes unless hazards are evenly spaced."""
 
     name: str
     per_hour: Mapping[str, float]  # Of each of `FLOWS`; those not named never come
@@ -38,6 +40,9 @@ class Traffic:
     kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normed
     sounds: Mapping[str, float] = field(default_factory=dict)  # What else sounds, by kind, an hour
     signals: Mapping[str, float] = field(default_factory=dict)  # Shares of the vehicles that warn, by signal
+    # Of ambience and wind over the preset's, dB: each stream draws its level between these two, evenly.
+    background_db: tuple[float, float] = (0.0, 0.0)
+    rain_share: float = 0.0  # Probability that it rains throughout a stream
 
     def __post_init__(self) -> None:
         for name, known, most in (
@@ -53,6 +58,9 @@ class Traffic:
         in_range("headway_s[1]", self.headway_s[1], self.headway_s[0], 10.0)
         if self.apart_s is not None:
             in_range("apart_s", self.apart_s, 0.0, 10.0)
+        in_range("background_db[0]", self.background_db[0], -40.0, self.background_db[1])
+        in_range("background_db[1]", self.background_db[1], -40.0, 30.0)
+        in_range("rain_share", self.rain_share, 0.0, 1.0)
         # A share of one would make a queue without an end.
         in_range("follower_share", self.follower_share, 0.0, 0.9)
         in_range("kinds: sum of the shares", sum(self.kinds.values()), 1e-6, 1e6)
@@ -64,6 +72,8 @@ class Traffic:
 
 
 _OTHERS = {"turns_away": 20.0, "parks": 8.0, "far": 40.0, "from_behind": 12.0, "from_ahead": 12.0}
+_STOPPING = {"queue": 25.0, "stops": 25.0}
+_IN_PAIRS: Mapping[str, Any] = {"evenly": True, "headway_s": (0.8, 6.0), "apart_s": 6.0}
 _MISLEADING = {
     "voice tone beeper horn dog": 20.0,
     "children music drill birds steps horns": 10.0,
@@ -90,13 +100,7 @@ TRAFFICS = {
         ),
         # As above with arrivals as streets have them: arms that do not know of each other, and followers as
         # near as a vehicle's length allows. Of 36 in 14.4 minutes 17 come alone, 12 from both sides.
-        Traffic(
-            "pairs",
-            {"left": 35, "right": 35, "both": 50, "queue": 30} | _OTHERS,
-            evenly=True,
-            headway_s=(0.8, 6.0),
-            apart_s=6.0,
-        ),
+        Traffic("pairs", {"left": 35, "right": 35, "both": 50, "queue": 30} | _OTHERS, **_IN_PAIRS),
         Traffic("no-hazard", _OTHERS),
         # What misleads: everything that is near, loud or grows louder and never comes out of an arm.
         Traffic(
@@ -116,8 +120,40 @@ TRAFFICS = {
         Traffic("speech", {}, sounds={"voice": 150, "children": 150}),
         Traffic("music", {}, sounds={"music": 100, "tune": 100, "drums": 100}),
         Traffic("empty", {}),
+        # What a model learns, in weather that varies: as above, a sixth after a stop of 2 to 10 s.
+        Traffic("town", {"left": 30, "right": 30, "both": 40} | _STOPPING | _OTHERS, **_IN_PAIRS),
+        # One kind of hazard alone, as an exam asks.
+        Traffic("stops", {"stops": 150}, evenly=True),
+        *(
+            Traffic(f"{kind}-only", {"left": 75, "right": 75}, evenly=True, kinds={kind: 1.0})
+            for kind in ("bicycle", "scooter", "electric")
+        ),
     )
 }
+# In its last 3 s before T0, 300 to 2000 Hz, a vehicle of `pairs` raises the level over ambience and wind by
+# 8.7 dB in the median stream of the first renderer and by 3.6 dB of the second, between streams by 4.6 to
+# 13.2 and 0.2 to 8.2 (5 to 95 %; 16 and 8 streams). With the background of `varied` by 14.0 and 5.7, 3.0 to
+# 24.8 and 1.2 to 11.4. Rates of gusts and the share of rain are assumed.
+_WEATHERS: Mapping[str, Mapping[str, Any]] = {
+    "gusts": {"sounds": {"wind": 120.0}},
+    "rain": {"rain_share": 1.0},
+    "quiet": {"background_db": (-10.0, -10.0)},
+    "varied": {"background_db": (-14.0, 8.0), "rain_share": 0.15, "sounds": {"wind": 60.0}}
+    | {"per_hour": {"distant": 40.0}},
+}
+
+
+def _under(base: Traffic, weather: str) -> Traffic:
+    """Return a traffic in a weather, named after both."""
+    changed: dict[str, Any] = {"name": f"{base.name}-{weather}"}
+    for key, value in _WEATHERS[weather].items():
+        changed[key] = {**getattr(base, key), **value} if isinstance(value, Mapping) else value
+    return replace(base, **changed)
+
+
+for _name in ("pairs", "no-hazard", "town", "misleading"):
+    for _one in (_under(TRAFFICS[_name], weather) for weather in _WEATHERS):
+        TRAFFICS[_one.name] = _one
 
 
 def traffic_named(name: str) -> Traffic:
@@ -136,7 +172,10 @@ MAX_MINUTES = 160.0
 # A drive down the own street to the corner. Five seconds before line of sight are judged, and the first one
 # has no hop yet; recordings of a moving ego stop after 7.3 to 9 s.
 MAX_DRIVE_MINUTES, STOPS_S = 1.0, (8.0, 9.0)
-EGO = 7  # purpose of a generator
+EGO, BACKGROUND, RAIN = 7, 9, 10  # purposes of generators
+# Light rain of 1 mm/h to a downpour of some 16, against the moderate one of 4 mm/h of the table of sounds, if
+# the power of drops rises a little faster than their volume (assumed).
+RAIN_DB = (-8.0, 8.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +237,22 @@ class StreamSettings:
             return EgoMotion()
         rng = self.generator(EGO)
         return EgoMotion(rng.uniform(*EGO_SPEEDS_MPS), rng.uniform(*STOPS_S))
+
+    @property
+    def drawn_preset(self) -> Preset:
+        """The preset, with its ambience and wind at the level that this stream draws."""
+        low_db, high_db = self.traffic.background_db
+        level_db = float(self.generator(BACKGROUND).uniform(low_db, high_db))
+        octaves_db = tuple(octave_db + level_db for octave_db in self.preset.ambient_octaves_db)
+        return replace(
+            self.preset, ambient_octaves_db=octaves_db, wind_100hz_db=self.preset.wind_100hz_db + level_db
+        )
+
+    @property
+    def rain_db(self) -> float | None:
+        """Level of the rain that falls throughout, over moderate rain; None if it does not rain."""
+        rng = self.generator(RAIN)
+        return float(rng.uniform(*RAIN_DB)) if rng.random() < self.traffic.rain_share else None
 
     @property
     def duration_s(self) -> float:

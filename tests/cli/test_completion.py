@@ -33,7 +33,7 @@ def complete(script: str, *words: str) -> list[str]:
     [
         (["worldstate", "l"], ["live", "log"]),
         (["worldstate", "array", "b"], ["bounds", "bearings"]),
-        (["worldstate", "sim", "make", "--traffic", "b"], ["busy"]),
+        (["worldstate", "sim", "make", "--traffic", "b"], ["busy", "bicycle-only"]),
         (["worldstate", "array", "check", "some.wav", "--dur"], ["--duration", "--duration-error"]),
         (["worldstate", "run", "a.wav", "--uncal"], ["--uncalibrated"]),
         (["worldstate", "run", "--array-axes", "b"], ["base_link"]),

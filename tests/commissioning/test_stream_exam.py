@@ -36,6 +36,7 @@ from worldstate.commissioning.stream_exam import (
 )
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
+from worldstate.operations.metrics.approach_table import ApproachTable, StreamApproach, hop_outcome
 from worldstate.operations.recordings.hop_table import HopTable
 
 Vehicle = tuple[str, str, str, float]  # flow, kind, arm, T0
@@ -117,6 +118,22 @@ def test_an_alarm_counts_from_the_horizon_of_the_risk_on_or_from_less() -> None:
     assert early.lead_s == pytest.approx(7.0) and early.onsets == 1
     (late,) = alarm_outcomes(stream, time_s, raised, longest_s=5.0)
     assert (late.lead_s, late.onsets) == (0.0, 0)
+
+
+@given(seed=st.integers(0, 2**32), t0_s=st.floats(10.0, 20.0), share=st.floats(0.0, 1.0))
+def test_an_alarm_stands_at_t0_if_it_is_on_in_the_last_hop_before_it(
+    seed: int, t0_s: float, share: float
+) -> None:
+    """Of either side; whatever is raised from T0 on, or a second and more before it, changes nothing."""
+    rng, time_s = np.random.default_rng(seed), np.round(np.arange(1.0, 30.0, 0.1), 1)
+    raised = rng.random((len(time_s), 2)) < share * rng.random()
+    found = hop_outcome(StreamApproach("single", (t0_s,), (0,)), time_s, raised)
+    last = [i for i, at_s in enumerate(time_s) if t0_s - 1.0 < at_s < t0_s - 1e-3]
+    assert found.last_second == any(raised[i, 0] or raised[i, 1] for i in last)
+    assert found.at_t0 == bool(raised[last[-1]].any())
+    assert found.at_t0 <= found.last_second <= found.detected
+    shares = ApproachTable([found, replace(found, at_t0=False, last_second=False)], ()).standing()
+    assert shares == {"advised_last_second": found.last_second / 2, "advised_at_t0": found.at_t0 / 2}
 
 
 def test_an_approach_of_a_drive_counts_however_soon_the_vehicle_comes_out() -> None:
@@ -372,6 +389,21 @@ def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_w
     # Half as many junctions of the second renderer beside them.
     assert len(set(learned.values())) == 2 * (40 + 20) and len(set(exams.values())) == 2 * 5
     assert not set(learned.values()) & set(exams.values())
+
+
+def test_a_model_learns_each_flow_in_weather_that_varies_and_is_examined_in_the_published_one() -> None:
+    learned, exam = learned_streams(CommissionSettings()), exam_streams(CommissionSettings())
+    came = {flow for one in learned for flow, rate in one.traffic.per_hour.items() if rate}
+    assert came >= {"left", "both", "queue", "stops", "turns_away", "far", "distant", "leaves", "stands"}
+    for renderer in "ST":
+        mine = [one for one in learned if one.site.name[0] == renderer]
+        assert {one.traffic.hazard_free for one in mine} == {True, False}
+        above = [one.drawn_preset.wind_100hz_db - one.preset.wind_100hz_db for one in mine]
+        assert np.ptp(above) > 10.0
+        assert all(one.traffic.sounds["wind"] for one in mine)
+    assert any(one.rain_db is not None for one in learned)
+    assert {one.traffic.name for one in exam} == {"pairs", "no-hazard"}
+    assert all(one.drawn_preset == one.preset and one.rain_db is None for one in exam)
 
 
 def test_a_moving_ego_drives_again_and_again_and_no_drive_is_another() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import coherence, stft
+from scipy.signal import coherence, stft, welch
 
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
@@ -30,6 +30,7 @@ from worldstate.simulation.emitters.emitter import emitted
 from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, directivity
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import split_octaves
+from worldstate.simulation.scene.presets import site_ambience
 from worldstate.simulation.scene.settings import SIGNALS, sound_kind, with_sounds
 from worldstate.simulation.scene.vehicle import drive
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
@@ -174,6 +175,40 @@ def test_gusts_shake_their_microphones_and_no_other():
     blowing = np.square(sound[[1, 2], : len(sound[0]) // 600 * 600].reshape(2, -1, 600)).mean(axis=2)
     assert (blowing > 1e-6 * blowing.max()).mean() < 0.9  # they come and go
     assert abs(np.corrcoef(sound[1], sound[2])[0, 1]) < 0.3
+
+
+@given(over_db=st.floats(-10.0, 20.0), lasts_s=st.floats(1.0, 4.0))
+@settings(max_examples=10)
+def test_wind_swells_at_all_microphones_alike_and_its_noise_is_common_to_no_two(over_db, lasts_s):
+    wind = SoundSettings("wind", 0.5, lasts_s, level_offset_db=over_db)
+    sound = heard(wind, 4 * RING.positions_m, seconds=5.0)
+    within = slice(round(0.5 * FS), round((0.5 + lasts_s) * FS))
+    assert not sound[:, : within.start].any()
+    assert not sound[:, within.stop + 1 :].any()
+    fifths = np.array([np.square(one).mean() for one in np.array_split(sound[:, within], 5, axis=1)])
+    assert fifths.argmax() == 2
+    frequencies, between = coherence(sound[0, within], sound[4, within], FS, nperseg=256)
+    assert between[frequencies > 60.0].mean() < 3.0 * 256 / (lasts_s * FS) + 0.02
+    # In the middle, within a fifth of its time, the octave of 100 Hz has the level that was asked for.
+    middle = sound[:, round((0.5 + 0.4 * lasts_s) * FS) : round((0.5 + 0.6 * lasts_s) * FS)]
+    frequencies, density = welch(middle, FS, nperseg=min(800, middle.shape[1]))
+    octave = (frequencies >= 100.0 / np.sqrt(2.0)) & (frequencies <= 100.0 * np.sqrt(2.0))
+    power = density[:, octave].mean() * 100.0 / np.sqrt(2.0)
+    assert 10.0 * np.log10(power / 4e-10) == pytest.approx(77.0 + over_db, abs=3.0)
+    # Three octaves higher it has fallen by 3.7 times 9 dB.
+    high = (frequencies >= 600.0) & (frequencies <= 1000.0)
+    fallen_db = 10.0 * np.log10(density[:, octave].mean() / density[:, high].mean())
+    assert fallen_db == pytest.approx(37.0 * np.log10(780.0 / 98.0), abs=4.0)
+
+
+@given(st.integers(0, 2**31), st.sampled_from(SITES), st.floats(-15.0, 5.0))
+def test_wind_swells_by_8_to_25_db_over_the_mean_wind_of_the_site_for_one_to_five_seconds(seed, where, level):
+    windy = replace(preset(), wind_100hz_db=preset().wind_100hz_db + level)
+    empty = SimulationSettings(site(where), "none", duration_s=10.0, preset=windy)
+    (wind,) = with_sounds(empty, ["wind"], 4, np.random.default_rng(seed)).sounds
+    mean_db = windy.wind_100hz_db + site_ambience(site(where), windy).wind_db
+    assert 8.0 <= sound_kind("wind").level_db + wind.level_offset_db - mean_db <= 25.0
+    assert 1.0 <= wind.duration_s <= 5.0
 
 
 def test_a_signal_of_a_vehicle_moves_with_it():

@@ -14,11 +14,12 @@ import pytest
 import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import welch
+from scipy.signal import coherence, welch
 from worldstate_lab.trials.trial import find_takes
 
 from worldstate.adapters.datasets.ovad import Recording, choose_array, read_true_tracks
 from worldstate.cli.main import main
+from worldstate.commissioning.heard_stream import junction_named
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
@@ -82,6 +83,48 @@ def test_a_stream_is_its_background_and_the_sum_of_its_events_rendered_apart() -
         expected[:, begin:end] += alone.pressure_pa[:, begin - alone.first : end - alone.first]
     assert np.abs(expected).max() > 0.05
     np.testing.assert_allclose(added, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("where", ["SB1", "TA1"])
+@pytest.mark.parametrize("level_db", [-17.0, 5.0])
+def test_a_background_so_many_decibels_up_is_the_same_sound_as_much_louder(
+    where: str, level_db: float
+) -> None:
+    """But for the electronic noise, which does not follow the street."""
+    silent = replace(preset(), self_noise_db=0.0, ambient_waves=8)
+    traffic = Traffic("test", {}, background_db=(level_db, level_db))
+    usual = StreamSettings(junction_named(where), 0.2, 5, replace(traffic, background_db=(0.0, 0.0)), silent)
+    heard = [
+        sound_of(draw_stream(replace(one, sample_rate_hz=3000.0), PAIR).scene, ())
+        for one in (usual, replace(usual, traffic=traffic))
+    ]
+    factor = 10.0 ** (level_db / 20.0)
+    np.testing.assert_allclose(heard[1], factor * heard[0], rtol=2e-3, atol=1e-4 * np.abs(heard[1]).max())
+
+
+def test_rain_falls_throughout_a_stream_without_a_seam_and_is_common_to_no_two_microphones() -> None:
+    dry = StreamSettings(site("SB1"), 1.2, 4, Traffic("test", {}), STILL, 3000.0)
+    raining = next(
+        one
+        for seed in range(9)
+        if (one := replace(dry, seed=seed, traffic=Traffic("test", {}, rain_share=0.5))).rain_db is not None
+    )
+    dry = replace(dry, seed=raining.seed)
+    rain = np.subtract(*(sound_of(draw_stream(one, PAIR).scene, ()) for one in (raining, dry)))
+    # Pieces of 30 s meet at 30 and 60 s. Two seconds of two channels hold 160 drops of exponential strengths.
+    seconds_db = 10.0 * np.log10(np.square(rain).reshape(2, -1, 6000).mean(axis=(0, 2)))
+    assert np.abs(seconds_db - np.median(seconds_db)).max() < 4.0
+    frequencies, between = coherence(*rain, 3000.0, nperseg=256)
+    assert between[frequencies > 500.0].mean() < 0.1
+    others = (replace(raining, seed=seed) for seed in range(99))
+    louder = next(one for one in others if one.rain_db is not None and one.rain_db > 5.0)
+    assert louder.rain_db is not None
+    assert raining.rain_db is not None
+    more = sound_of(draw_stream(louder, PAIR).scene, ()) - sound_of(
+        draw_stream(replace(dry, seed=louder.seed), PAIR).scene, ()
+    )
+    found_db = 10.0 * np.log10(np.square(more).mean() / np.square(rain).mean())
+    assert found_db == pytest.approx(louder.rain_db - raining.rain_db, abs=1.0)
 
 
 def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() -> None:

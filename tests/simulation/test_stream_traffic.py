@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.commissioning.stream_figure import FLOWS
@@ -24,7 +24,7 @@ from worldstate.simulation.stream.arrivals import (
     draw_sounds,
 )
 from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, emerges
-from worldstate.simulation.stream.settings import HAZARDS, StreamSettings, Traffic, traffic_named
+from worldstate.simulation.stream.settings import HAZARDS, RAIN_DB, StreamSettings, Traffic, traffic_named
 from worldstate.simulation.stream.truth import (
     CLUTTER_IMAGES,
     CLUTTER_PER_HOUR,
@@ -34,7 +34,7 @@ from worldstate.simulation.stream.truth import (
     visible_s,
 )
 
-NEVER_SEEN = {"turns_away", "parks", "far"}
+NEVER_SEEN = {"turns_away", "parks", "far", "distant"}
 
 
 def events_of(name: str, where: str, seed: int, duration_s: float = 3600.0) -> list[VehicleEvent]:
@@ -201,7 +201,83 @@ def test_other_sounds_come_at_their_rate_and_rain_takes_boxes() -> None:
     assert wet[620:] == dry[620:]
 
 
+@pytest.mark.parametrize("where", ["SA1", "SB3"])
+def test_a_stop_lasts_two_to_ten_seconds_out_of_view_and_the_vehicle_comes_into_view_after_it(
+    where: str,
+) -> None:
+    settings = StreamSettings(site(where), 60.0, traffic=traffic_named("stops"))
+    stopped_s = []
+    for number, event in enumerate(draw_events(settings, np.random.default_rng(1))):
+        truth = vehicle_truth(number, event, settings)
+        clock = np.arange(0.0, event.manoeuvre.motion.duration_s, 0.01)
+        still = clock[event.manoeuvre.motion.trajectory(clock).speed_mps < 1e-3]
+        stopped_s.append(np.ptp(still))
+        assert truth.hazard
+        assert truth.t0_s is not None
+        # From rest a vehicle needs more than a second for the metre at least that is left.
+        assert 1.0 < truth.t0_s - (event.start_s + still[-1]) < 5.0
+    assert len(stopped_s) == 150
+    assert 2.0 - 0.02 < min(stopped_s) < 2.5
+    assert 9.5 < max(stopped_s) < 10.0 + 0.02
+
+
+def test_a_town_holds_each_flow_and_what_is_distant_stays_60_to_120_m_away_and_unseen() -> None:
+    settings = StreamSettings(site("SB1"), 60.0, traffic=traffic_named("town-varied"))
+    events = draw_events(settings, np.random.default_rng(2))
+    flows = Counter(event.flow for event in events)
+    usual = {"left", "right", "both", "queue", "follows", "stops", "turns_away", "far", "parks", "distant"}
+    assert usual <= set(flows)
+    distant = [vehicle_truth(i, one, settings) for i, one in enumerate(events) if one.flow == "distant"]
+    assert all(one.t0_s is None and not one.hazard for one in distant)
+    away_m = [float(np.abs(one.y_m).mean()) for one in distant if len(one.y_m)]
+    assert len(away_m) > 20
+    assert min(away_m) > 60.0 - 1e-6
+    assert 80.0 < max(away_m) < 120.0 + 1e-6
+
+
+@pytest.mark.parametrize("weather", ["gusts", "rain"])
+def test_gusts_and_rain_leave_the_vehicles_of_an_exam_as_they_are(weather: str) -> None:
+    for name in ("pairs", "no-hazard"):
+        dry, wet = (events_of(one, "SA1", 7) for one in (name, f"{name}-{weather}"))
+        assert [(e.flow, e.start_s, e.end_s) for e in dry] == [(e.flow, e.start_s, e.end_s) for e in wet]
+
+
+def test_a_louder_background_moves_no_line_of_sight_and_lets_vehicles_be_heard_from_less_far() -> None:
+    usual, louder = (
+        {
+            round(e.start_s + e.manoeuvre.arrives_s, 6): e.manoeuvre.arrives_s
+            for e in draw_events(StreamSettings(site("SB1"), 30.0, traffic=one), np.random.default_rng(7))
+        }
+        for one in (traffic_named("pairs"), replace(traffic_named("pairs"), background_db=(20.0, 20.0)))
+    )
+    shared = usual.keys() & louder.keys()
+    assert len(shared) > 60
+    assert all(louder[at] <= usual[at] + 1e-6 for at in shared)
+    assert np.mean([louder[at] < usual[at] - 0.5 for at in shared]) > 0.5
+
+
+def test_the_background_is_drawn_evenly_between_its_limits_and_rain_falls_in_its_share_of_streams() -> None:
+    low_db, high_db = traffic_named("town-varied").background_db
+    streams = [StreamSettings(site("SA1"), 1.0, seed, traffic_named("town-varied")) for seed in range(400)]
+    above = np.array([one.drawn_preset.wind_100hz_db - one.preset.wind_100hz_db for one in streams])
+    octaves = np.array([one.drawn_preset.ambient_octaves_db for one in streams])
+    usual = np.array(streams[0].preset.ambient_octaves_db)
+    np.testing.assert_allclose(octaves - usual, np.tile(above[:, None], 8))
+    assert kstest(above, "uniform", (low_db, high_db - low_db)).pvalue > 1e-3
+    rain_db = [one.rain_db for one in streams if one.rain_db is not None]
+    share = traffic_named("town-varied").rain_share
+    assert abs(len(rain_db) - 400 * share) < 4.0 * np.sqrt(400 * share * (1.0 - share))
+    assert RAIN_DB[0] <= min(rain_db) < max(rain_db) <= RAIN_DB[1]
+    # Nothing is drawn unless it is asked for.
+    assert StreamSettings(site("SA1"), 1.0).drawn_preset == streams[0].preset
+    assert StreamSettings(site("SA1"), 1.0).rain_db is None
+
+
 def test_streams_refuse_what_they_cannot_be() -> None:
+    with pytest.raises(InvalidArgumentError, match="background_db"):
+        Traffic("test", {}, background_db=(3.0, 2.0))
+    with pytest.raises(InvalidArgumentError, match="rain_share"):
+        Traffic("test", {}, rain_share=1.5)
     with pytest.raises(InvalidArgumentError, match="minutes"):
         StreamSettings(site("DA1"), 1.1)
     with pytest.raises(InvalidArgumentError, match="junction"):

@@ -33,8 +33,10 @@ from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
 # Hazards one after another; a moving ego has one a drive, with the arrivals that its model learned.
 PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
-# What is near or loud and never comes, learned at every other two junctions, in streets of both renderers.
-MISLEADING, TRACED_SEEDS = "misleading", 500
+# What a standing ego's model learns, in weather that varies. What is near or loud and never comes is learned
+# at every other two junctions, in streets of both renderers.
+TOWN, CALM_TOWN, MISLEADING_TOWN = "town-varied", "no-hazard-varied", "misleading-varied"
+TRACED_SEEDS = 500
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
@@ -74,7 +76,7 @@ class CommissionSettings:
     --------
     >>> plan = learned_streams(CommissionSettings(junctions=2))
     >>> [f"{one.site.name} {one.traffic.name} {one.minutes:g}" for one in plan][:2]
-    ['SA101 pairs 7.2', 'SA101 no-hazard 6']
+    ['SA101 town-varied 7.2', 'SA101 no-hazard-varied 6']
     """
 
     junctions: int = 16
@@ -114,13 +116,13 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """
     names = {i: f"{settings.sites[0][0]}{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
     approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
-    found = _streams(names, LEARNED_SEED, _usual(approaching, quiet, settings), settings)
     if settings.moving_ego:
-        return found
+        return _streams(names, LEARNED_SEED, _usual(approaching, quiet, settings), settings)
+    found = _streams(names, LEARNED_SEED, {TOWN: approaching, CALM_TOWN: quiet}, settings)
     some = {i: name for i, name in names.items() if i % 4 < 2}
     traced = {TRACED_SEEDS + i: f"T{name[1:]}" for i, name in some.items()}
-    found += _streams(traced, LEARNED_SEED, {PAIRS: approaching, MISLEADING: quiet}, settings)
-    return found + _streams(some, LEARNED_SEED, {MISLEADING: quiet}, settings)
+    found += _streams(traced, LEARNED_SEED, {TOWN: approaching, MISLEADING_TOWN: quiet}, settings)
+    return found + _streams(some, LEARNED_SEED, {MISLEADING_TOWN: quiet}, settings)
 
 
 def _usual(

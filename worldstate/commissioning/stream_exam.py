@@ -107,7 +107,7 @@ def examine(streams: Sequence[ExaminedStream]) -> Figures:
     for flow in ("single", "both", "queue"):
         found[f"detected_{flow}"] = loud.of_flow(flow).detections()["detected"]
     found["detected_quiet"] = mean_of([one.detected for one in every.outcomes if one.approach.quiet])
-    found |= loud.sides()
+    found |= loud.sides() | loud.standing()
     found["onsets_after"] = mean_of([one.onsets_after for one in loud.outcomes])
     found |= _ranking(streams) | loud.false_alarms() | _worst(streams)
     return found | _calibration(streams) | _by_kind(every.outcomes)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Rows of the events: first what comes out of a hidden arm, then each kind of negative.
 FLOWS = (
     "left", "right", "both", "queue", "follows", "waits", "turns_away", "parks", "far", "from_behind",
-    "from_ahead", "stands", "leaves", "joins",
+    "from_ahead", "stands", "leaves", "joins", "stops", "distant",
 )  # fmt: skip
 MAP_M = 60.0  # as far to the sides
 WALLS_M = 12.0  # the ego's own street is drawn this far behind it

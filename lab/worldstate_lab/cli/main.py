@@ -23,6 +23,7 @@ STUDIES = {
         "table",
         "windows",
         "streams",
+        "scenarios",
         "bearings",
         "corpora",
         "planner",

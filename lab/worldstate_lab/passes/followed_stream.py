@@ -26,6 +26,7 @@ from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.commissioning.sequence_training import StreamTruth, stream_truth
 from worldstate.core.filter import WorldFilter
+from worldstate.ground import LEAST_HEARD
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.measurement.measurement import (
     Measurement,
@@ -103,6 +104,7 @@ class FollowedStream:
     within: FloatArray  # shape (n, 2, horizons); NaN where nothing is said
     time_to_visible_s: FloatArray  # shape (n, 2, 3): Low, best, high; NaN where none is stated
     masked: BoolArray  # shape (n,): Whether a reason is given why not all could be heard
+    unheard: BoolArray  # shape (n,): Whether the snapshot counts the hop as one in which nothing can be heard
     entities: tuple[tuple[Entity, ...], ...]  # Of every hop
     merged: frozenset[str]  # Ids that ended in another one
     tallies: tuple[Tally, ...]  # Of every hop: what the watch over the alarm's budget has counted
@@ -150,6 +152,7 @@ def followed(
         within=np.array([[list((cue.within or {}).values()) or nothing for cue in hop] for hop in cues]),
         time_to_visible_s=np.array([[cue.time_to_visible_s or never for cue in hop] for hop in cues]),
         masked=np.array([any(one.reason for one in state.heard or ()) for state in states]),
+        unheard=np.array([all(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]),
         entities=tuple(state.entities for state in states),
         merged=frozenset(one.entity_id for state in states for one in state.events if one.kind == "merged"),
         tallies=tuple(Tally() if state.budget is None else state.budget.tally for state in states),

@@ -180,6 +180,7 @@ def pass_figures(streams: Sequence[PassedStream]) -> Figures:
     false = table.false_alarms()
     return {
         **{name: figures[name] for name in named},
+        **table.standing(),
         **{f"{name}_5s": former[name] for name in named if name in _OF_FIVE_SECONDS},
         **_entities(streams, table),
         **{name: false[name] for name in ("hazard_free_hours", "onsets_per_hour", "hazard_free_share")},

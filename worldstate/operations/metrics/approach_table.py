@@ -125,6 +125,9 @@ class ApproachOutcome:
     own_side: bool = False
     other_side: bool = False
     every_side: bool = False
+    # Whether any side was in alarm in the last second before T0, and in the last hop before it; of a stream.
+    last_second: bool = False
+    at_t0: bool = False
     approach: StreamApproach = StreamApproach()
 
     @property
@@ -183,6 +186,7 @@ def hop_outcome(
     alarms_s, onsets_s = time_s[before & any_side], time_s[rising_edges(any_side)]
     named = np.asarray(raised[before].any(axis=0))
     pairs = zip(approach.entries_s, approach.sides, strict=True)
+    last = any_side[shortly_before(time_s, first_s, 1.0)]
     return ApproachOutcome(
         lead_s=first_s - float(alarms_s[0]) if alarms_s.size else 0.0,
         onsets=int(((onsets_s > first_s - longest_s) & (onsets_s < first_s)).sum()),
@@ -190,6 +194,8 @@ def hop_outcome(
         own_side=bool(named[approach.sides[0]]),
         other_side=bool(named[1 - approach.sides[0]]),
         every_side=all(raised[shortly_before(time_s, t0_s, longest_s), side].any() for t0_s, side in pairs),
+        last_second=bool(last.any()),
+        at_t0=bool(last[-1:].any()),
         approach=approach,
     )
 
@@ -238,6 +244,13 @@ class ApproachTable:
             "detected_high": high,
             "lead_s": mean_of([one.lead_s for one in self.outcomes if one.detected]),
             "lead_missed_as_0_s": mean_of([one.lead_s for one in self.outcomes]),
+        }
+
+    def standing(self) -> Figures:
+        """Return how often an alarm stands in the last second before T0, and in the last hop before it."""
+        return {
+            "advised_last_second": mean_of([one.last_second for one in self.outcomes]),
+            "advised_at_t0": mean_of([one.at_t0 for one in self.outcomes]),
         }
 
     def sides(self) -> Figures:

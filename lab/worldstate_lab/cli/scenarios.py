@@ -1,0 +1,106 @@
+"""`worldstate-lab scenarios`: what the whole world-state makes of weather, stops and quiet road users.
+
+Each scenario is a traffic with hazards and one without, rendered at every junction for the model's own array,
+listened to and followed hop by hop without a camera. Printed for each: approaches with an advisory before T0,
+those in advisory in the last second before it and in the last hop, onsets an hour without hazards, and the
+shares of hops that the snapshot counts as unheard, of those whose second holds a gust and of all others.
+Quiet road users count only in scenarios of their own. Streams that lie in --streams are not rendered again.
+
+Choose junctions and a seed from which the model did not learn.
+
+Examples
+--------
+  worldstate-lab scenarios --streams exam --jobs 2
+  worldstate-lab scenarios gusts rain --streams exam --model my_model.json --minutes 4 --sites SA2 TB912
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from worldstate.adapters.files.acoustic_domain import array_of
+from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.progress import track
+from worldstate.commissioning.commission import parts_of
+from worldstate.commissioning.heard_stream import hear_stream, junction_named
+from worldstate.commissioning.stream_exam import approach_table
+from worldstate.ground.typing import BoolArray
+from worldstate.operations.metrics.approach_table import Figures, mean_of
+from worldstate.simulation.parallel import in_processes
+from worldstate.simulation.stream.arrivals import draw_sounds
+from worldstate.simulation.stream.settings import StreamSettings, traffic_named
+from worldstate.simulation.stream.writing import SOUNDS
+from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
+from worldstate_lab.report.table import figure_lines
+
+# Traffic with hazards and traffic without.
+SCENARIOS: Mapping[str, tuple[str, str]] = {
+    "usual": ("pairs", "no-hazard"),
+    **{day: (f"pairs-{day}", f"no-hazard-{day}") for day in ("gusts", "rain", "quiet")},
+    "stops": ("stops", "no-hazard"),
+    **{kind: (f"{kind}-only", "no-hazard") for kind in ("bicycle", "scooter", "electric")},
+}
+RATE_HZ, WINDOW_S = 6000.0, 1.0  # Of the sound, up to 2 kHz; what a hop reads
+Followed = tuple[PassedStream, BoolArray]  # A stream, and whether the second of each hop holds a gust
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add, sites = parser.add_argument, ["SA2", "SB2", "TA911", "TB912"]
+    add("names", nargs="*", metavar="NAME", choices=[[], *SCENARIOS], help="scenarios (default: all)")
+    add("--streams", type=Path, required=True, metavar="D", help="folder of what is listened to")
+    add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
+    add("--budget", type=float, metavar="N", help="onsets an hour (default: that of the model)")
+    add("--sites", nargs="+", default=sites, metavar="SITE", help=f"junctions (default: {' '.join(sites)})")
+    add("--minutes", type=float, default=10.0, help="of each stream (default: %(default)g)")
+    add("--seed", type=int, default=9100, help="of the first junction (default: %(default)s)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    model, names = read_model(arguments.model), arguments.names or [*SCENARIOS]
+    if arguments.budget is not None:
+        model = replace(model, sequence=parts_of(model)[1].asking(budget=arguments.budget))
+    arguments.streams.mkdir(parents=True, exist_ok=True)
+    every = [(i, site, arguments.minutes) for i, site in enumerate(arguments.sites, arguments.seed)]
+    plan = [
+        StreamSettings(junction_named(site), minutes, seed, traffic_named(name), sample_rate_hz=RATE_HZ)
+        for name in dict.fromkeys(chain.from_iterable(SCENARIOS[name] for name in names))
+        for seed, site, minutes in every
+    ]
+    found = in_processes(partial(followed, model=model, folder=arguments.streams), plan, arguments.jobs)
+    streams: dict[str, list[Followed]] = {}
+    for settings, one in zip(plan, track(found, "following", len(plan)), strict=True):
+        streams.setdefault(settings.traffic.name, []).append(one)
+    rows = {name: scenario_figures([*chain(*map(streams.get, SCENARIOS[name]))]) for name in names}
+    return CommandResult({"scenarios": rows}, table={}, lines=figure_lines(rows, ".3f"))
+
+
+def followed(settings: StreamSettings, model: Model, folder: Path) -> Followed:
+    """Return a stream as the filter follows it, rendered unless it lies in the folder."""
+    path, array = folder / f"{settings.name}-{settings.minutes:g}.npz", array_of(model.domain)
+    if not path.is_file():
+        hear_stream(settings, [array])[0].save(path)
+    passed = passed_stream(path, model, "none")
+    in_gust = np.zeros(len(passed.followed.time_s), bool)
+    for one in draw_sounds(settings, array.n_microphones, settings.generator(SOUNDS)):
+        since_s = passed.followed.time_s - one.start_s - one.sound.start_s
+        in_gust |= (one.sound.kind == "wind") & (since_s > 0.0) & (since_s < one.sound.duration_s + WINDOW_S)
+    return passed, in_gust
+
+
+def scenario_figures(streams: Sequence[Followed]) -> Figures:
+    """Return the figures of one scenario."""
+    table = approach_table([(one.heard, one.followed.advisory) for one, _ in streams])
+    counted = table.loud() if table.loud().outcomes else table
+    unheard = np.concatenate([one.followed.unheard for one, _ in streams])
+    in_gust = np.concatenate([inside for _, inside in streams])
+    found = counted.detections() | counted.standing() | table.false_alarms()
+    return found | {"unheard_in_gusts": mean_of(unheard[in_gust]), "unheard_else": mean_of(unheard[~in_gust])}
