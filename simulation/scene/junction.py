@@ -19,9 +19,9 @@ SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, i
 MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
 MAX_OCCLUDERS = 4
 _MOVING = re.compile(r"D([AB]\d+)")  # Named or drawn: where the ego moves at the place S..
-# By the first letter of a drawn site: TA1. All others are heard along the paths of their plan.
-_RENDERERS = {"T": "rays"}
-_DRAWN = re.compile(r"[T][AB]\d{1,6}")
+# By the first letter of a drawn site: TA1, MB917. All others are heard along the paths of their plan.
+_RENDERERS = {"T": "rays", "M": "mirrors"}
+_DRAWN = re.compile(r"[TM][AB]\d{1,6}")
 # The fits want smooth side walls, and a rough one opposite: shop fronts, doors, parked bicycles.
 ROUGHNESS_A, ROUGHNESS_B = (1.0, 4.0), (0.3, 1.0)
 WALL_END_M = 99.0  # openings before a wall begins and after it ends go on to here
@@ -168,7 +168,7 @@ def site(name: str) -> Site:
     Parameters
     ----------
     name : str
-        One of `SITES` or `MOVING_SITES`, or TA1, TB1, TA2, ... of the second renderer.
+        One of `SITES` or `MOVING_SITES`, or TA1, TB1, ... and MA1, ... of the other renderers.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def site(name: str) -> Site:
     if name in MOVING_SITES:
         return replace(site("S" + name[1:]), name=name)
     if not _DRAWN.fullmatch(name):
-        one_of("site", name, (*SITES, *MOVING_SITES, "TA1", "TB1"))
+        one_of("site", name, (*SITES, *MOVING_SITES, "TA1", "TB1", "MA1", "MB1"))
     return PLANS[name] if name in PLANS else drawn_site(name)
 
 
@@ -292,7 +292,8 @@ def _wider_site(name: str, rng: np.random.Generator) -> Site:
     verge, street = rng.uniform(0.3, 3.5), rng.uniform(4.0, 9.0)
     opposite = ahead + verge + street + rng.uniform(0.3, 4.0) if name[1] == "A" else None
     plan = Site(name, left, right, ahead, opposite, left, right, street, verge_m=verge)
-    return replace(plan, surface_db=rng.uniform(0.0, 9.0))
+    side, facade = rng.uniform(0.9, 0.97, 2) if plan.renderer == "mirrors" else (0.8, 0.8)
+    return replace(plan, surface_db=rng.uniform(0.0, 9.0), side_reflection=side, facade_reflection=facade)
 
 
 def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:

@@ -11,6 +11,7 @@ from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.presets import Ambience, Preset, recording_ambience, site_ambience
 
 from .background import Town, add_background, add_town
+from .mirrors import add_mirrored, town_by_mirrors
 from .rays import add_traced, town_by_rays
 from .receiver import Receiver
 from .static_field import PlacedSource, StreetSound
@@ -29,6 +30,7 @@ class Renderer:
 RENDERERS: Mapping[str, Renderer] = MappingProxyType(
     {
         "rays": Renderer(add_traced, town_by_rays, over_roofs=True),
+        "mirrors": Renderer(add_mirrored, town_by_mirrors, over_roofs=False),
     }
 )
 
