@@ -20,10 +20,10 @@ from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, a
 from worldstate.simulation.scene.driving import comes_into_view_s, trajectories
 from worldstate.simulation.scene.settings import SimulationSettings, SoundSettings
 from worldstate.simulation.scene.vehicle import Trajectory
-from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
 from worldstate.simulation.sound.receiver import Receiver, standing_m
+from worldstate.simulation.sound.renderers import add_ambience
 from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 SCHEMA = "worldstate.simulation.truth"
@@ -250,7 +250,7 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     # Generators of their own, and only where something sounds: the rest stays what it is without.
     _add_sounds(street, settings, paths, rng)
     static.render()
-    add_background(sound, receiver, settings.site, settings.preset, to_street)
+    add_ambience(sound, receiver, settings.site, settings.preset, to_street)
     if not settings.ego.stands:
         add_ego(sound, receiver, settings.site, settings.preset, to_channels)
     return _to_samples(sound, settings, to_channels)

@@ -13,10 +13,10 @@ from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emi
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.diffraction import screen_attenuation_db
 from worldstate.simulation.sound.propagation import ANY_ORDER, add_sources
-from worldstate.simulation.sound.rays import TracedSource, add_traced
 from worldstate.simulation.sound.receiver import Receiver, Surroundings
+from worldstate.simulation.sound.renderers import RENDERERS
 from worldstate.simulation.sound.scatter import add_scattered, scattering
-from worldstate.simulation.sound.static_field import StreetSound, add_late_sound
+from worldstate.simulation.sound.static_field import PlacedSource, StreetSound, add_late_sound
 
 from .emitter import emitted
 from .weather import add_gusts, add_rain, add_wind
@@ -37,9 +37,9 @@ def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator)
     sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
-    if site.is_traced:
-        source = TracedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M)
-        add_traced(street, source, rng)
+    if renderer := RENDERERS.get(site.renderer):
+        source = PlacedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M)
+        renderer.add_source(street, source, rng)
         return
     around = _around(street)
     far = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
@@ -127,14 +127,14 @@ def _add_from(
     rate, ego_x = receiver.sample_rate_hz, receiver.ego.x_m(track.time_s)
     angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad
     towards = _gained(signal, directivity(kind, angle), rate) * GROUND_GAIN
-    if site.is_traced:
-        source = TracedSource(towards, track.time_s, track.x_m, track.y_m, kind.height_m)
-        add_traced(street, source, rng)
-        return
-    around = _around(street)
-    if not in_the_streets(site, track).all():
+    renderer, around = RENDERERS.get(site.renderer), _around(street)
+    if not (renderer and renderer.over_roofs) and not in_the_streets(site, track).all():
         over = _gained(towards, over_roofs(track, kind.height_m, receiver, around.cap_db), rate)
         add_sources(static, [_source(over, track, kind, rate)], replace(around, site=in_the_open(site)))
+        return
+    if renderer:
+        source = PlacedSource(towards, track.time_s, track.x_m, track.y_m, kind.height_m)
+        renderer.add_source(street, source, rng)
         return
     add_sources(static, [_source(towards, track, kind, rate)], around)
     mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN

@@ -19,7 +19,9 @@ SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, i
 MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
 MAX_OCCLUDERS = 4
 _MOVING = re.compile(r"D([AB]\d+)")  # Named or drawn: where the ego moves at the place S..
-_TRACED = re.compile(r"T[AB]\d{1,6}")
+# By the first letter of a drawn site: TA1, MB917. All others are heard along the paths of their plan.
+_RENDERERS = {"T": "rays", "M": "mirrors"}
+_DRAWN = re.compile(r"[TM][AB]\d{1,6}")
 # The fits want smooth side walls, and a rough one opposite: shop fronts, doors, parked bicycles.
 ROUGHNESS_A, ROUGHNESS_B = (1.0, 4.0), (0.3, 1.0)
 WALL_END_M = 99.0  # openings before a wall begins and after it ends go on to here
@@ -117,9 +119,9 @@ class Site:
         return self.in_the_open or bool(self.occluders)
 
     @property
-    def is_traced(self) -> bool:
-        """Whether its sound is carried by rays through drawn houses: TA1, TB1 and so on."""
-        return _TRACED.fullmatch(self.name) is not None
+    def renderer(self) -> str:
+        """What carries sound: "paths", "rays" through drawn houses (TA1), "mirrors": smooth walls (MA1)."""
+        return _RENDERERS[self.name[0]] if _DRAWN.fullmatch(self.name) else "paths"
 
     @property
     def far_kerb_m(self) -> float:
@@ -166,7 +168,7 @@ def site(name: str) -> Site:
     Parameters
     ----------
     name : str
-        One of `SITES` or `MOVING_SITES`, or TA1, TB1, TA2, ... of the second renderer.
+        One of `SITES` or `MOVING_SITES`, or TA1, TB1, ... and MA1, ... of the other renderers.
 
     Returns
     -------
@@ -185,8 +187,8 @@ def site(name: str) -> Site:
     """
     if name in MOVING_SITES:
         return replace(site("S" + name[1:]), name=name)
-    if not _TRACED.fullmatch(name):
-        one_of("site", name, (*SITES, *MOVING_SITES, "TA1", "TB1"))
+    if not _DRAWN.fullmatch(name):
+        one_of("site", name, (*SITES, *MOVING_SITES, "TA1", "TB1", "MA1", "MB1"))
     return PLANS[name] if name in PLANS else drawn_site(name)
 
 
@@ -257,8 +259,8 @@ def drawn_site(name: str) -> Site:
     True
     """
     rng = site_generator(name)
-    if _TRACED.fullmatch(name):
-        return _traced_site(name, rng)
+    if _DRAWN.fullmatch(name):
+        return _wider_site(name, rng)
     with_wall = name[:2] in ("SA", "DA")
     ahead, corners = rng.uniform(4.5, 5.2), rng.uniform(2.3, 3.1, 2)
     walls = corners - rng.uniform(0.1, 0.7, 2)
@@ -284,13 +286,14 @@ def drawn_site(name: str) -> Site:
     )
 
 
-def _traced_site(name: str, rng: np.random.Generator) -> Site:
-    """Draw a site for the second renderer: wider streets, and more of them, than the fitted family has."""
+def _wider_site(name: str, rng: np.random.Generator) -> Site:
+    """Draw a site of the other renderers: wider streets, and more of them, than the fitted family has."""
     (left, right), ahead = rng.uniform(2.2, 8.0, 2), rng.uniform(3.0, 10.0)
     verge, street = rng.uniform(0.3, 3.5), rng.uniform(4.0, 9.0)
     opposite = ahead + verge + street + rng.uniform(0.3, 4.0) if name[1] == "A" else None
     plan = Site(name, left, right, ahead, opposite, left, right, street, verge_m=verge)
-    return replace(plan, surface_db=rng.uniform(0.0, 9.0))
+    side, facade = rng.uniform(0.9, 0.97, 2) if plan.renderer == "mirrors" else (0.8, 0.8)
+    return replace(plan, surface_db=rng.uniform(0.0, 9.0), side_reflection=side, facade_reflection=facade)
 
 
 def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:

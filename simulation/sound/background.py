@@ -12,7 +12,7 @@ from functools import cache, lru_cache
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfftfreq
 
-from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
+from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, level_curve
 from worldstate.simulation.scene.presets import OPENINGS, Ambience, Preset, recording_ambience, site_ambience
@@ -290,3 +290,55 @@ def wind_density(
     """Power spectral density of wind at a microphone, Pa^2/Hz, from its level in the octave of 100 Hz."""
     at_100hz = REFERENCE_PA**2 * 10.0 ** (octave_100hz_db / 10.0) / (100.0 / np.sqrt(2.0))
     return np.asarray(at_100hz * (np.maximum(frequencies_hz, floor_hz) / 100.0) ** slope)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Town:
+    """What surrounds drawn walls or houses: plane waves from the sky and by where these end."""
+
+    here: Ambience
+    own: np.random.Generator  # Of the site alone
+    opened: FloatArray  # shape (K,): Share of each of K even directions from -pi on
+    sky_share: tuple[float, float] = (0.3, 0.8)
+    louder_db: tuple[float, float] = (0.0, 0.0)
+
+
+def direction_numbers(azimuth_rad: FloatArray, count: int) -> IndexArray:
+    """Return which of so many even directions each azimuth of -pi to pi belongs to, shape (n,)."""
+    return ((azimuth_rad + np.pi) * count / (2.0 * np.pi)).astype(np.intp) % count
+
+
+WAVES, WANDER_DB, WANDER_S = 64, 2.5, 0.7
+TOWN_DB, TOWN_S = 1.5, 12.0  # all of it rises and falls together
+OCTAVE_DB = 2.5  # how far a street's spectrum is from the preset's
+PASSING_S, PASSING_DB = (2.0, 6.0), (-8.0, 4.0)
+
+
+def add_town(
+    out: Float32Array, receiver: Receiver, preset: Preset, rng: np.random.Generator, town: Town
+) -> None:
+    """Add what such a street sounds like without a vehicle, shape (M, n); what passes far away is heard."""
+    grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
+    azimuth = rng.uniform(-np.pi, np.pi, WAVES)
+    elevation = np.abs(rng.normal(0.0, 0.3, WAVES))
+    opened = town.opened[direction_numbers(azimuth, len(town.opened))]
+    by_gaps, sky, time = opened / opened.sum(), town.own.uniform(*town.sky_share), grid.middles_s
+    octaves = town.here.octaves_db + OCTAVE_DB * town.own.standard_normal(len(town.here.octaves_db))
+    octaves += town.own.uniform(*town.louder_db)
+    wander = np.stack([_wander(time, WANDER_S, WANDER_DB, rng) for _ in azimuth], axis=1)
+    power = np.broadcast_to(sky / WAVES + (1.0 - sky) * by_gaps, wander.shape).copy()
+    for loudest_s in far_passages_s(preset, float(time[-1]), rng):
+        side = np.exp(8.0 * (np.cos(azimuth - rng.choice(azimuth, p=by_gaps)) - 1.0))
+        level = 10.0 ** (rng.uniform(*PASSING_DB) / 10.0) * side / side.sum()
+        power += level * np.exp(-(((time - loudest_s) / rng.uniform(*PASSING_S)) ** 2))[:, None]
+    power *= 10.0 ** ((wander + _wander(time, TOWN_S, TOWN_DB, rng)[:, None]) / 10.0)
+    noise = own_noise_density(preset, town.here, grid.frequencies_hz)
+    delays = plane_wave_delays(unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m)
+    density = level_curve(octaves, grid.frequencies_hz)
+    WaveField(grid, delays + receiver.skew_s, density, power, noise).add_to(out, rng)
+
+
+def _wander(time_s: FloatArray, every_s: float, spread_db: float, rng: np.random.Generator) -> FloatArray:
+    """Level that wanders by so much in so long, shape (B,)."""
+    knots = spread_db * rng.standard_normal(int(time_s[-1] / every_s) + 2)
+    return np.interp(time_s / every_s, np.arange(len(knots)), knots)

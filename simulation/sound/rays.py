@@ -17,18 +17,17 @@ from functools import lru_cache
 
 import numpy as np
 import scipy
-from scipy.special import modfresnelm
 
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.junction import Site, site_generator
-from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, level_curve
-from worldstate.simulation.scene.presets import Ambience, Preset
+from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
+from worldstate.simulation.scene.presets import Ambience
 
-from .background import BlockGrid, WaveField, far_passages_s, own_noise_density
+from .background import Town, direction_numbers
 from .delay import Emission, SampledSignal
-from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS
+from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS, corner_gain
 from .receiver import Receiver, add_along, add_to_all
-from .static_field import StreetSound, plane_wave_delays, unit_vectors
+from .static_field import PlacedSource, StreetSound, plane_wave_delays, unit_vectors
 
 RAYS, BOUNCES, STEP_M = 100_000, 40, 1.0
 CELL_M, PLAN_M = 2.0, ((-40.0, 40.0), (-90.0, 90.0))  # x and y of the plan that is kept
@@ -116,11 +115,6 @@ def azimuths_rad() -> FloatArray:
     return -np.pi + (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS
 
 
-def _direction_numbers(azimuth_rad: FloatArray) -> IndexArray:
-    """Return which direction each azimuth of -pi to pi belongs to, shape (n,)."""
-    return ((azimuth_rad + np.pi) * DIRECTIONS / (2.0 * np.pi)).astype(np.intp) % DIRECTIONS
-
-
 @lru_cache(maxsize=8)
 def reached(site: Site, height_m: float) -> Reached:
     """Trace the rays of a site once."""
@@ -180,7 +174,7 @@ def _launched(height_m: float, count: int, rng: np.random.Generator) -> _Rays:
     azimuth = rng.uniform(-np.pi, np.pi, count)
     sine = rng.uniform(-STEEPEST, STEEPEST, count)
     return _Rays(
-        _direction_numbers(azimuth),
+        direction_numbers(azimuth, DIRECTIONS),
         np.zeros((count, 2)),
         np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1),
         np.full(count, height_m),
@@ -273,63 +267,10 @@ def _decay_s(length_m: FloatArray, energy: FloatArray) -> float:
     return float(np.clip(-60.0 / (min(per_m, -1e-3) * SPEED_OF_SOUND_MPS), 0.15, 1.5))
 
 
-def corner_gain(edge_m: Point, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-    r"""Amplitude round the corner of a house to the array at the origin, shape (T, 8), rms over the octave.
-
-    .. math:: \frac{|D|}{\sqrt{s' s (s' + s)}}
-
-    with the coefficient D of a hard wedge of 90 degrees (Kouyoumjian and Pathak, eqs. 25 to 29) whose faces
-    run back along the own street and sideways along the crossing one.
-    """
-    # A corner on the right is one on the left of the mirrored plan.
-    side = np.sign(edge_m[1])
-    ahead, beside = edge_m[0], abs(edge_m[1])
-    from_edge = x_m - ahead, side * y_m - beside
-    away, last = np.maximum(np.hypot(*from_edge), 0.1), float(np.hypot(ahead, beside))
-    seen = np.mod(np.arctan2(*from_edge[::-1]) - np.pi, 2.0 * np.pi)
-    own = float(np.mod(np.arctan2(-beside, -ahead) - np.pi, 2.0 * np.pi))
-    octave = 2.0 ** (np.array([-1.0, 0.0, 1.0]) / 3.0)
-    k = 2.0 * np.pi * np.outer(OCTAVES_HZ, octave) / SPEED_OF_SOUND_MPS
-    distance = (away * last / (away + last))[:, None, None]
-    total = np.zeros((len(away), *k.shape), np.complex128)
-    for angle in (seen - own, seen + own):
-        for sign in (1.0, -1.0):
-            total += _wedge_term(angle[:, None, None], sign, k * distance)
-    coefficient = np.abs(total) / (2.0 * WEDGE * np.sqrt(2.0 * np.pi * k))
-    rms = np.sqrt(np.square(coefficient).mean(axis=2))
-    return np.asarray(rms / np.sqrt(away * last * (away + last))[:, None])
-
-
-WEDGE = 1.5  # the open angle round the corner, in half turns
-
-
-def _wedge_term(angle_rad: FloatArray, sign: float, k_distance: FloatArray) -> FloatArray:
-    """One of the four cotangents with its transition function."""
-    # On the boundary itself the cotangent is infinite and the transition nought: a milliradian beside it.
-    tangent = np.tan((np.pi + sign * angle_rad) / (2.0 * WEDGE))
-    beside = angle_rad + np.where(np.abs(tangent) < 1e-3, 4e-3, 0.0)
-    turns = np.rint((beside + sign * np.pi) / (2.0 * np.pi * WEDGE))
-    a = 2.0 * np.cos(0.5 * (2.0 * np.pi * WEDGE * turns - beside)) ** 2
-    root = np.sqrt(k_distance * a)
-    transition = 2j * root * np.exp(1j * root**2) * modfresnelm(root)[0]
-    return np.asarray(transition / np.tan((np.pi + sign * beside) / (2.0 * WEDGE)))
-
-
 LIT_BLEND_M = 0.5  # of a source's way, over which it comes into the straight line
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TracedSource:
-    """A sound of a traced street and where it comes from at its emission knots."""
-
-    signal: Float32Array  # shape (n,)
-    time_s: FloatArray  # shape (T,): The knots
-    x_m: FloatArray  # shape (T,)
-    y_m: FloatArray
-    height_m: float
-
-
-def add_traced(street: StreetSound, source: TracedSource, rng: np.random.Generator) -> None:
+def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
     """Add a moving or standing source by all that rays found, round both corners, over roofs, straight."""
     static, site, receiver = street.static, street.site, street.receiver
     emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
@@ -362,7 +303,7 @@ class _Way:
     later_m: float = 0.0  # Beyond the way by the mouth
 
 
-def _echoes(source: TracedSource, site: Site, receiver: Receiver, rng: np.random.Generator) -> list[_Way]:
+def _echoes(source: PlacedSource, site: Site, receiver: Receiver, rng: np.random.Generator) -> list[_Way]:
     """Return the directions from which rays came."""
     here = _reached_by(receiver, site)
     energy = _at(here.energy, source.x_m, source.y_m)
@@ -381,7 +322,7 @@ def _echoes(source: TracedSource, site: Site, receiver: Receiver, rng: np.random
     ]
 
 
-def _edges(source: TracedSource, site: Site, receiver: Receiver, lit: FloatArray) -> list[_Way]:
+def _edges(source: PlacedSource, site: Site, receiver: Receiver, lit: FloatArray) -> list[_Way]:
     """Return the ways round both corners and over the nearest roof, of a source that is not seen."""
     x, y, ways = source.x_m, source.y_m, []
     for across in (site.corner_left_m, -site.corner_right_m):
@@ -394,7 +335,7 @@ def _edges(source: TracedSource, site: Site, receiver: Receiver, lit: FloatArray
 
 
 def _add_straight(
-    out: Float32Array, emission: Emission, source: TracedSource, lit: FloatArray, receiver: Receiver
+    out: Float32Array, emission: Emission, source: PlacedSource, lit: FloatArray, receiver: Receiver
 ) -> None:
     """Add what reaches every microphone along the straight line."""
     made = emission.table(np.repeat(lit[:, None], len(OCTAVES_HZ), axis=1))
@@ -410,7 +351,7 @@ def _add_straight(
     add_to_all(out, table, emission.knots_s[span], travel, receiver)
 
 
-def _roof_gain(source: TracedSource, receiver: Receiver) -> FloatArray:
+def _roof_gain(source: PlacedSource, receiver: Receiver) -> FloatArray:
     r"""Amplitude over the nearest roof, shape (T, 8): ISO 9613-2, eq. (14), a thin screen, at most 20 dB.
 
     .. math:: D = 10 \log_{10}(3 + 20 z / \lambda)
@@ -425,14 +366,14 @@ def _roof_gain(source: TracedSource, receiver: Receiver) -> FloatArray:
 ROOF_M, ROOF_RAD = (6.0, 8.0), 0.5  # how far away and how high it is, and how steep sound comes from there
 
 
-def _lit(site: Site, source: TracedSource) -> FloatArray:
+def _lit(site: Site, source: PlacedSource) -> FloatArray:
     """1 where the array sees a source, 0 where a corner is before it, shape (T,)."""
     right, left = site.sights_m(np.maximum(source.x_m, site.corner_ahead_m), (0.0, 0.0))
     inside = np.minimum(left - source.y_m, source.y_m - right)
     return np.clip(0.5 + inside / LIT_BLEND_M, 0.0, 1.0) ** 2
 
 
-def _way_m(site: Site, source: TracedSource) -> FloatArray:
+def _way_m(site: Site, source: PlacedSource) -> FloatArray:
     """Way from above by the middle of the mouth where a source is beside it, shape (T,)."""
     wide = min(site.corner_left_m, site.corner_right_m)
     over = np.sign(source.y_m) * np.minimum(np.abs(source.y_m), wide)
@@ -466,47 +407,6 @@ def _smeared(table: SampledSignal, early: float, decay_s: float, rng: np.random.
     return SampledSignal(np.asarray(values, np.float32), table.start_s, table.rate_hz)
 
 
-WAVES, SKY_SHARE, WANDER_DB, WANDER_S = 64, (0.3, 0.8), 2.5, 0.7
-TOWN_DB, TOWN_S = 1.5, 12.0  # all of it rises and falls together
-OCTAVE_DB = 2.5  # how far a street's spectrum is from the preset's
-PASSING_S, PASSING_DB = (2.0, 6.0), (-8.0, 4.0)
-
-
-def add_traced_background(
-    out: Float32Array,
-    receiver: Receiver,
-    site: Site,
-    preset: Preset,
-    rng: np.random.Generator,
-    here: Ambience,
-) -> None:
-    """Add what a traced street sounds like without a vehicle, shape (M, n).
-
-    Sound comes from the sky, and by the gaps and ends of the streets where rays got out; what passes far
-    away is heard by one of these.
-    """
-    grid, own = BlockGrid(out.shape[1], receiver.sample_rate_hz), site_generator(site.name, "town")
-    opened = _reached_by(receiver, site).open
-    azimuth = rng.uniform(-np.pi, np.pi, WAVES)
-    elevation = np.abs(rng.normal(0.0, 0.3, WAVES))
-    opened = opened[_direction_numbers(azimuth)]
-    by_gaps = opened / opened.sum()
-    sky, time = own.uniform(*SKY_SHARE), grid.middles_s
-    octaves = here.octaves_db + OCTAVE_DB * own.standard_normal(len(OCTAVES_HZ))
-    wander = np.stack([_wander(time, WANDER_S, WANDER_DB, rng) for _ in azimuth], axis=1)
-    power = np.broadcast_to(sky / WAVES + (1.0 - sky) * by_gaps, wander.shape).copy()
-    for loudest_s in far_passages_s(preset, float(time[-1]), rng):
-        side = np.exp(8.0 * (np.cos(azimuth - rng.choice(azimuth, p=by_gaps)) - 1.0))
-        level = 10.0 ** (rng.uniform(*PASSING_DB) / 10.0) * side / side.sum()
-        power += level * np.exp(-(((time - loudest_s) / rng.uniform(*PASSING_S)) ** 2))[:, None]
-    power *= 10.0 ** ((wander + _wander(time, TOWN_S, TOWN_DB, rng)[:, None]) / 10.0)
-    noise = own_noise_density(preset, here, grid.frequencies_hz)
-    delays = plane_wave_delays(unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m)
-    density = level_curve(octaves, grid.frequencies_hz)
-    WaveField(grid, delays + receiver.skew_s, density, power, noise).add_to(out, rng)
-
-
-def _wander(time_s: FloatArray, every_s: float, spread_db: float, rng: np.random.Generator) -> FloatArray:
-    """Level that wanders by so much in so long, shape (B,)."""
-    knots = spread_db * rng.standard_normal(int(time_s[-1] / every_s) + 2)
-    return np.interp(time_s / every_s, np.arange(len(knots)), knots)
+def town_by_rays(receiver: Receiver, site: Site, here: Ambience) -> Town:
+    """Return a town that is heard by the gaps and ends of the streets where rays got out."""
+    return Town(here, site_generator(site.name, "town"), _reached_by(receiver, site).open)

@@ -155,6 +155,17 @@ class StreetSound:
     receiver: Receiver
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedSource:
+    """A sound of one point and where it comes from at its emission knots."""
+
+    signal: Float32Array  # shape (n,)
+    time_s: FloatArray  # shape (T,): The knots
+    x_m: FloatArray  # shape (T,)
+    y_m: FloatArray
+    height_m: float
+
+
 def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Generator) -> None:
     """Add a diffuse tail of a dry signal: its energy without its direction.
 

@@ -23,11 +23,10 @@ from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.presets import Ambience, Preset, recording_ambience, site_ambience
 from worldstate.simulation.scene.settings import SoundSettings
 from worldstate.simulation.scene.vehicle import EgoMotion
-from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego
-from worldstate.simulation.sound.rays import add_traced_background
 from worldstate.simulation.sound.receiver import Receiver, standing_m
+from worldstate.simulation.sound.renderers import add_ambience
 from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 from .arrivals import STANDING, Event, SoundEvent, VehicleEvent
@@ -129,8 +128,7 @@ def ambience_piece(
     settings, overlap = scene.settings, overlap_samples(scene.settings)
     sound = np.zeros((len(scene.microphones.positions_m), samples + overlap), np.float32)
     receiver = scene.microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz)
-    add = add_traced_background if settings.site.is_traced else add_background
-    add(sound, receiver, settings.site, settings.drawn_preset, rng, scene.ambience)
+    add_ambience(sound, receiver, settings.site, settings.drawn_preset, rng, scene.ambience)
     if settings.rain_db is not None:
         # From a second before the piece to a second after it: a shower sets in and ends slowly.
         lasts_s = sound.shape[1] / settings.sample_rate_hz + 2.0

@@ -87,7 +87,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     sites = simulation.SITES
     add(
         "--site",
-        help=f"{', '.join(sites)}, or TA1, TB1, ... of the second renderer (default: {sites[0]})",
+        help=f"{', '.join(sites)}, or TA1, MB7, ... of the other renderers (default: {sites[0]})",
     )
     add("--traffic", choices=[*TRAFFICS], help="how much drives (default: calm)")
 

@@ -1,0 +1,306 @@
+"""The third renderer: mirror images of a source in smooth walls, and the two corners between the streets.
+
+It has no late field and scatters nothing: a hidden vehicle is heard by its specular images, each with its own
+delay at every microphone, and by waves that the corners diffract. Beams from the array are followed through
+the plan; each is the part of it in which a source reaches the array by one sequence of reflections, so that
+every reflection lies on its wall and no wall stands in between. Energy, rays and screens play no part.
+
+Sources: J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics", J.
+Acoust. Soc. Am. 65, 943-950, 1979; T. Funkhouser et al., "A beam tracing approach to acoustic modeling for
+interactive virtual environments", SIGGRAPH 1998.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import pairwise, product
+
+import numpy as np
+
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.simulation.scene.junction import Site, site_generator
+from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
+from worldstate.simulation.scene.presets import Ambience
+
+from .background import Town, direction_numbers
+from .delay import Emission
+from .diffraction import air_gain, corner_gain, ground_gain
+from .receiver import Receiver, add_to_all
+from .static_field import PlacedSource, StreetSound
+
+ORDERS = 10  # reflections that are followed
+BENT_ORDERS = 4  # with a corner between them: those beyond are faint beside images that no corner hides
+FADE_M = 1.0  # of a source's way over which an image appears: the first Fresnel zone at 1 kHz, 6 m away
+FAINTEST = 0.03  # of the amplitude of the loudest: an image below it is left out
+NARROWEST_RAD = 1e-5  # of a beam
+BESIDE_M = 0.01  # a corner is reached where a point so far beside it is
+EVERY = 4  # knots, for gains of corners change slowly
+DIRECTIONS, SKY_SHARE, LOUDER_DB = 36, (0.1, 0.9), (-8.0, 2.0)
+OWN_STREET_M, ARM_M = (10.0, 60.0), (20.0, 90.0)  # how far walls go on behind the ego, and along an arm
+GAP_SHARE, GAP_M = 0.3, (2.5, 6.0)  # of the fronts in the crossing street have an opening so wide
+LOSS_PER_OCTAVE = (0.0, 0.01)
+BEYOND_SHARE = 0.5  # of crossings without a wall opposite the own street goes on between houses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fronts:
+    """Smooth walls, seen from above."""
+
+    ends_m: FloatArray  # shape (W, 2, 2): Both ends of every wall, x and y
+    kept: FloatArray  # shape (W, 8): Pressure that comes back, per octave
+
+
+def drawn_fronts(site: Site) -> Fronts:
+    """Draw how far the walls of a site's plan go, their openings, and what they keep.
+
+    Examples
+    --------
+    >>> from worldstate.simulation.scene.junction import drawn_site
+    >>> float(drawn_fronts(drawn_site("MA1")).kept.min()) > 0.8
+    True
+    """
+    rng, ahead = site_generator(site.name, "fronts"), site.corner_ahead_m
+    sides = ((1.0, site.corner_left_m), (-1.0, site.corner_right_m))
+    walls = []
+    for side, across in sides:
+        corner = (ahead, side * across)
+        walls.append((corner, (-1.0, 0.0), rng.uniform(*OWN_STREET_M), _kept(site.side_reflection, rng)))
+        walls.append((corner, (0.0, side), rng.uniform(*ARM_M), _kept(site.facade_reflection, rng)))
+    opposite, apart = site.opposite_wall_m, 0.0
+    if opposite is None and rng.random() < BEYOND_SHARE:
+        opposite, apart = site.far_kerb_m + site.verge_m, rng.uniform(2.0, 8.0)
+    if opposite is not None:
+        kept = _kept(site.facade_reflection, rng)
+        walls += [((opposite, side * apart), (0.0, side), rng.uniform(*ARM_M), kept) for side, _ in sides]
+    pieces = []
+    for start, way, length, kept in walls:
+        at: tuple[float, ...] = (0.0, length)
+        # None in the own street: the array would see an arm through it, and the camera's plan has none.
+        if way[0] == 0.0 and rng.random() < GAP_SHARE:
+            gap = rng.uniform(2.0, length - GAP_M[1])
+            at = (0.0, gap, gap + rng.uniform(*GAP_M), length)
+        for first, last in zip(at[::2], at[1::2], strict=True):
+            pieces.append((np.array(start) + np.outer((first, last), way), kept))
+    ends, factors = zip(*pieces, strict=True)
+    return Fronts(np.array(ends), np.array(factors))
+
+
+def _kept(reflection: float, rng: np.random.Generator) -> FloatArray:
+    return np.asarray(reflection - rng.uniform(*LOSS_PER_OCTAVE) * np.arange(len(OCTAVES_HZ)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Images:
+    """Mirror images of a point (a microphone), and the parts of the plan that reach it by each of them."""
+
+    mirror: FloatArray  # shape (I, 3, 3): (x, y, 1) of a point to that of its image
+    kept: FloatArray  # shape (I, 8): Product of the reflection factors
+    order: IndexArray  # shape (I,): Number of reflections
+    number: IndexArray  # shape (B,): The image that each beam belongs to
+    apex_m: FloatArray  # shape (B, 2)
+    edges: FloatArray  # shape (B, 2, 2): Unit vectors along both edges, the second on the left of the first
+    bounds: FloatArray  # shape (B, 2, 3): (a, b, c): a x + b y + c > 0 beyond the last wall, before the next
+
+    def inside(self, place: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Distance from both edges, positive inside, and whether a place lies between both walls.
+
+        Shapes: place (3, T), rows x, y, 1 -> (2, B, T), (B, T).
+        """
+        away = place[:2] - self.apex_m[:, :, None]
+        (ax, ay), (bx, by) = self.edges.transpose(1, 2, 0)[:, :, :, None]
+        across = np.stack([ax * away[:, 1] - ay * away[:, 0], by * away[:, 0] - bx * away[:, 1]])
+        return across, np.all(self.bounds @ place > 0.0, axis=1)
+
+    def weights(self, place: FloatArray) -> FloatArray:
+        """1 where a source reaches the point by an image, 0 where a wall is in the way, shape (I, T)."""
+        across, between = self.inside(place)
+        # Beams that share an edge add up to one across it, and one narrower than the fade is fainter.
+        each = np.maximum(smooth_step(0.5 + across / FADE_M).sum(axis=0) - 1.0, 0.0) * between
+        out = np.zeros((len(self.mirror), each.shape[1]))
+        np.add.at(out, self.number, each)
+        return np.minimum(out, 1.0)
+
+    def of(self, image: int, point_m: FloatArray) -> FloatArray:
+        """Return the mirror image of a point, shape (2,)."""
+        return np.asarray(self.mirror[image, :2] @ [*point_m[:2], 1.0])
+
+    def reached_from(self, place_m: FloatArray) -> IndexArray:
+        """Return the images by which the point is reached from a place (2,)."""
+        across, between = self.inside(np.array([[*place_m, 1.0]]).T)
+        return np.unique(self.number[(between & np.all(across > 0.0, axis=0))[:, 0]])
+
+    def opened(self, directions: int) -> FloatArray:
+        """Energy that leaves the walls by each of so many even directions of the point, shape (K,)."""
+        out, free = np.full(directions, 1e-9), ~self.bounds[:, 1, :2].any(axis=1)
+        for number, ((ax, ay), (bx, by)) in zip(self.number[free], self.edges[free], strict=True):
+            x, y = np.array([ax + bx, ay + by]) @ self.mirror[number, :2, :2]
+            at = direction_numbers(np.arctan2(y, x), directions)
+            out[at] += np.arcsin(ax * by - ay * bx) * self.kept[number, 3] ** 2
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Beam:
+    """Directions (start, start + width) from an image, after a reflection in wall `last` (-1: none)."""
+
+    mirror: FloatArray
+    kept: FloatArray
+    apex_m: FloatArray
+    start_rad: float
+    width_rad: float
+    last: int = -1
+    order: int = 0
+
+
+def trace(fronts: Fronts, point_m: FloatArray, orders: int = ORDERS) -> Images:
+    """Follow the beams from a point (2,) through up to so many reflections."""
+    numbers: dict[tuple[float, ...], int] = {}
+    images, found = list[tuple[object, ...]](), list[tuple[object, ...]]()
+    whole = np.eye(3), np.ones(len(OCTAVES_HZ)), point_m
+    waiting = [_Beam(*whole, start, 0.5 * np.pi) for start in (-np.pi, -0.5 * np.pi, 0.0, 0.5 * np.pi)]
+    while waiting:
+        beam = waiting.pop()
+        key = *_key(beam.mirror), *beam.kept.tolist()
+        if key not in numbers:
+            numbers[key] = len(images)
+            images.append((beam.mirror, beam.kept, beam.order))
+        beyond = _side(fronts, beam.last, beam.apex_m) * (-1.0 if beam.last >= 0 else 1.0)
+        for start, width, wall in _parts(fronts, beam):
+            before = _side(fronts, wall, beam.apex_m)
+            edges = _unit(np.array([start, start + width]))
+            found.append((numbers[key], beam.apex_m, edges, (beyond, before)))
+            if wall >= 0 and beam.order < orders:
+                mirror = np.eye(3) - 2.0 * np.outer([*before[:2], 0.0], before)
+                # Mirrored, the left edge is the right one.
+                x, y = mirror[:2, :2] @ edges[1]
+                apex, kept = mirror[:2] @ [*beam.apex_m, 1.0], beam.kept * fronts.kept[wall]
+                turned = float(np.arctan2(y, x)), width, wall, beam.order + 1
+                waiting.append(_Beam(mirror @ beam.mirror, kept, apex, *turned))
+    columns = [*zip(*images, strict=True), *zip(*found, strict=True)]
+    return Images(*(np.array(one) for one in columns))
+
+
+def _key(mirror: FloatArray) -> tuple[float, ...]:
+    """Return what images at one place share, whatever walls they met in whatever order."""
+    return tuple((np.round(mirror.ravel(), 4) + 0.0).tolist())
+
+
+def _unit(angle_rad: float | FloatArray) -> FloatArray:
+    return np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=-1)
+
+
+def _parts(fronts: Fronts, beam: _Beam) -> Iterator[tuple[float, float, int]]:
+    """Cut a beam at the ends of walls: start and width of each part, the wall that it meets (-1: none)."""
+    away = fronts.ends_m - beam.apex_m
+    turned = np.mod(np.arctan2(away[..., 1], away[..., 0]) - beam.start_rad, 2.0 * np.pi)
+    cuts = np.unique(np.r_[0.0, turned[turned < beam.width_rad], beam.width_rad])
+    first, along = away[:, 0].T, (away[:, 1] - away[:, 0]).T
+    for low, high in pairwise(cuts.tolist()):
+        if high - low > NARROWEST_RAD:
+            x, y = _unit(beam.start_rad + 0.5 * (low + high))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                across = x * along[1] - y * along[0]
+                way = (first[0] * along[1] - first[1] * along[0]) / across
+                part = (first[0] * y - first[1] * x) / across
+            # Walls before the last one stand between it and its image, where no sound is.
+            hit = (part > 0.0) & (part < 1.0) & (way > (way[beam.last] + 1e-6 if beam.last >= 0 else 0.0))
+            nearest = int(np.where(hit, way, np.inf).argmin()) if hit.any() else -1
+            yield beam.start_rad + low, high - low, nearest
+
+
+def _side(fronts: Fronts, wall: int, apex_m: FloatArray) -> FloatArray:
+    """Return (a, b, c), (a, b) of unit length, with a x + b y + c > 0 on the apex's side of a wall."""
+    if wall < 0:
+        return np.array([0.0, 0.0, 1.0])
+    (x, y), (to_x, to_y) = fronts.ends_m[wall]
+    line = np.array([y - to_y, to_x - x, x * to_y - to_x * y]) / np.hypot(to_x - x, to_y - y)
+    return np.asarray(line * np.sign(line @ [*apex_m, 1.0]))
+
+
+@lru_cache(maxsize=64)
+def images_at(site: Site, x_m: float, y_m: float) -> Images:
+    """Follow the beams from a place of a site once."""
+    return trace(drawn_fronts(site), np.array([x_m, y_m]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """One way from a source to the microphones at the emission knots."""
+
+    gain: FloatArray  # shape (T, 8): Amplitude beside spherical spreading
+    from_m: FloatArray  # shape (2, T) or (2, 1): Where its last leg begins, at the source or at a corner
+    before_m: FloatArray | float  # shape (T,): Way before that
+    images: Images
+    number: int  # The image of the microphones where it ends
+    height_m: float  # Of the source
+
+    def length_m(self, position_m: FloatArray, span: slice = slice(None)) -> FloatArray:
+        """Length to a position (3,) at some of the knots."""
+        last = np.hypot(*(self.from_m - self.images.of(self.number, position_m)[:, None]))
+        return np.asarray(np.hypot(self.before_m + last, position_m[2] - self.height_m)[span])
+
+
+def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
+    """Add a moving or standing source by all its images, and by the waves that both corners diffract."""
+    receiver, centre = street.receiver, street.receiver.centre_m
+    emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
+    ways = ways_of(street.site, source, centre)
+    lengths = [way.length_m(centre) for way in ways]
+    loud = np.array([way.gain[:, 3] / length for way, length in zip(ways, lengths, strict=True)])
+    for way, length, level in zip(ways, lengths, loud, strict=True):
+        road = ground_gain(length, source.height_m, float(centre[2]))
+        audible = level > FAINTEST * loud.max(axis=0)
+        made = emission.table(way.gain * air_gain(length) * road * audible[:, None])
+        if made is not None:
+            table, span = made
+            travel = partial(way.length_m, span=span)
+            add_to_all(street.static.out, table, emission.knots_s[span], travel, receiver)
+
+
+def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]:
+    """Return every image in which a source is seen, and what the corners bend of it."""
+    images = images_at(site, *centre_m[:2].tolist())
+    place = np.stack([source.x_m, source.y_m, np.ones_like(source.x_m)])
+    lit, height = images.weights(place), source.height_m
+    # At the edge of a shadow half of the amplitude is left: a quarter here, a quarter by the corner.
+    seen = [
+        Way(lit[number, :, None] ** 2 * images.kept[number], place[:2], 0.0, images, number, height)
+        for number in np.flatnonzero(lit.any(axis=1)).tolist()
+    ]
+    return [*seen, *_diffracted(site, images, lit, place, centre_m, height)]
+
+
+def _diffracted(
+    site: Site, images: Images, lit: FloatArray, place: FloatArray, centre_m: FloatArray, height_m: float
+) -> Iterator[Way]:
+    """Yield the ways from images of a source in an arm round its corner to images of the microphones."""
+    seen: dict[tuple[float, ...], FloatArray] = defaultdict(lambda: np.zeros(lit.shape[1]))
+    for mirror, weight in zip(images.mirror, lit, strict=True):
+        seen[_key(mirror)] = seen[_key(mirror)] + weight
+    knots = np.arange(lit.shape[1])
+    some = np.r_[knots[:-1:EVERY], knots[-1]]
+    for side, across in ((1.0, site.corner_left_m), (-1.0, site.corner_right_m)):
+        corner, here = np.array([site.corner_ahead_m, side * across]), np.array([BESIDE_M, side * BESIDE_M])
+        arm = images_at(site, corner[0] + here[0], corner[1] - here[1])
+        reached = arm.weights(place[:, some]) * (side * place[1, some] > 0.0)
+        both = product(images.reached_from(corner - here).tolist(), np.flatnonzero(reached.any(axis=1)))
+        for ear, there in both:
+            at, mirror = images.of(ear, centre_m), arm.mirror[there]
+            unfolded = (np.linalg.inv(mirror) @ place)[:2]
+            # Images behind a face of the corner are in the coefficient of the wedge.
+            open_to = reached[there] * (unfolded[0, some] > corner[0]) * (side * at[1] < across)
+            hidden = open_to * np.maximum(1.0 - seen[_key(mirror @ images.mirror[ear])][some], 0.0)
+            if images.order[ear] + arm.order[there] <= BENT_ORDERS and hidden.any():
+                before = np.hypot(*(unfolded - corner[:, None]))
+                gain = corner_gain(tuple(corner - at), *(unfolded[:, some] - at[:, None]))
+                gain *= hidden[:, None] * images.kept[ear] * arm.kept[there]
+                gain = np.stack([np.interp(knots, some, band) for band in gain.T], axis=1)
+                way = Way(gain, corner[:, None], before, images, ear, height_m)
+                yield replace(way, gain=gain * way.length_m(centre_m)[:, None])
+
+
+def town_by_mirrors(receiver: Receiver, site: Site, here: Ambience) -> Town:
+    """Return a town that is heard by where the walls end, at a level of the site's own."""
+    opened = images_at(site, *receiver.centre_m[:2].tolist()).opened(DIRECTIONS)
+    return Town(here, site_generator(site.name, "town"), opened, SKY_SHARE, LOUDER_DB)

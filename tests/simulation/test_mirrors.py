@@ -1,0 +1,160 @@
+"""The renderer of smooth walls against pyroomacoustics' image sources, and the laws of mirror images."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.simulation.dataset.recording import simulate_recording
+from worldstate.simulation.scene.junction import drawn_site, site
+from worldstate.simulation.scene.presets import preset
+from worldstate.simulation.scene.settings import SimulationSettings
+from worldstate.simulation.sound import mirrors, renderers
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.mirrors import FADE_M, Fronts, add_mirrored, drawn_fronts, trace
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.static_field import PlacedSource, StaticSources, StreetSound
+
+FS = 6000.0
+EAR = np.zeros(2)
+# A junction whose streets are closed at their ends: own street along x, crossing street along y.
+JUNCTION = np.array([(-9, -3), (5, -3), (5, -24), (12, -24), (12, 26), (5, 26), (5, 3), (-9, 3)], float)
+YARD = np.array([(-6, -4), (14, -4), (14, 7), (-6, 7)], float)
+
+plans = st.builds("{}{}".format, st.sampled_from(["MA", "MB"]), st.integers(1, 999)).map(drawn_site)
+shares = st.floats(0.05, 0.95)
+
+
+def closed(corners: np.ndarray, kept: np.ndarray) -> Fronts:
+    return Fronts(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), np.tile(kept[:, None], 8))
+
+
+def reaching(images: mirrors.Images, point: np.ndarray, place: np.ndarray) -> list[tuple[float, ...]]:
+    """Length and gain of every way from a place to a point, the shortest first."""
+    found = images.reached_from(place)
+    return sorted((float(np.hypot(*(place - images.of(i, point)))), float(images.kept[i, 3])) for i in found)
+
+
+@pytest.mark.parametrize(
+    ("corners", "absorbing", "place"),
+    [(YARD, [3], (7.3, 4.7)), (JUNCTION, [2, 4, 7], (9.0, 1.0)), (JUNCTION, [2, 4, 7], (8.0, 15.0))],
+)
+def test_images_are_those_of_pyroomacoustics(corners, absorbing, place) -> None:
+    """Ways of all images up to order 3, with their gains; corners hide some, absorbing ends leave nothing."""
+    pra = pytest.importorskip("pyroomacoustics")
+    kept = 0.9 + 0.01 * np.arange(len(corners))
+    kept[absorbing] = 0.0
+    materials = [pra.Material(1.0 - one**2) for one in kept]
+    room = pra.Room.from_corners(corners.T, fs=16000, max_order=3, materials=materials)
+    room.add_source(list(place))
+    room.add_microphone(list(EAR))
+    room.image_source_model()
+    seen = room.visibility[0][0] > 0
+    away, damping = room.sources[0].images[:, seen].T - EAR, room.sources[0].damping[0, seen]
+    expected = sorted(zip(np.hypot(*away.T).tolist(), damping.tolist(), strict=True))
+    found = reaching(trace(closed(corners, kept), EAR, 3), EAR, np.array(place))
+    audible = [[way for way in ways if way[1] > 0.0] for ways in (found, expected)]
+    assert len(audible[1]) > 2
+    np.testing.assert_allclose(audible[0], audible[1], rtol=1e-5)
+
+
+@given(plans, shares, st.floats(-40.0, 40.0), shares, shares)
+@settings(max_examples=25, deadline=None)
+def test_a_way_is_the_same_from_both_ends(plan, ahead, y, own_x, own_y) -> None:
+    """A source and a microphone may change places."""
+    far = plan.far_kerb_m
+    place = np.array([plan.corner_ahead_m + ahead * (far - plan.corner_ahead_m), y])
+    left, right = plan.side_wall_left_m, plan.side_wall_right_m
+    ear = np.array([plan.corner_ahead_m - 8.0 * own_x, own_y * (left + right) - right])
+    fronts = drawn_fronts(plan)
+    there, back = (reaching(trace(fronts, a, 5), a, b) for a, b in ((ear, place), (place, ear)))
+    np.testing.assert_allclose(there, back, rtol=1e-6)
+    loudest, straight = float(fronts.kept.max()), float(np.hypot(*(place - ear)))
+    orders = [np.log(gain) / np.log(loudest) for _, gain in there]
+    assert all(length >= straight - 1e-9 for length, _ in there)
+    assert all(order < 0.01 or order > 0.99 for order in orders)
+
+
+@given(plans, st.floats(8.0, 60.0))
+@settings(max_examples=20, deadline=None)
+def test_what_is_seen_is_lit_once(plan, y) -> None:
+    """Well inside the straight line the direct image has weight one, well behind the corner none."""
+    images, lane = trace(drawn_fronts(plan), EAR), plan.lanes_m[0]
+    (right, left), direct = plan.sight_m(lane), images.order == 0
+    inside, behind = (
+        np.array([0.0, left - 2.0 * FADE_M]),
+        np.array([left + 2.0 * FADE_M, left + y, right - y]),
+    )
+    for y_m, weight in ((inside, 1.0), (behind, 0.0)):
+        place = np.stack([np.full(len(y_m), lane), y_m, np.ones(len(y_m))])
+        np.testing.assert_allclose(images.weights(place)[direct], weight)
+
+
+def impulses(plan, place: tuple[float, float], positions: np.ndarray) -> np.ndarray:
+    """What microphones hear of a click in the middle of half a second."""
+    blocks = round(0.5 * FS / KNOT_SAMPLES)
+    click = np.zeros(blocks * KNOT_SAMPLES, np.float32)
+    click[len(click) // 2] = 1.0
+    knots = np.arange(blocks + 1) * KNOT_SAMPLES / FS
+    receiver = Receiver(positions, np.zeros(len(positions)), knots)
+    static = StaticSources(np.zeros((len(positions), len(click)), np.float32), FS)
+    source = PlacedSource(click, knots, *(np.full(blocks + 1, one) for one in place), 0.3)
+    street = StreetSound(static, plan, preset(), receiver)
+    add_mirrored(street, source, np.random.default_rng(1))
+    return static.out
+
+
+RING = np.array([[0.2, 0.1, 1.7], [-0.2, 0.15, 1.6], [0.05, -0.2, 1.9], [-0.05, -0.05, 1.6]])
+
+
+@given(plans, st.floats(-35.0, 35.0))
+@settings(max_examples=8, deadline=None)
+def test_a_mirrored_plan_sounds_mirrored(plan, y) -> None:
+    """What a microphone hears in a mirrored street of a mirrored source, the mirrored one hears in it."""
+    fronts, turned = drawn_fronts(plan), np.array([1.0, -1.0])
+    left, right = plan.corner_left_m, plan.corner_right_m
+    other = replace(
+        plan, corner_left_m=right, corner_right_m=left, side_wall_left_m=right, side_wall_right_m=left
+    )
+    lane, sounds, opened = plan.lanes_m[0], [], []
+    with pytest.MonkeyPatch.context() as patch:
+        for street, ends, sign in ((plan, fronts.ends_m, 1.0), (other, fronts.ends_m * turned, -1.0)):
+            patch.setattr(mirrors, "drawn_fronts", lambda _, ends=ends: Fronts(ends, fronts.kept))
+            mirrors.images_at.cache_clear()
+            sounds.append(impulses(street, (lane, sign * y), RING * np.array([1.0, sign, 1.0])))
+            opened.append(mirrors.images_at(street, 0.0, 0.0).opened(mirrors.DIRECTIONS))
+    mirrors.images_at.cache_clear()
+    np.testing.assert_allclose(sounds[0], sounds[1], atol=1e-4 * np.abs(sounds[0]).max())
+    np.testing.assert_allclose(opened[0], opened[1][::-1], rtol=1e-6)
+
+
+def test_the_wall_opposite_is_what_is_heard_of_a_hidden_vehicle() -> None:
+    """Images in that wall are nearly all of the ways that no corner bends, and make a hidden click louder."""
+    louder = []
+    for number in range(1, 13):
+        plan = drawn_site(f"MA{number}")
+        place = np.array([plan.lanes_m[0], plan.sight_m(plan.lanes_m[0])[1] + 6.0])
+        fronts, heard = drawn_fronts(plan), impulses(plan, (place[0], place[1]), RING)
+        opposite = np.isclose(fronts.ends_m[:, :, 0], plan.opposite_wall_m).all(axis=1)
+        alone = Fronts(fronts.ends_m[~opposite], fronts.kept[~opposite])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(mirrors, "drawn_fronts", lambda _, alone=alone: alone)
+            mirrors.images_at.cache_clear()
+            without = impulses(plan, (place[0], place[1]), RING)
+        mirrors.images_at.cache_clear()
+        louder.append(10.0 * np.log10(np.square(heard).sum() / np.square(without).sum()))
+    assert min(louder) > 0.0 and np.median(louder) > 3.0, np.round(louder, 1)
+
+
+@pytest.mark.parametrize("name", ["TA1", "MB1"])
+def test_a_recording_has_the_town_of_its_street(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording's ambience comes from the renderer that carries its vehicles."""
+    towns = []
+    monkeypatch.setattr(renderers, "add_town", lambda *arguments: towns.append(arguments[-1]))
+    settings = SimulationSettings(site(name), "none", duration_s=0.6, entry_s=0.45)
+    pair = MicrophoneArray(np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]))
+    simulate_recording(settings, np.random.default_rng(1), pair)
+    assert len(towns) == 1 and towns[0].opened.sum() > 0.0
