@@ -503,7 +503,7 @@ def add_traced_background(
     noise = own_noise_density(preset, here, grid.frequencies_hz)
     delays = plane_wave_delays(unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m)
     density = level_curve(octaves, grid.frequencies_hz)
-    WaveField(grid, delays + receiver.skew_s, density, power, noise).add_to(out, rng)
+    WaveField(grid, delays + receiver.skew_s, density, power, noise, preset.flicker_db).add_to(out, rng)
 
 
 def _wander(time_s: FloatArray, every_s: float, spread_db: float, rng: np.random.Generator) -> FloatArray:
