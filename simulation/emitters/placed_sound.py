@@ -30,7 +30,7 @@ BASS_BELOW_HZ = 177.0  # between the octaves of 125 and 250 Hz
 def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator) -> None:
     """Add one vehicle, whose motion is given at the emission knots, to all microphones."""
     static, site, preset, rate = street.static, street.site, street.preset, street.receiver.sample_rate_hz
-    level = preset.vehicle_level_db + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
+    level = preset.vehicles_db(site) + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
     # What the road adds is heard of the tyres alone.
     engine_db = preset.engine_spread_db * rng.standard_normal() - site.surface_db + engine_bass_db(preset)
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)

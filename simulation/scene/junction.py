@@ -286,9 +286,15 @@ def drawn_site(name: str) -> Site:
     )
 
 
+# Of the image, whose edge is at 34 degrees: tangent, and how far its camera stands behind the array.
+WIDEST_CORNER, CAMERA_BEHIND_M = 0.65, 0.57
+
+
 def _wider_site(name: str, rng: np.random.Generator) -> Site:
     """Draw a site of the other renderers: wider streets, and more of them, than the fitted family has."""
-    (left, right), ahead = rng.uniform(2.2, 8.0, 2), rng.uniform(3.0, 10.0)
+    corners, ahead = rng.uniform(2.2, 8.0, 2), rng.uniform(3.0, 10.0)
+    # A vehicle passes a corner outside the image before the camera sees it: T0 would be no line of sight.
+    left, right = np.minimum(corners, WIDEST_CORNER * (ahead + CAMERA_BEHIND_M)).tolist()
     verge, street = rng.uniform(0.3, 3.5), rng.uniform(4.0, 9.0)
     opposite = ahead + verge + street + rng.uniform(0.3, 4.0) if name[1] == "A" else None
     plan = Site(name, left, right, ahead, opposite, left, right, street, verge_m=verge)

@@ -165,6 +165,8 @@ def draw_driver(
 ) -> Driver:
     """Draw an arm, a speed and whether the driver brakes before a blind junction."""
     speed = float(rng.uniform(*speeds_mps(site, kind)))
+    if kind.ridden_mps is None:
+        speed *= preset.speed_factor
     braking = float(rng.uniform(*BRAKING_MPS2)) if rng.random() < BRAKING_SHARE else 0.0
     chosen = LEFT if rng.random() < 0.5 else RIGHT
     return Driver(site, kind, arm or chosen, speed, braking, earshot_m(site, kind, speed, preset))
@@ -174,7 +176,7 @@ def earshot_m(site: Site, kind: VehicleKind, speed_mps: float, preset: Preset) -
     """Distance beyond which a vehicle in a hidden arm is lost in the ambience in all octaves that count."""
     speed = np.array([speed_mps])
     power = [10.0 ** (law(speed, kind)[:, 0] / 10.0) for law in (rolling_level_db, propulsion_level_db)]
-    level = 10.0 * np.log10(np.sum(power, axis=0)) + POWER_TO_1M_DB + preset.vehicle_level_db
+    level = 10.0 * np.log10(np.sum(power, axis=0)) + POWER_TO_1M_DB + preset.vehicles_db(site)
     above = level - preset.ambient_octaves_db
     bent = 10.0 ** ((above - SHADOW_DB + INAUDIBLE_DB)[HEARD_OCTAVES].max() / 20.0)
     late = 10.0 ** ((above + late_level_db(site, preset) + LATE_INAUDIBLE_DB)[HEARD_OCTAVES].max() / 20.0)

@@ -15,7 +15,14 @@ from worldstate.simulation.emitters.placed_sound import add_vehicle
 from worldstate.simulation.scene.junction import Site, place
 from worldstate.simulation.scene.presets import site_ambience
 from worldstate.simulation.scene.vehicle import EgoMotion, Trajectory, drive, load_db
-from worldstate.simulation.sound.background import BlockGrid, WaveField, add_background, opening_images
+from worldstate.simulation.sound.background import (
+    FLICKER_S,
+    FLICKER_SHARED,
+    BlockGrid,
+    WaveField,
+    add_background,
+    opening_images,
+)
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes, ego_noise
@@ -71,6 +78,34 @@ def test_stretches_are_what_is_added_at_once():
     one = field(3.1, np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]), 0.3)
     parts = np.concatenate(list(one.stretches(np.random.default_rng(1))), axis=1)
     assert np.array_equal(parts[:, : one.grid.samples], heard(one))
+
+
+def test_flicker_changes_octaves_by_its_deviation_and_not_their_mean_level():
+    """Against levels of band-passed sound: deviation, what octaves share, and how fast it is over."""
+    seconds, deviation_db, step = 240.0, 3.0, 0.04
+    one = replace(field(seconds, np.zeros((1, 3))), flicker_db=deviation_db)
+    still, flickering = (
+        [octave_levels_db(replace(one, flicker_db=db), middle_hz, step) for middle_hz in (500.0, 2000.0)]
+        for db in (0.0, deviation_db)
+    )
+    chance = np.mean([levels.var() for levels in still])
+    for before, after in zip(still, flickering, strict=True):
+        mean_db = 10.0 * np.log10((10.0 ** (after / 10.0)).mean() / (10.0 ** (before / 10.0)).mean())
+        assert abs(mean_db) < 0.3
+        # An octave's band reaches into its neighbours, and 0.04 s into what comes next.
+        assert 0.75 < np.sqrt(after.var() - chance) / deviation_db < 1.05
+        off, lag = after - after.mean(), round(FLICKER_S / step)
+        kept = (off[lag:] * off[:-lag]).mean() / (after.var() - chance)
+        assert kept == pytest.approx(np.exp(-1.0), abs=0.12)
+    covariance = np.cov(*flickering)[0, 1]
+    assert covariance / deviation_db**2 == pytest.approx(FLICKER_SHARED, abs=0.08)
+
+
+def octave_levels_db(one: WaveField, middle_hz: float, step_s: float) -> np.ndarray:
+    edges = middle_hz * np.array([0.85, 1.18])
+    sound = scipy.signal.sosfilt(scipy.signal.butter(4, edges, "band", fs=FS, output="sos"), heard(one)[0])
+    rows = sound[: len(sound) // round(step_s * FS) * round(step_s * FS)].reshape(-1, round(step_s * FS))
+    return 10.0 * np.log10((rows**2).mean(axis=1))
 
 
 def empty_window(name: str, seed: int, levels=None) -> np.ndarray:

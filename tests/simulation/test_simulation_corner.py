@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.simulation.scene.junction import SITES, Site, site
+from worldstate.simulation.scene.driving import entry_y_m
+from worldstate.simulation.scene.junction import SITES, Site, drawn_site, site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
@@ -16,6 +17,17 @@ from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.static_field import StaticSources
 
 C = SPEED_OF_SOUND_MPS
+
+
+@given(letter=st.sampled_from(["SA", "SB", "TA", "TB", "MA", "MB"]), number=st.integers(101, 999_999))
+def test_a_vehicle_comes_out_of_a_drawn_arm_at_the_corner(letter: str, number: int) -> None:
+    """At the edge of the image it would be in line of sight of the microphones for seconds before its T0."""
+    place = drawn_site(f"{letter}{number}")
+    for approach, lane, corner in zip(
+        ("left", "right"), place.lanes_m, (place.corner_left_m, place.corner_right_m), strict=True
+    ):
+        heard_from = lane / place.corner_ahead_m * corner  # by the array at the origin
+        assert 0.0 <= heard_from - abs(entry_y_m(place, lane, approach)) < 1.5
 
 
 def rigid_wedge_db(r, angle, r0, angle0):

@@ -12,7 +12,7 @@ from scipy.stats import chi2, kstest
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.commissioning.stream_figure import FLOWS
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation import site
+from worldstate.simulation import preset, site
 from worldstate.simulation.scene.junction import place
 from worldstate.simulation.scene.kinds import LIGHT, vehicle_kind
 from worldstate.simulation.scene.settings import SoundSettings
@@ -23,7 +23,14 @@ from worldstate.simulation.stream.arrivals import (
     draw_events,
     draw_sounds,
 )
-from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, emerges
+from worldstate.simulation.stream.manoeuvres import (
+    MANOEUVRES,
+    Driver,
+    SpeedLimit,
+    draw_driver,
+    earshot_m,
+    emerges,
+)
 from worldstate.simulation.stream.settings import HAZARDS, RAIN_DB, StreamSettings, Traffic, traffic_named
 from worldstate.simulation.stream.truth import (
     CLUTTER_IMAGES,
@@ -162,6 +169,19 @@ def test_who_stops_brakes_stands_and_goes_on_as_mechanics_says(
     assert (np.diff(motion.driven_m) >= 0).all() and (np.diff(motion.time_s) >= 0).all()
     middle = np.array([motion.reaches_s(stop) - 0.5 * stands_s])
     assert motion.trajectory(middle).speed_mps[0] == 0.0
+
+
+@given(st.floats(0.5, 2.0), st.sampled_from(["SA1", "SB1", "TB7"]), st.integers(0, 999))
+def test_a_preset_makes_vehicles_faster_and_bicycles_not(factor: float, where: str, seed: int) -> None:
+    usual = preset()
+    for kind in ("light", "bicycle"):
+        one, fast = (
+            draw_driver(site(where), vehicle_kind(kind), levels, np.random.default_rng(seed))
+            for levels in (usual, replace(usual, speed_factor=factor))
+        )
+        times = factor if kind == "light" else 1.0
+        assert fast.speed_mps == pytest.approx(times * one.speed_mps)
+        assert (fast.arm, fast.braking_mps2) == (one.arm, one.braking_mps2)
 
 
 def test_boxes_follow_what_is_in_view_with_misses_and_clutter() -> None:
@@ -310,3 +330,15 @@ def test_signals_are_the_vehicles_own_and_bells_those_of_riders() -> None:
 
 def test_every_flow_has_a_row_in_the_figure():
     assert set(FLOWS) >= set(MANOEUVRES)
+
+
+def test_only_streets_of_the_second_renderer_have_its_louder_vehicles() -> None:
+    levels = replace(preset(), traced_vehicle_db=4.0)
+    change_db = {
+        name: levels.vehicles_db(site(name)) - preset().vehicles_db(site(name)) for name in ("SB1", "TB7")
+    }
+    assert change_db == {"SB1": 0.0, "TB7": 4.0}
+    quiet = vehicle_kind("electric")
+    for name, louder in (("SB1", False), ("TB7", True)):
+        reach_m = [earshot_m(site(name), quiet, 4.0, one) for one in (preset(), levels)]
+        assert (reach_m[1] > reach_m[0]) == louder

@@ -38,7 +38,9 @@ STUDIES = {
         "street",
     )
 }
-CORNER = {name: f"worldstate_lab.cli.corner.{name}" for name in ("sequences", "junctions", "staged")}
+CORNER = {
+    name: f"worldstate_lab.cli.corner.{name}" for name in ("sequences", "junctions", "staged", "columns")
+}
 BENCHES = {
     "bench": f"{BENCH}.cost",
     "bench cost": f"{BENCH}.cost",

@@ -6,6 +6,7 @@ model that ships; on the path `pair` the whole product runs on two channels, wit
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,8 @@ from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.files.model_file import Model
+from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.listener import Listener, Step
 from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
@@ -38,6 +40,7 @@ from .recordings import NANODET_BOXES, CornerRecording
 
 PathName = Literal["seven", "seven_on_time", "pair"]
 SPECTRA: tuple[PathName, ...] = ("seven", "seven_on_time")
+PAIR = Path("pair")
 # What the product publishes at every hop, by side where it has sides.
 PRODUCT_COLUMNS = (
     "compared_nats",  # shape (2,): What the alarm of a side is decided by
@@ -108,6 +111,14 @@ class Chain:
         else:
             spectra = recording.spectra(self.path == "seven_on_time")
             yield from Listener(source, rate_hz, spectra=spectra).steps(sound[:, :1])
+
+
+def corner_chain(path: PathName, folder: Path, model: Path | None, boxes: str | None) -> Chain:
+    """Return a path over recordings in a folder, by default with the pair's model or the one that ships."""
+    if path in SPECTRA:
+        return ovad_chain(read_model(model), boxes, path)
+    pair = folder / PAIR
+    return Chain(path, read_model(model or pair / "model.json"), read_array(pair / "array.csv"), boxes)
 
 
 def ovad_chain(model: Model, boxes: str | None = "boxes", path: PathName = "seven") -> Chain:

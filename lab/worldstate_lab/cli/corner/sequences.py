@@ -31,8 +31,6 @@ from typing import Any, get_args
 
 import numpy as np
 
-from worldstate.adapters.files.array_file import read_array
-from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
 from worldstate.commissioning.heard_stream import HeardStream
@@ -40,7 +38,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate_lab.report.table import plain
 from worldstate_lab.sequences.front_end_figures import front_end_figures
-from worldstate_lab.sequences.hearing import SPECTRA, Chain, PathName, ovad_chain
+from worldstate_lab.sequences.hearing import PAIR, SPECTRA, Chain, PathName, corner_chain
 from worldstate_lab.sequences.path_figures import (
     SEEDS,
     Heard,
@@ -57,7 +55,7 @@ from worldstate_lab.sequences.tracking import tracking_figures
 from worldstate_lab.sequences.window_rows import window_lines, window_rows
 from worldstate_lab.trials.pass_cache import Failed, attempted
 
-PAIR, EXAM = Path("pair"), "exam.json"
+EXAM = "exam.json"
 _LONGEST_CUT_S = 2.0  # T0 is 7 s in most recordings, 2 s in one: what is left must hold a hop before it
 
 
@@ -126,12 +124,7 @@ def _paths(arguments: argparse.Namespace) -> tuple[PathName, ...]:
 
 def _chain(arguments: argparse.Namespace, path: PathName) -> Chain:
     boxes = None if arguments.boxes == "none" else arguments.boxes
-    if path in SPECTRA:
-        return ovad_chain(read_model(arguments.model), boxes, path)
-    folder = arguments.folder / PAIR
-    return Chain(
-        path, read_model(arguments.model or folder / "model.json"), read_array(folder / "array.csv"), boxes
-    )
+    return corner_chain(path, arguments.folder, arguments.model, boxes)
 
 
 def _heard(chain: Chain, recordings: Sequence[CornerRecording], jobs: int) -> tuple[Heard, dict[str, str]]:
