@@ -138,7 +138,7 @@ _WEATHERS: Mapping[str, Mapping[str, Any]] = {
     "gusts": {"sounds": {"wind": 120.0}},
     "rain": {"rain_share": 1.0},
     "quiet": {"background_db": (-10.0, -10.0)},
-    "varied": {"background_db": (-14.0, 8.0), "rain_share": 0.15, "sounds": {"wind": 60.0}}
+    "varied": {"background_db": (-10.0, 8.0), "rain_share": 0.15, "sounds": {"wind": 60.0}}
     | {"per_hour": {"distant": 40.0}},
 }
 

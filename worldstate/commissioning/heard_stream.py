@@ -25,6 +25,7 @@ from worldstate.ground.checks import check_ranges
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES, Site, drawn_site, ego_moves, site
+from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import rate_for
 from worldstate.simulation.stream.rendering import Block
 from worldstate.simulation.stream.settings import StreamSettings, traffic_named
@@ -33,10 +34,11 @@ from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
 # Hazards one after another; a moving ego has one a drive, with the arrivals that its model learned.
 PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
-# What a standing ego's model learns, in weather that varies. What is near or loud and never comes is learned
-# at every other two junctions, in streets of both renderers.
+# What a standing ego's model learns in streets of each renderer, in weather that varies: at every junction
+# vehicles that come, and at two of four what is near or loud and never comes.
 TOWN, CALM_TOWN, MISLEADING_TOWN = "town-varied", "no-hazard-varied", "misleading-varied"
-TRACED_SEEDS = 500
+LEARNED_PRESET = "street-7"
+RENDERERS = {"S": 0, "T": 500, "M": 750}  # First letter of a junction's name, and where its numbers begin
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
@@ -53,8 +55,8 @@ class CommissionSettings:
     Parameters
     ----------
     junctions : int
-        Drawn junctions to learn from, half with a wall across the crossing street; with few, a model learns
-        these streets instead of streets.
+        Drawn junctions of each renderer to learn from, half with a wall across the crossing street; with few,
+        a model learns these streets instead of streets. A moving ego has those of the first renderer.
     approach_minutes, hazard_free_minutes : float
         Stream at each of them.
     exam_minutes : float
@@ -76,10 +78,10 @@ class CommissionSettings:
     --------
     >>> plan = learned_streams(CommissionSettings(junctions=2))
     >>> [f"{one.site.name} {one.traffic.name} {one.minutes:g}" for one in plan][:2]
-    ['SA101 town-varied 7.2', 'SA101 no-hazard-varied 6']
+    ['SA101 town-varied 7.2', 'SA101 misleading-varied 6']
     """
 
-    junctions: int = 16
+    junctions: int = 12
     approach_minutes: float = 7.2
     hazard_free_minutes: float = 6.0
     exam_minutes: float = 24.0
@@ -112,17 +114,19 @@ def quick_settings(settings: CommissionSettings) -> CommissionSettings:
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams that a model learns from: drawn junctions, none of the five with a name.
 
-    Beside them, for an ego that stands, half as many of the second renderer.
+    For an ego that stands as many of each renderer, none of which outweighs the others.
     """
-    names = {i: f"{settings.sites[0][0]}{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
+    plans = {i: f"{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
     approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
     if settings.moving_ego:
+        names = {i: f"D{plan}" for i, plan in plans.items()}
         return _streams(names, LEARNED_SEED, _usual(approaching, quiet, settings), settings)
-    found = _streams(names, LEARNED_SEED, {TOWN: approaching, CALM_TOWN: quiet}, settings)
-    some = {i: name for i, name in names.items() if i % 4 < 2}
-    traced = {TRACED_SEEDS + i: f"T{name[1:]}" for i, name in some.items()}
-    found += _streams(traced, LEARNED_SEED, {TOWN: approaching, MISLEADING_TOWN: quiet}, settings)
-    return found + _streams(some, LEARNED_SEED, {MISLEADING_TOWN: quiet}, settings)
+    found: list[StreamSettings] = []
+    for (letter, first), (i, plan) in product(RENDERERS.items(), plans.items()):
+        without = MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
+        name = {first + i: f"{letter}{plan}"}
+        found += _streams(name, LEARNED_SEED, {TOWN: approaching, without: quiet}, settings)
+    return [replace(one, preset=preset(LEARNED_PRESET)) for one in found]
 
 
 def _usual(
