@@ -30,7 +30,7 @@ SYNTHESES: dict[str, Synthesis] = {
         *(syntheses.drill, syntheses.music, syntheses.tune, syntheses.drums, syntheses.dog),
         *(syntheses.birds, syntheses.shots, syntheses.tone, syntheses.siren, syntheses.wail),
         *(syntheses.sweeps, syntheses.turns, syntheses.horn, syntheses.horns, syntheses.beeper),
-        syntheses.bicycle_bell,
+        *(syntheses.bicycle_bell, syntheses.jackhammer),
     )
 }
 # Everything is drawn at a whole multiple of the rate asked, of at least this, and then band-limited: partials

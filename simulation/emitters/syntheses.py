@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+from scipy.signal import fftconvolve
 
 from worldstate.ground.typing import Complex128Array, FloatArray
 from worldstate.simulation.scene.octave_bands import octave_masks
@@ -447,7 +448,9 @@ def horn(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 # take turns, or of one or two that are held (spans assumed, wider than any regulation).
 SWEEP_LOW_HZ, SWEEP_RATIO, SWEEPS_HZ = (350.0, 900.0), (1.3, 2.6), (0.1, 8.0)
 TURN_LOW_HZ, TURN_RATIO, TURN_S, TURN_GLIDE_S = (350.0, 800.0), (1.15, 1.6), (0.25, 1.0), 0.02
-HELD_HZ, HELD_S, HELD_PAUSE_S = (250.0, 650.0), (0.4, 8.0), (0.1, 2.0)
+HELD_HZ, HELD_S, HELD_PAUSE_S = (250.0, 650.0), (0.3, 8.0), (0.1, 2.0)
+# A diaphragm is rough: held to the modulation of 24 real horns above 6 Hz, which even tones lack.
+DIAPHRAGM, DIAPHRAGM_S, HORN_FALLS = (0.0, 0.6), (0.01, 0.06), (0.0, 0.8)
 SECOND_RATIO, SECOND_SHARE = (1.15, 1.35), 0.7
 
 
@@ -474,11 +477,13 @@ def horns(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     pitches = [rng.uniform(*HELD_HZ)]
     if rng.random() < SECOND_SHARE:
         pitches.append(pitches[0] * rng.uniform(*SECOND_RATIO))
-    longest_s = rng.uniform(*HELD_S)
+    longest_s = np.exp(rng.uniform(*np.log(HELD_S)))
     blasts = gate(samples, rate_hz, bursts(samples / rate_hz, (0.1, longest_s), HELD_PAUSE_S, rng), 0.01)
-    amplitudes = rng.uniform(0.2, 1.0, 15) * np.where(np.arange(15) < 7, 1.0, 0.3)
+    amplitudes = rng.uniform(0.2, 1.0, 15) * np.arange(1.0, 16.0) ** -rng.uniform(*HORN_FALLS)
     held = [harmonics(np.full(samples, pitch), amplitudes.tolist(), rate_hz) for pitch in pitches]
-    return np.asarray(blasts * np.sum(held, axis=0))
+    rough, every_s = rng.uniform(*DIAPHRAGM), rng.uniform(*DIAPHRAGM_S)
+    together = [(1.0 + rough * drift(samples, rate_hz, every_s, rng)) * one for one in held]
+    return np.asarray(blasts * np.sum(together, axis=0))
 
 
 def beeper(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
@@ -489,52 +494,86 @@ def beeper(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray
     return beeps * harmonics(np.full(samples, rng.uniform(*BEEP_HZ)), BEEP_PARTIALS, rate_hz)
 
 
-# A hand-held circular saw: 3000 to 5500 turns a minute, 24 or 40 teeth (makers' data).
-SAW_HZ, TEETH = (55.0, 75.0), (24, 40)
-CUT_S, IDLE_S = (1.5, 4.0), (0.8, 2.0)
-SAG, CUTTING_DB = 0.15, 8.0  # the motor slows down in the wood, and is louder there (assumed)
-SHAFT = (1.0, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1)
-BLADE = (3.0, 1.5, 0.8, 0.5, 0.3, 0.2)
-SAW_DB = (-25.0, -20.0, -15.0, -10.0, -4.0, 0.0, 2.0, 0.0)
-# A hammer drill: 45 to 55 blows and 13 to 18 turns a second (makers' data).
-BLOWS_HZ, TURNS_HZ, GEAR_TEETH = (45.0, 55.0), (13.0, 18.0), 35
-BORE_S, REST_S = (2.0, 5.0), (0.5, 2.0)
-# Modes of bit and wall that every blow excites (assumed).
-BLOW = ((420.0, 1.0, 0.006), (1150.0, 1.0, 0.004), (2400.0, 0.9, 0.003), (4100.0, 0.5, 0.002))
-DRILL_DB = (-20.0, -15.0, -10.0, -5.0, 0.0, 0.0, -3.0, -6.0)
-NOISE_GAIN = 30_000.0  # octave levels are dB re 20 uPa: brings 0 dB to the size of the partials
-
-
-def saw_motion(samples: int, rate_hz: float, rng: np.random.Generator) -> tuple[FloatArray, ...]:
-    """Draw a saw and its cuts: teeth a second, turns a second, and the load 0..1, shape (samples,) each."""
-    cuts = bursts(samples / rate_hz, CUT_S, IDLE_S, rng)
-    # The motor takes some tenths of a second to slow down and to recover: the ramps of the load.
-    load = gate(samples, rate_hz, cuts, 0.4)
-    hunting = 1.0 + 0.005 * drift(samples, rate_hz, 0.2, rng)
-    turns = rng.uniform(*SAW_HZ) * (1.0 - SAG * load) * hunting
-    return turns * rng.choice(TEETH), turns, load
-
-
-def saw(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a circular saw that cuts board after board, shape (samples,)."""
-    teeth, turns, load = saw_motion(samples, rate_hz, rng)
-    tones = harmonics(turns, SHAFT, rate_hz) + harmonics(teeth, BLADE, rate_hz)
-    noise = NOISE_GAIN * octave_noise(SAW_DB, samples, rate_hz, rng)
-    rough = 1.0 + 0.2 * drift(samples, rate_hz, 0.05, rng)
-    return (tones + noise * rough * (0.3 + 0.7 * load)) * 10.0 ** (CUTTING_DB * (load - 1.0) / 20.0)
+# Hammer drills give 25 to 80 blows a second, breakers 9 to 30 (makers' data; the envelopes of seven real
+# breakers 9 to 21), not quite evenly, and fewer under load. Each blow excites modes of bit, body and ground,
+# which ring for some cycles, and a burst of noise; between blows motor or air are heard. Held to the numbers
+# of real drilling and jackhammers (docs/evidence/foreign_sounds.md).
+DRILL_BLOWS_HZ, BREAKER_BLOWS_HZ = (25.0, 80.0), (9.0, 30.0)
+UNEVEN_BLOWS, BLOW_SPREAD_DB, BLOW_DRIFT = (0.002, 0.03), (0.5, 3.0), (0.01, 0.08)
+MODES, MODE_HZ, MODE_CYCLES, LONGEST_MODE_S = (3, 10), (120.0, 5000.0), (2.0, 15.0), 0.04
+IMPACT_S, IMPACT, BETWEEN, MOTOR = (0.003, 0.03), (0.1, 2.0), (0.05, 1.0), (0.3, 2.5)
+BLOW_DB = (-8.0, -5.0, -3.0, 0.0, 0.0, -2.0, -5.0, -8.0)
+DRILLED_S, BROKEN_S, REST_S = (0.4, 5.0), (3.0, 15.0), (0.2, 2.0)
+# Circular saws, grinders, drills without blows: a motor or a blade of 50 to 500 turns a second, with teeth or
+# gears that whine up to 5 kHz (makers' data: 24 or 40 teeth at 55 to 75 turns, a motor's 100 to 500); it runs
+# up, slows down under its load, and runs out.
+MOTOR_HZ, GEARS_HZ, RUN_S = (50.0, 500.0), (50.0, 5000.0), (0.05, 0.8)
+LOAD_S, LOADED_S, MOST_SAG, LOADED_DB = (0.2, 2.0), (0.1, 1.5), 0.35, (0.0, 12.0)
+GRIND_DB = (-25.0, -20.0, -15.0, -10.0, -4.0, 0.0, 2.0, 0.0)
+WHINE, GRIND, CHATTER_HZ, CHATTER_DB = (0.4, 2.5), (0.05, 1.0), (8.0, 80.0), (0.0, 4.0)
 
 
 def drill(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     """Draw a hammer drill that bores hole after hole, shape (samples,)."""
-    bores = bursts(samples / rate_hz, BORE_S, REST_S, rng)
-    blows_hz, turns = rng.uniform(*BLOWS_HZ), np.full(samples, rng.uniform(*TURNS_HZ))
-    out = np.zeros(samples)
-    for start, end in bores:
-        for at in np.arange(start, min(end, samples / rate_hz), 1.0 / blows_hz).tolist():
-            add_ringing(out, at, rate_hz, BLOW, rng.uniform(0.8, 1.2))
-    running = gate(samples, rate_hz, bores, 0.15)
-    motor = harmonics(turns * GEAR_TEETH, (0.2, 0.1, 0.05), rate_hz)
-    return out + running * (motor + 0.3 * NOISE_GAIN * octave_noise(DRILL_DB, samples, rate_hz, rng))
+    runs = bursts(samples / rate_hz, DRILLED_S, REST_S, rng)
+    motor = motor_sound(gate(samples, rate_hz, runs, 0.1), rate_hz, rng)
+    return hammered(samples, rate_hz, runs, DRILL_BLOWS_HZ, rng) + rng.uniform(*MOTOR) * motor
+
+
+def jackhammer(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw a breaker that breaks up a road, shape (samples,)."""
+    runs = bursts(samples / rate_hz, BROKEN_S, REST_S, rng)
+    return hammered(samples, rate_hz, runs, BREAKER_BLOWS_HZ, rng)
+
+
+def hammered(
+    samples: int, rate_hz: float, runs: Spans, blows_hz: tuple[float, float], rng: np.random.Generator
+) -> FloatArray:
+    """Blows while it runs, what each excites, and air between them, shape (samples,)."""
+    running, pace_hz = gate(samples, rate_hz, runs, 0.1), np.exp(rng.uniform(*np.log(blows_hz)))
+    cycles = np.cumsum(pace_hz * (1.0 + rng.uniform(*BLOW_DRIFT) * drift(samples, rate_hz, 0.4, rng)))
+    at = np.flatnonzero(np.diff(np.floor(cycles / rate_hz)))
+    late = rng.uniform(*UNEVEN_BLOWS) * rate_hz / pace_hz * rng.standard_normal(len(at))
+    blows = np.zeros(samples)
+    strength = 10.0 ** (rng.uniform(*BLOW_SPREAD_DB) * rng.standard_normal(len(at)) / 20.0)
+    np.add.at(blows, np.clip(at + np.round(late).astype(int), 0, samples - 1), strength * running[at])
+    response, impact_s = np.zeros(round(0.3 * rate_hz)), rng.uniform(*IMPACT_S)
+    low, high = np.log(MODE_HZ)
+    for mode_hz in np.exp(rng.uniform(low, high, int(rng.integers(*MODES)))).tolist():
+        decay_s = min(rng.uniform(*MODE_CYCLES) / mode_hz, LONGEST_MODE_S)
+        add_ringing(response, 0.0, rate_hz, [(mode_hz, rng.uniform(0.3, 1.0), decay_s)])
+    decay = np.exp(-np.arange(len(response)) / rate_hz / impact_s)
+    ringing, envelope = (fftconvolve(blows, one)[:samples] for one in (response, decay))
+    noise = octave_noise(BLOW_DB, samples, rate_hz, rng)
+    air = rng.uniform(*BETWEEN) * running * _unit(noise)
+    return np.asarray(_unit(ringing) + rng.uniform(*IMPACT) * _unit(noise * envelope) + air)
+
+
+def saw(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Draw a saw or another machine that runs up, works under load and runs out, shape (samples,)."""
+    spans = bursts(samples / rate_hz, DRILLED_S, REST_S, rng)
+    return motor_sound(gate(samples, rate_hz, spans, rng.uniform(*RUN_S)), rate_hz, rng)
+
+
+def motor_sound(running: FloatArray, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Motor, gears and what is ground, at a speed 0..1 that sags under load, of power one."""
+    samples = len(running)
+    load = gate(samples, rate_hz, bursts(samples / rate_hz, LOAD_S, LOADED_S, rng), 0.2)
+    speed = (
+        running * (1.0 - rng.uniform(0.0, MOST_SAG) * load) * (1.0 + 0.01 * drift(samples, rate_hz, 0.1, rng))
+    )
+    fastest_hz, chatter_s = rng.uniform(*MOTOR_HZ), 1.0 / rng.uniform(*CHATTER_HZ)
+    both_hz = fastest_hz, float(np.exp(rng.uniform(*np.log(GEARS_HZ))))
+    whine = [harmonics(one * speed, rng.uniform(0.1, 1.0, 8).tolist(), rate_hz) for one in both_hz]
+    grind = _unit(octave_noise(GRIND_DB, samples, rate_hz, rng) * (0.3 + 0.7 * load))
+    worked = rng.uniform(*WHINE) * _unit(whine[0] + whine[1]) + rng.uniform(*GRIND) * grind
+    level_db = rng.uniform(*LOADED_DB) * (load - 1.0)
+    level_db += rng.uniform(*CHATTER_DB) * drift(samples, rate_hz, chatter_s, rng)
+    return _unit(running * worked * 10.0 ** (level_db / 20.0))
+
+
+def _unit(signal: FloatArray) -> FloatArray:
+    return np.asarray(signal / (signal.std() + np.finfo(float).tiny))
 
 
 # Pitches from the hum of a transformer to a whistle; how many overtones and how strong is assumed.

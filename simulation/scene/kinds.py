@@ -41,6 +41,7 @@ class VehicleKind:
     engine_m: float = 0.3  # Height of the engine as a source; tyres are at `TYRE_M`
     ridden_mps: tuple[float, float] | None = None  # Its speeds, where they are not those of the street
     harmonic_share: float = 0.5  # Share of the engine's power in multiples of its firing frequency
+    turns_hz: tuple[float, float] | None = None  # Of a crank whose single pulses are heard, as it is ridden
 
 
 TYRE_M = 0.05
@@ -138,7 +139,7 @@ TRAM = replace(
     harmonic_share=0.0,
 )
 
-# Category 4b of CNOSSOS-EU, which counts its engine alone; lines as strong as the broadband part (assumed).
+# Category 4b of CNOSSOS-EU, which counts its engine alone, at 2,100 to 9,000 turns a minute.
 MOTORCYCLE = replace(
     LIGHT,
     name="motorcycle",
@@ -152,6 +153,7 @@ MOTORCYCLE = replace(
     propulsion_a_db=(99.9, 101.9, 96.7, 94.4, 95.2, 94.7, 92.1, 88.6),
     propulsion_b_db=(3.2, 5.9, 11.9, 11.6, 11.5, 12.6, 11.1, 12.0),
     engine_m=0.4,
+    turns_hz=(35.0, 150.0),
 )
 
 KINDS = {kind.name: kind for kind in (LIGHT, MEDIUM, HEAVY, ELECTRIC, BICYCLE, SCOOTER, TRAM, MOTORCYCLE)}

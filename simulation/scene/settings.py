@@ -53,8 +53,9 @@ _TABLE = (
     # Assumed: some 65 dB(A) at 100 m.
     SoundKind("bell", "church bell", 105.0, 25.0),
     # Makers' declarations of hand-held tools lie at 90 to 100 dB(A) at the operator; assumed.
-    SoundKind("saw", "circular saw", 95.0, 1.0),
+    SoundKind("saw", "circular saw, grinder or another machine with a motor", 95.0, 1.0),
     SoundKind("drill", "hammer drill in masonry", 93.0, 1.2),
+    SoundKind("jackhammer", "breaker on a road", 105.0, 0.5),
     # Assumed: a loudspeaker in an open window.
     SoundKind("music", "music with beat and bass", 80.0, 2.5, BOX_DB),
     SoundKind("tune", "instruments that play a tune", 80.0, 1.5),

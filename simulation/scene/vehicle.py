@@ -318,9 +318,10 @@ class _Drawing:
     sample_rate_hz: float
     rng: np.random.Generator
 
-    def noise(self, octave_pressure: FloatArray) -> Float32Array:
-        """Gaussian noise whose octave pressures (8, T) follow the drive."""
-        white = self.rng.standard_normal(len(self.time), dtype=np.float32)
+    def noise(self, octave_pressure: FloatArray, white: Float32Array | None = None) -> Float32Array:
+        """Gaussian noise, or what else is white, whose octave pressures (8, T) follow the drive."""
+        if white is None:
+            white = self.rng.standard_normal(len(self.time), dtype=np.float32)
         gains = octave_pressure / np.sqrt(_band_shares(self.sample_rate_hz))[:, None]
         signal = np.zeros(len(self.time), np.float32)
         for band, gain in zip(split_octaves(white, self.sample_rate_hz), gains, strict=True):
@@ -329,6 +330,8 @@ class _Drawing:
 
     def engine(self, octave_pressure: FloatArray) -> Float32Array:
         """Noise and lines; an octave that no line falls into is noise alone."""
+        if self.trajectory.kind.turns_hz is not None:
+            return self.noise(octave_pressure, exhaust_pulses(self.trajectory, self.time, self.rng))
         share = self.trajectory.kind.harmonic_share
         firing = firing_frequency_hz(self.trajectory, self.time, self.rng)
         orders = np.arange(1, HARMONICS + 1)
@@ -380,6 +383,57 @@ def firing_frequency_hz(trajectory: Trajectory, time: FloatArray, rng: np.random
     knots = np.arange(time[0], time[-1] + WANDER_STEP_S, WANDER_STEP_S)
     wander = 1.0 + WANDER * np.clip(rng.standard_normal(len(knots)) / 2.0, -1.0, 1.0)
     return np.asarray(np.maximum(ratio * speed, IDLE_HZ) * np.interp(time, knots, wander))
+
+
+# A motorcycle has one to four cylinders; a moped has one of two strokes, which fires at every turn. Cylinders
+# fire neither evenly nor alike, so that there are lines at half orders, and the exhaust's noise follows them.
+TWO_STROKES, CYLINDERS, UNEVEN_FIRING, WEAKEST = 0.25, (1, 2, 2, 3, 4), 0.5, 0.6
+PULSE_SPREAD, PULSE_JITTER, MOST_NOISE, SHARPEST = (0.02, 0.3), (0.0, 0.02), 0.8, 6.0
+# Turns a second at idle, 1,100 to 1,900 a minute; of a gear over those of the next one; share with a belt,
+# whose turns hardly follow the speed; share of those that stand and are revved, and how far (all assumed).
+IDLE_TURNS_HZ, GEAR_RATIO, BELTS, BELT, REVVED, MOST_REVS = (18.0, 32.0), (1.25, 1.7), 0.25, 0.3, 0.6, 4.0
+TURNS_WANDER, LOUDER_BY_TURNS = 0.02, 1.5  # Amplitude over turns: 30 dB a decade (assumed)
+
+
+def crank_turns_hz(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Draw how often a motorcycle's crank turns a second, shape of `time`."""
+    knots = np.arange(time[0], time[-1] + WANDER_STEP_S, WANDER_STEP_S)
+    wander = np.interp(time, knots, rng.standard_normal(len(knots)))
+    speed, idle = trajectory.speed_mps, rng.uniform(*IDLE_TURNS_HZ)
+    if speed.max() < CREEPING_MPS:
+        revved = rng.uniform(0.0, MOST_REVS) * (rng.random() < REVVED)
+        return np.asarray(idle * (1.0 + TURNS_WANDER * wander + revved * np.maximum(wander, 0.0)))
+    ridden = np.exp(rng.uniform(*np.log(trajectory.kind.turns_hz or IDLE_TURNS_HZ)))
+    in_gear = np.log(np.maximum(speed, CREEPING_MPS)) + rng.random()
+    geared = np.exp(np.mod(in_gear, np.log(rng.uniform(*GEAR_RATIO))))
+    if rng.random() < BELTS:
+        geared = (speed / speed.max()) ** BELT
+    turns = np.maximum(ridden * _smooth(geared, trajectory.time_s), idle)
+    return np.asarray(np.interp(time, trajectory.time_s, turns) * (1.0 + TURNS_WANDER * wander))
+
+
+def exhaust_pulses(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> Float32Array:
+    """Draw pulses of cylinders and noise that follows them, white and of power one, shape of `time`."""
+    rate_hz = (len(time) - 1) / (time[-1] - time[0])
+    turns, is_moped = crank_turns_hz(trajectory, time, rng), rng.random() < TWO_STROKES
+    cylinders = 1 if is_moped else int(rng.choice(CYLINDERS))
+    steps = turns * (1.0 if is_moped else 0.5) / rate_hz  # Cycles of the engine a sample
+    spread, jitter, sharp = rng.uniform(*PULSE_SPREAD), rng.uniform(*PULSE_JITTER), rng.uniform(0.0, SHARPEST)
+    pulses, envelope, cycles = np.zeros(len(time)), np.zeros(len(time)), np.cumsum(steps)
+    for number in range(cylinders):
+        own = cycles - (number + UNEVEN_FIRING * rng.uniform(-0.5, 0.5)) / cylinders
+        fires = np.flatnonzero(np.diff(np.floor(own)))
+        late = 1.0 - np.mod(own[fires], 1.0) + jitter * rng.standard_normal(len(fires))
+        first, share = np.divmod(np.clip(fires + late / steps[fires], 0.0, len(time) - 2.0), 1.0)
+        strength = rng.uniform(WEAKEST, 1.0) * (1.0 + spread * rng.standard_normal(len(fires)))
+        # Between two samples where it falls between them.
+        np.add.at(pulses, first.astype(np.intp), (1.0 - share) * strength)
+        np.add.at(pulses, first.astype(np.intp) + 1, share * strength)
+        envelope += np.exp(sharp * (np.cos(2.0 * np.pi * own) - 1.0))
+    noise, share = envelope * rng.standard_normal(len(time)), MOST_NOISE * rng.random() ** 2
+    pulses /= pulses.std() + np.finfo(float).tiny
+    whole = np.sqrt(1.0 - share) * pulses + np.sqrt(share) * noise / noise.std()
+    return np.asarray(whole * (turns / turns.mean()) ** LOUDER_BY_TURNS, np.float32)
 
 
 def _smooth(values: FloatArray, time_s: FloatArray) -> FloatArray:

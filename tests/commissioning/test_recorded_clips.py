@@ -109,6 +109,30 @@ def test_every_recording_counts_as_much_however_long_and_under_whichever_name(tm
     assert set(of_guard(learned.rows).kinds.tolist()) == {CLOSE, "pump", "siren", "beeper", "voice"}
 
 
+def test_buses_of_free_recordings_are_trucks_and_every_file_is_a_recording(tmp_path: Path) -> None:
+    path, free = tmp_path / "clips.csv", "Creative Commons 0"
+    rows = [(pump(tmp_path / f"{n}.wav", n), kind, free) for n, kind in enumerate(("bus", "bus", "tram"))]
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("file", "kind", "licence"), *rows])
+    learned = read_recorded(tmp_path, path)
+    kinds, hops = np.unique(learned.rows.kinds, return_counts=True)
+    assert dict(zip(kinds.tolist(), hops.tolist(), strict=True)) == {
+        "heavy": 2 * HOPS_EACH,
+        "tram": HOPS_EACH,
+    }
+    assert set(of_guard(learned.rows).kinds.tolist()) == {CLOSE}
+    assert (
+        learned.licences == (free,)
+        and f"3 recordings beside the simulation (bus 2, tram 1; {free}" in learned.told
+    )
+    # What is learned from CC0 is the project's own; one recording of no licence changes that.
+    assert "not the project's own" not in learned.told
+    with path.open("a", newline="") as file:
+        csv.writer(file).writerow((pump(tmp_path / "3.wav", 3), "bus", ""))
+    told = read_recorded(tmp_path, path).told
+    assert "licence not stated" in told and "not the project's own" in told
+
+
 @pytest.mark.parametrize(
     ("row", "told"),
     [

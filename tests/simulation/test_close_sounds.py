@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from worldstate.commissioning.heard_stream import junction_named
 from worldstate.simulation.scene.kinds import KINDS
+from worldstate.simulation.scene.vehicle import Trajectory, crank_turns_hz, exhaust_pulses
 from worldstate.simulation.stream.close_sounds import (
     close_sound,
     close_vehicle,
@@ -50,6 +51,26 @@ def test_the_same_draws_make_the_same_sound() -> None:
     )
     np.testing.assert_array_equal(first, again)
     assert first.shape == (SECONDS * RATE_HZ,)
+
+
+@given(st.integers(0, 10_000), st.floats(3.0, 16.0))
+@settings(max_examples=15, deadline=None)
+def test_a_motorcycle_fires_at_multiples_of_half_its_turns(seed: int, speed_mps: float) -> None:
+    time = np.arange(0.0, 4.0, 1.0 / RATE_HZ)
+    knots = np.arange(0.0, 4.1, 0.1)
+    still = np.zeros_like(knots)
+    path = Trajectory(knots, still, np.full_like(knots, speed_mps), 0.0, 1, KINDS["motorcycle"])
+    turns, pulses = (
+        draw(path, time, np.random.default_rng(seed)) for draw in (crank_turns_hz, exhaust_pulses)
+    )
+    assert pulses.std() == pytest.approx(1.0, abs=0.15) and 17.0 < turns.min() <= turns.max() < 300.0
+    # Against the crank's own angle a line stands still, however the turns wander; in between there is none.
+    angle = np.pi * np.cumsum(turns) / RATE_HZ
+    at, between = (
+        sum(abs((pulses * np.exp(-1j * (order + shift) * angle)).mean()) ** 2 for order in range(1, 9))
+        for shift in (0.0, 0.5)
+    )
+    assert at > 3.0 * between
 
 
 @given(st.integers(0, 1000), st.sampled_from(["dog", "horns", "sweeps", "shots", "tune"]))

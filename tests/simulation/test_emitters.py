@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from scipy.signal import bilinear_zpk, find_peaks, sosfilt, stft, zpk2sos
 
 from worldstate.simulation.emitters.emitter import SYNTHESES, emitted
-from worldstate.simulation.emitters.syntheses import saw, saw_motion
+from worldstate.simulation.emitters.syntheses import (
+    BREAKER_BLOWS_HZ,
+    DRILL_BLOWS_HZ,
+    hammered,
+    motor_sound,
+)
 from worldstate.simulation.scene.octave_bands import split_octaves
 from worldstate.simulation.scene.settings import MICROPHONES, SOUNDS
 
@@ -117,20 +122,29 @@ def test_a_minor_third_rings_in_a_church_bell(sounds):
     assert (np.abs(ratios - 1.2) < 0.015).any() and (np.abs(ratios - 2.0) < 0.015).any()
 
 
-def test_a_saw_sings_at_the_frequency_of_its_teeth():
-    samples = int(4 * FS)
-    teeth, turns, load = saw_motion(samples, FS, np.random.default_rng(3))
-    sound = saw(samples, FS, np.random.default_rng(3))
-    # Mixed down by the teeth's own phase the tone stands still; beside it there is only noise.
-    for shift, strong in ((0.0, True), (40.0, False), (-40.0, False)):
-        phase = 2 * np.pi * np.cumsum(teeth + shift) / FS
-        line = abs((sound * np.exp(-1j * phase)).mean()) ** 2 / (sound**2).mean()
-        assert (line > 1e-2) == strong
-    np.testing.assert_allclose(teeth, np.round(teeth[0] / turns[0]) * turns)
-    assert teeth[0] / turns[0] >= 24 and 40.0 < turns.min() <= turns.max() < 80.0
-    busy = load > 0.9
-    assert sound[busy].std() > 1.5 * sound[load < 0.1].std()
-    assert teeth[busy].mean() < 0.9 * teeth[load < 0.1].mean()
+def test_a_machine_that_runs_at_half_its_speed_has_its_lines_at_half():
+    matched, unmoved = [], []
+    for seed in range(8):
+        (hz, fast), (_, slow) = (
+            power_spectrum(motor_sound(np.full(int(2 * FS), speed), FS, np.random.default_rng(seed)))
+            for speed in (1.0, 0.5)
+        )
+        # Noise has the same octaves at either speed: only lines move.
+        for found, spectrum in ((matched, np.interp(hz / 2.0, hz, slow)), (unmoved, slow)):
+            found.append(np.corrcoef(np.log(spectrum), np.log(fast))[0, 1])
+    assert np.mean(matched) > np.mean(unmoved) + 0.1
+
+
+@given(st.integers(0, 1000), st.floats(BREAKER_BLOWS_HZ[0], DRILL_BLOWS_HZ[1]))
+@settings(max_examples=12, deadline=None)
+def test_a_hammer_is_modulated_at_its_blows(seed, blows_hz):
+    samples = int(8 * FS)
+    sound = hammered(samples, FS, [(0.0, 8.0)], (blows_hz, blows_hz), np.random.default_rng(seed))
+    swell = np.log(envelope(sound, rate=400))
+    power = np.abs(np.fft.rfft((swell - swell.mean()) * np.hanning(len(swell)))) ** 2
+    over = np.fft.rfftfreq(len(swell), 1.0 / 400) / blows_hz
+    at, below, above = (power[(over > low) & (over < low + 0.3)].mean() for low in (0.85, 0.45, 1.3))
+    assert at > 2.0 * max(below, above)
 
 
 def test_steps_keep_a_walkers_pace(sounds):

@@ -21,7 +21,9 @@ LOWEST_RATE_HZ, MEMORY_S, MOST_SECONDS = 8000.0, 2.1, 600.0
 # Of every recording, spread over it: as many as a simulated clip has in the mean, so that both count alike.
 HOPS_EACH = 25
 # A kind may be called as guard and road users call it: it is learned as the first such of the simulator's.
-_AS = {name: kind for kind, name in reversed((FOREIGN | SIGNALS | CLASS_OF).items())} | {"street": CLOSE}
+_AS = {name: kind for kind, name in reversed((FOREIGN | SIGNALS | CLASS_OF).items())}
+_AS |= {"street": CLOSE, "bus": _AS["truck"]}
+_FREE = "Creative Commons 0"  # Whatever is learned from it is free, too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,20 +33,24 @@ class RecordedClips:
     rows: SoundRows  # Kinds are the simulator's, or those of the table that it has not; sites the recordings
     recordings: Mapping[str, int]  # How many of each kind, as the table calls it
     digest: str  # SHA-256 of the table
+    licences: tuple[str, ...]  # As the table states them
 
     @property
     def told(self) -> str:
         """For the provenance of what was learned from them."""
         kinds = ", ".join(f"{kind} {number}" for kind, number in self.recordings.items())
-        learned = f"recordings beside the simulation ({kinds}; table of SHA-256 {self.digest})"
-        return f"guard and road users learned from {learned}: these coefficients are not the project's own"
+        of = f"{kinds}; {', '.join(self.licences)}; table of SHA-256 {self.digest}"
+        owned = "" if self.licences == (_FREE,) else ": these coefficients are not the project's own"
+        number = sum(self.recordings.values())
+        return f"guard and road users learned from {number} recordings beside the simulation ({of}){owned}"
 
 
 def read_recorded(folder: Path, table: Path, advance: Callable[[], object] = lambda: None) -> RecordedClips:
     """Hear the clips of a table, whose files lie in a folder; `advance` is called after every line.
 
-    Columns are file, kind, recording and, where it has one, road_user: a class of `CLASSES`, empty where it
-    is none. A kind that neither the simulator nor the guard names is a foreign sound of its own.
+    Columns are file, kind and, if it has them, recording (each file is one without), road_user (a class of
+    `CLASSES`, empty if it is none) and licence. A kind that neither the simulator nor the guard names is a
+    foreign sound of its own; a bus is a truck.
 
     Raises
     ------
@@ -52,17 +58,20 @@ def read_recorded(folder: Path, table: Path, advance: Callable[[], object] = lam
         If the table or a file cannot be read, or a line names no kind or an unknown road user.
     """
     heard: dict[tuple[str, str], list[FloatArray]] = {}
-    for line, row in read_rows(table, ("file", "kind", "recording"), optional=("road_user",)):
+    licences = dict[str, None]()
+    for line, row in read_rows(table, ("file", "kind"), optional=("recording", "road_user", "licence")):
         with refused_as_file(table, f"line {line}: "):
             user = one_of("road_user", row.get("road_user", ""), ("", *CLASSES[:-1]))
             named("kind", row["kind"])
-        heard.setdefault((user or row["kind"], row["recording"]), []).append(heard_clip(folder / row["file"]))
+        recording = row.get("recording") or row["file"]
+        heard.setdefault((user or row["kind"], recording), []).append(heard_clip(folder / row["file"]))
+        licences[row.get("licence") or "licence not stated"] = None
         advance()
     if not heard:
         raise InputFileError(table, "expected at least one clip")
     rows = SoundRows.joined([_rows(*key, np.concatenate(clips)) for key, clips in heard.items()])
     digest = hashlib.sha256(read_bytes(table, "a CSV file", MAX_BYTES)).hexdigest()
-    return RecordedClips(rows, Counter(kind for kind, _ in heard), digest)
+    return RecordedClips(rows, Counter(kind for kind, _ in heard), digest, tuple(licences))
 
 
 def _rows(kind: str, recording: str, measures: FloatArray) -> SoundRows:

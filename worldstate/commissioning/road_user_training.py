@@ -53,7 +53,7 @@ STRENGTH = 0.001
 _TILT_DB = 21.0
 _OCTAVES = 0.5 * np.log2(np.multiply(EDGES_HZ[:-1], EDGES_HZ[1:]))
 _NATS_OF_TILT = 0.1 * np.log(10.0) * (_OCTAVES - _OCTAVES.mean()) / np.log2(EDGES_HZ[-1] / EDGES_HZ[0])
-CHOSEN_FOR_ROAD_USERS = f"strength {STRENGTH} of road users chosen on the same passes"
+CHOSEN_FOR_ROAD_USERS = f"strength {STRENGTH} of road users chosen on 82 passes of cars and trams"
 _FOLDS = 8
 _FIGURES = 5  # Of a coefficient in the file
 

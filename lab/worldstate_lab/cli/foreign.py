@@ -4,7 +4,7 @@ Train a domain guard on streams that were listened to and on simulated sounds at
 it what it never heard: every kind of sound by a guard that was trained without that kind, every family of
 kinds by one without that family, every street by one without that site. The threshold is set on the other
 sites: at most .025 of the hops of each of hidden, in view and empty are flagged there, and not below the one
-that was chosen on real clips. Close passes and sounds at no junction are learned and judged, too.
+that was chosen on CC0 recordings. Close passes and sounds at no junction are learned and judged, too.
 
 Speech, music, bells, tools, tones, birds, steps and rain are foreign; siren, horn, reversing beeper and bell
 of a bicycle are warning signals, which come from vehicles. A hop counts where the sound is as loud as the
@@ -27,8 +27,8 @@ from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import (
+    CC0_THRESHOLD,
     FOREIGN,
-    REAL_THRESHOLD,
     SIGNALS,
     STREET,
     SoundRows,
@@ -50,7 +50,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
     "speech": ("voice", "children"),
     "music": ("music", "tune", "drums"),
     "ringing": ("bell", "tone"),
-    "tools": ("saw", "drill"),
+    "tools": ("saw", "drill", "jackhammer"),
     "impacts": ("steps", "rain", "shots"),
     "animals": ("birds", "dog"),
 }
@@ -115,9 +115,10 @@ def _verdicts(rows: SoundRows, without: Collection[str], kinds: Collection[str])
     out = np.zeros(len(rows.kinds))
     for one, guard in guards.items():
         others = [
-            np.concatenate([excesses[other, label] for other in sites if other != one]) for label in STREET
+            np.concatenate([excesses[other, label] for other in sites if other != one])
+            for label in STREET[:-1]
         ]
-        chosen = replace(guard, threshold=max(threshold_of(others), REAL_THRESHOLD))
+        chosen = replace(guard, threshold=max(threshold_of(others), CC0_THRESHOLD))
         here = np.flatnonzero((rows.sites == one) & np.isin(rows.kinds, list(kinds)))
         out[here] = [_code(chosen, rows.measures[i]) for i in here]
     return out

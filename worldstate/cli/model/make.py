@@ -58,7 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     quiet = "recordings without a vehicle: the alarm is set on them"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
     add("--sounds", type=Path, metavar="FOLDER", help="clips of your own, which --kinds lists")
-    add("--kinds", type=Path, metavar="TABLE", help="file, kind, recording and road_user of each of --sounds")
+    add("--kinds", type=Path, metavar="TABLE", help="file, kind and more of each of --sounds")
     command.add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
     allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"
     add("--onsets", type=float, metavar="N", help=allowed)
