@@ -378,8 +378,8 @@ def _drawn(
 ) -> tuple[SimulationSettings, np.random.Generator]:
     """Return what a recording is, and the generator that goes on to simulate it."""
     rng = np.random.default_rng(plan.seed)
-    drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
-    settings = replace(drawn, preset=replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder))
+    levels = replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder)
+    settings = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind, levels)
     if wanted.bandwidth_hz is not None:
         settings = replace(settings, sample_rate_hz=rate_for(wanted.bandwidth_hz))
     if wanted.sounds:

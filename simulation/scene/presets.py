@@ -102,7 +102,7 @@ class Preset:
     traced_vehicle_db : float
         What is added to that mean in streets of the second renderer, which are wider.
     speed_factor : float
-        How many times as fast as `SPEEDS_MPS` vehicles of a stream are.
+        How many times as fast as `SPEEDS_MPS` vehicles are.
     engine_spread_db : float
         Standard deviation of an engine's level against its vehicle's: make, gear and load, from coasting
         or driving on a battery to full power.

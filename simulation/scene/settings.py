@@ -358,7 +358,12 @@ class SimulationSettings:
 
 
 def draw_settings(
-    site_name: str, approach: str, rng: np.random.Generator, duration_s: float = 10.0, kind: str = "light"
+    site_name: str,
+    approach: str,
+    rng: np.random.Generator,
+    duration_s: float = 10.0,
+    kind: str = "light",
+    levels: Preset | None = None,
 ) -> SimulationSettings:
     """Draw how a vehicle drives, in sight at 65 to 75 % of the time.
 
@@ -378,6 +383,8 @@ def draw_settings(
         Length of the recording.
     kind : str
         One of `KINDS`.
+    levels : Preset, optional
+        Of everything else; the default preset where not given.
 
     Returns
     -------
@@ -400,16 +407,18 @@ def draw_settings(
         one_of("approach", approach, (*known.approaches, "none"))
     brakes = rng.random() < BRAKING_SHARE
     plan = site(site_name) if known is None else known.site
+    levels = levels or preset()
     drawn = SimulationSettings(
         site=plan,
         approach=approach,
         duration_s=duration_s,
         entry_s=duration_s * rng.uniform(0.65, 0.75),
-        speed_mps=rng.uniform(*speeds_mps(plan, vehicle_kind(kind))),
+        speed_mps=rng.uniform(*speeds_mps(plan, vehicle_kind(kind), levels)),
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
         parked_car=bool(rng.random() < 0.3) and known is None,
         kind=kind,
         ego=_draw_ego(rng, duration_s) if site_name in MOVING_SITES else EgoMotion(),
+        preset=levels,
     )
     way = None if known is None else known.drawn_way(approach, rng)
     return drawn if way is None else _on_way(drawn, way)
@@ -425,10 +434,10 @@ def _on_way(settings: SimulationSettings, way: Way) -> SimulationSettings:
     return replace(settings, others=(plain,))
 
 
-def speeds_mps(site: Site, kind: VehicleKind) -> tuple[float, float]:
+def speeds_mps(site: Site, kind: VehicleKind, levels: Preset) -> tuple[float, float]:
     """Range of the speeds of a kind of vehicle at a site, before braking."""
-    street = SPEEDS_MPS if site.opposite_wall_m is None else WALLED_SPEEDS_MPS
-    return kind.ridden_mps or street
+    slow, fast = SPEEDS_MPS if site.opposite_wall_m is None else WALLED_SPEEDS_MPS
+    return kind.ridden_mps or (levels.speed_factor * slow, levels.speed_factor * fast)
 
 
 def _draw_ego(rng: np.random.Generator, duration_s: float) -> EgoMotion:

@@ -164,9 +164,7 @@ def draw_driver(
     site: Site, kind: VehicleKind, preset: Preset, rng: np.random.Generator, arm: str | None = None
 ) -> Driver:
     """Draw an arm, a speed and whether the driver brakes before a blind junction."""
-    speed = float(rng.uniform(*speeds_mps(site, kind)))
-    if kind.ridden_mps is None:
-        speed *= preset.speed_factor
+    speed = float(rng.uniform(*speeds_mps(site, kind, preset)))
     braking = float(rng.uniform(*BRAKING_MPS2)) if rng.random() < BRAKING_SHARE else 0.0
     chosen = LEFT if rng.random() < 0.5 else RIGHT
     return Driver(site, kind, arm or chosen, speed, braking, earshot_m(site, kind, speed, preset))

@@ -321,8 +321,9 @@ def test_a_calm_street_is_another_sound_of_the_same_drive(tmp_path, capsys):
         assert main([*arguments, "--preset", name, "--bandwidth", "2000"]) == 0
         truth = json.loads((tmp_path / name / "SA1/left/1_00_0000/truth.json").read_text())
         assert truth["settings"]["preset"]["name"] == name
-        truths[name] = truth["frames"]
+        truths[name] = truth["frames"], truth["settings"]["speed_mps"]
     assert truths["street-6"] == truths["street-6-calm"]
+    assert truths["street-7"][1] == pytest.approx(1.25 * truths["street-6"][1])
 
 
 @pytest.mark.parametrize("duration_s", [2.0, 30.0])
