@@ -33,8 +33,10 @@ from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
 # Hazards one after another; a moving ego has one a drive, with the arrivals that its model learned.
 PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
-# What is near or loud and never comes, learned at every other two junctions, in streets of both renderers.
-MISLEADING, TRACED_SEEDS = "misleading", 500
+# What is near or loud and never comes, learned at every other two junctions, in streets of all renderers.
+MISLEADING = "misleading"
+# Of the other renderers: numbers of their junctions begin there, and these examine.
+OTHERS, EXAM_OTHERS = {"T": 500, "M": 750}, ("A911", "B911", "A912", "B912", "A913")
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
@@ -110,7 +112,7 @@ def quick_settings(settings: CommissionSettings) -> CommissionSettings:
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams that a model learns from: drawn junctions, none of the five with a name.
 
-    Beside them, for an ego that stands, half as many of the second renderer.
+    Beside them, for an ego that stands, half as many of each of the other renderers.
     """
     names = {i: f"{settings.sites[0][0]}{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
     approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
@@ -118,8 +120,9 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     if settings.moving_ego:
         return found
     some = {i: name for i, name in names.items() if i % 4 < 2}
-    traced = {TRACED_SEEDS + i: f"T{name[1:]}" for i, name in some.items()}
-    found += _streams(traced, LEARNED_SEED, {PAIRS: approaching, MISLEADING: quiet}, settings)
+    for letter, first in OTHERS.items():
+        others = {first + i: letter + name[1:] for i, name in some.items()}
+        found += _streams(others, LEARNED_SEED, {PAIRS: approaching, MISLEADING: quiet}, settings)
     return found + _streams(some, LEARNED_SEED, {MISLEADING: quiet}, settings)
 
 
@@ -131,10 +134,19 @@ def _usual(
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
-    """Return the streams of an exam: the five junctions with a name, twenty singles of each and more."""
+    """Return the streams of an exam: the five junctions with a name, twenty singles of each and more.
+
+    For an ego that stands, five junctions of each of the other renderers for a third of the time.
+    """
     names = {i: name for i, name in enumerate(settings.sites) if i == MOUNTING or not settings.quick}
     minutes = _usual(0.6 * settings.exam_minutes, settings.exam_minutes, settings)
-    return _streams(names, EXAM_SEED, minutes, settings)
+    found = _streams(names, EXAM_SEED, minutes, settings)
+    if settings.moving_ego or settings.quick:
+        return found
+    others = {
+        first + i: letter + name for letter, first in OTHERS.items() for i, name in enumerate(EXAM_OTHERS)
+    }
+    return found + _streams(others, EXAM_SEED, {name: one / 3.0 for name, one in minutes.items()}, settings)
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
