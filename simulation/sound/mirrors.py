@@ -260,7 +260,7 @@ def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Gener
 
 def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]:
     """Return every image in which a source is seen, and what the corners bend of it."""
-    images = images_at(site, *centre_m[:2].tolist())
+    images = images_at(site, *centre_m[:2].round(3).tolist())
     place = np.stack([source.x_m, source.y_m, np.ones_like(source.x_m)])
     lit, height = images.weights(place), source.height_m
     # At the edge of a shadow half of the amplitude is left: a quarter here, a quarter by the corner.
@@ -302,5 +302,5 @@ def _diffracted(
 
 def town_by_mirrors(receiver: Receiver, site: Site, here: Ambience) -> Town:
     """Return a town that is heard by where the walls end, at a level of the site's own."""
-    opened = images_at(site, *receiver.centre_m[:2].tolist()).opened(DIRECTIONS)
+    opened = images_at(site, *receiver.centre_m[:2].round(3).tolist()).opened(DIRECTIONS)
     return Town(here, site_generator(site.name, "town"), opened, SKY_SHARE, LOUDER_DB)

@@ -386,9 +386,10 @@ def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_w
     learned = {one.name: one.seed for plan in plans for one in learned_streams(plan)}
     exams = {one.name: one.seed for plan in plans for one in exam_streams(plan)}
     # Approaches and the hazard-free stream of a junction are different traffic under one seed.
-    # Half as many junctions of the second renderer beside them.
-    assert len(set(learned.values())) == 2 * (40 + 20) and len(set(exams.values())) == 2 * 5
+    # Half as many junctions of each of the other renderers beside them, and as many that examine.
+    assert len(set(learned.values())) == 2 * (40 + 20 + 20) and len(set(exams.values())) == 2 * (5 + 5 + 5)
     assert not set(learned.values()) & set(exams.values())
+    assert not {one.split("-")[0] for one in learned} & {one.split("-")[0] for one in exams}
 
 
 def test_a_model_learns_each_flow_in_weather_that_varies_and_is_examined_in_the_published_one() -> None:

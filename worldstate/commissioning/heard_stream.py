@@ -39,6 +39,7 @@ PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
 TOWN, CALM_TOWN, MISLEADING_TOWN = "town-varied", "no-hazard-varied", "misleading-varied"
 LEARNED_PRESET = "street-7"
 RENDERERS = {"S": 0, "T": 500, "M": 750}  # First letter of a junction's name, and where its numbers begin
+EXAM_OTHERS = ("A911", "B911", "A912", "B912", "A913")  # Junctions of the other renderers that examine
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
@@ -137,10 +138,22 @@ def _usual(
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
-    """Return the streams of an exam: the five junctions with a name, twenty singles of each and more."""
+    """Return the streams of an exam: the five junctions with a name, twenty singles of each and more.
+
+    For an ego that stands, five junctions of each of the other renderers for a third of the time.
+    """
     names = {i: name for i, name in enumerate(settings.sites) if i == MOUNTING or not settings.quick}
     minutes = _usual(0.6 * settings.exam_minutes, settings.exam_minutes, settings)
-    return _streams(names, EXAM_SEED, minutes, settings)
+    found = _streams(names, EXAM_SEED, minutes, settings)
+    if settings.moving_ego or settings.quick:
+        return found
+    others = {
+        first + i: letter + plan
+        for letter, first in RENDERERS.items()
+        for i, plan in enumerate(EXAM_OTHERS)
+        if letter != "S"
+    }
+    return found + _streams(others, EXAM_SEED, {name: one / 3.0 for name, one in minutes.items()}, settings)
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
