@@ -261,11 +261,11 @@ def windows_of_recording(levels: Preset, plan: WindowPlan) -> list[Row]:
 
 def _scene(plan: WindowPlan, levels: Preset, rng: np.random.Generator) -> SimulationSettings:
     """Draw a scene in which the vehicle, or the end of a hazard-free window, comes at `ENTRY_S`."""
-    drawn = draw_settings(plan.environment, plan.approach, rng, DURATION_S)
+    drawn = draw_settings(plan.environment, plan.approach, rng, DURATION_S, levels=levels)
     ego = drawn.ego
     if not ego.stands:
         ego = replace(ego, stop_s=ego.stop_s - drawn.entry_s + ENTRY_S)
-    return replace(drawn, entry_s=ENTRY_S, ego=ego, sample_rate_hz=RATE_HZ, preset=levels)
+    return replace(drawn, entry_s=ENTRY_S, ego=ego, sample_rate_hz=RATE_HZ)
 
 
 def _cut(audio: Float32Array, start_s: float) -> Float32Array:

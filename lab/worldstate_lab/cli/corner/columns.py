@@ -2,8 +2,9 @@
 
 FOLDER holds real recordings of a corner in the layout of `worldstate-lab sequences`. Streams in --streams
 were heard by the array of --path, on `seven` by all 56 microphones: levels and bands do not depend on that,
-evidence, prominence and bearing do. Streams whose names begin alike are of one renderer. Window evidence of
-streams that --model learned is too good.
+evidence, prominence and bearing do. Streams whose names begin alike are of one renderer; a few junctions of
+each are enough, and the work grows with the square of their excerpts. Window evidence of streams that --model
+learned is too good.
 
 A row a column: the squared energy distance of real junctions from one another, of the halves of one of
 them (zero but for chance), and of simulated junctions from real ones, with the ratio of the distances.
