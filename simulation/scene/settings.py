@@ -109,7 +109,7 @@ class SoundSettings:
     start_s, duration_s : float
         When it is emitted, -60 to 120 s, and how long, up to 120 s.
     place_m : tuple of float
-        Where it stands, or starts: x ahead and y left of where the ego stops. Not of rain and gusts.
+        Where it stands, or starts: x ahead and y left of where the ego stops. Not of weather.
     route_m : tuple of (float, float)
         More points of its way; empty for a sound that stands.
     speed_mps : float

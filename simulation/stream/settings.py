@@ -135,7 +135,7 @@ TRAFFICS = {
 # 13.2 and 0.2 to 8.2 (5 to 95 %; 16 and 8 streams). With the background of `varied` by 14.0 and 5.7, 3.0 to
 # 24.8 and 1.2 to 11.4. Rates of gusts and the share of rain are assumed.
 _WEATHERS: Mapping[str, Mapping[str, Any]] = {
-    "gusts": {"sounds": {"wind": 120.0}},
+    "gusts": {"sounds": {"wind": 360.0}},
     "rain": {"rain_share": 1.0},
     "quiet": {"background_db": (-10.0, -10.0)},
     "varied": {"background_db": (-10.0, 8.0), "rain_share": 0.15, "sounds": {"wind": 60.0}}
@@ -239,10 +239,14 @@ class StreamSettings:
         return EgoMotion(rng.uniform(*EGO_SPEEDS_MPS), rng.uniform(*STOPS_S))
 
     @property
+    def background_db(self) -> float:
+        """Level of ambience and wind that this stream draws, over the preset's."""
+        return float(self.generator(BACKGROUND).uniform(*self.traffic.background_db))
+
+    @property
     def drawn_preset(self) -> Preset:
         """The preset, with its ambience and wind at the level that this stream draws."""
-        low_db, high_db = self.traffic.background_db
-        level_db = float(self.generator(BACKGROUND).uniform(low_db, high_db))
+        level_db = self.background_db
         octaves_db = tuple(octave_db + level_db for octave_db in self.preset.ambient_octaves_db)
         return replace(
             self.preset, ambient_octaves_db=octaves_db, wind_100hz_db=self.preset.wind_100hz_db + level_db

@@ -9,15 +9,18 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from worldstate.abduction.sequence.sequence_inputs import sequence_inputs
 from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
 from worldstate.commissioning import commission
+from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import (
     Growth,
     LabelledStream,
     StreamTruth,
     calibrated_margin_s,
     exported,
+    stream_truth,
     train_sequence,
 )
 from worldstate.commissioning.stream_exam import smoothed_log_odds
+from worldstate.operations.recordings.hop_table import HopTable
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -44,6 +47,26 @@ def _stream(rng: np.random.Generator, hops: int = 1200) -> tuple[np.ndarray, Str
     nobody = np.full((hops, 2), -np.inf)
     truth = StreamTruth(coming, np.zeros(hops, bool), nobody, nobody, np.zeros((hops, 2), bool))
     return np.concatenate([sides, rest, rng.normal(size=(hops, 4))], axis=1), truth
+
+
+@pytest.mark.parametrize("background_db", [-10.0, 0.0, 8.0])
+def test_a_vehicle_far_away_counts_by_its_level_over_the_background(background_db: float) -> None:
+    """A quiet street lets a fainter one be heard; labelled as empty it would teach that nothing is there."""
+    hops = 12
+    rising_db = 48.0 + background_db + np.linspace(-6.0, 6.0, hops)
+    columns = {"time_s": 0.1 * np.arange(hops)}
+    vehicles = {
+        **{"vehicle": np.array([7]), "flow": np.array(["far"]), "kind": np.array(["light"])},
+        **{"arm": np.array(["left"]), "entry_s": np.array([np.nan]), "hazard": np.array([False])},
+    }
+    rows = {
+        **{"vehicle": np.full(hops, 7), "time_s": columns["time_s"], "in_view": np.zeros(hops, bool)},
+        **{"x_m": np.full(hops, 9.0), "y_m": np.full(hops, 60.0), "loudness_db": rising_db},
+    }
+    about = {"site": "SA1", "background_db": background_db}
+    heard = HeardStream(HopTable(columns, about=about), HopTable(vehicles), HopTable(rows))
+    left, _ = stream_truth(heard).groups().T
+    assert [GROUPS[group] for group in left] == ["none"] * 6 + ["rising"] * 6
 
 
 @pytest.mark.long

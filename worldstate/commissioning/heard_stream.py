@@ -276,7 +276,7 @@ def hear_stream(
     ]
     about = {
         **{"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
-        "sample_rate_hz": settings.sample_rate_hz,
+        **{"sample_rate_hz": settings.sample_rate_hz, "background_db": settings.background_db},
     }
     with closing(stream.blocks()) as blocks:
         samples = _recorded(stream, blocks, loudness)

@@ -25,7 +25,8 @@ from .heard_stream import ROW_S, HeardStream
 SILENT_KINDS = ("bicycle", "scooter")
 # Tyres of electric cars are learned from, but heard later than engines: an exam counts all of these apart.
 QUIET_KINDS = (*SILENT_KINDS, "electric")
-# Below it a vehicle is lost in the background of the simulated streets, some 50 dB at the array.
+# Below it a vehicle is lost in the background of a simulated street, some 50 dB at the array; a stream that
+# draws another background has that much more or less.
 AUDIBLE_DB = 48.0
 OTHER_SIDE_S = 3.0
 
@@ -39,6 +40,7 @@ class StreamTruth:
     past_db: FloatArray  # shape (n, 2): Loudest that has left the view into this side
     far_db: FloatArray  # shape (n, 2): Loudest that never comes into view, or not yet and not from here
     far_rises: BoolArray  # shape (n, 2): Whether that one grows louder
+    audible_db: float = AUDIBLE_DB
 
     def groups(self) -> IndexArray:
         """Return the number of the group of every hop and side, shape (n, 2)."""
@@ -48,9 +50,9 @@ class StreamTruth:
         conditions = {
             "seen": np.broadcast_to(self.seen[:, None], coming.shape),
             "other": self.coming_s[:, ::-1] <= OTHER_SIDE_S,
-            "past": self.past_db >= np.maximum(self.far_db, AUDIBLE_DB),
-            "rising": (self.far_db >= AUDIBLE_DB) & self.far_rises,
-            "falling": self.far_db >= AUDIBLE_DB,
+            "past": self.past_db >= np.maximum(self.far_db, self.audible_db),
+            "rising": (self.far_db >= self.audible_db) & self.far_rises,
+            "falling": self.far_db >= self.audible_db,
         }
         numbers = [GROUPS.index(name) for name in conditions]
         rest = np.select(list(conditions.values()), numbers, GROUPS.index("none"))
@@ -84,7 +86,8 @@ def stream_truth(heard: HeardStream) -> StreamTruth:
         at = hop[elsewhere]
         wins = loudness[elsewhere] > far_db[at, arm]
         far_db[at[wins], arm], rises[at[wins], arm] = loudness[elsewhere][wins], louder[elsewhere][wins]
-    return StreamTruth(coming_s, seen, past_db, far_db, rises)
+    audible_db = AUDIBLE_DB + heard.hops.about.get("background_db", 0.0)
+    return StreamTruth(coming_s, seen, past_db, far_db, rises, audible_db)
 
 
 # Shallow trees of a third of the inputs each, and many of them: learned of 32 junctions, 60, 120 and 200
