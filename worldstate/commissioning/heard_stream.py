@@ -120,9 +120,8 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     if settings.moving_ego:
         return found
     some = {i: name for i, name in names.items() if i % 4 < 2}
-    for letter, first in OTHERS.items():
-        others = {first + i: letter + name[1:] for i, name in some.items()}
-        found += _streams(others, LEARNED_SEED, {PAIRS: approaching, MISLEADING: quiet}, settings)
+    others = _others({i: name[1:] for i, name in some.items()})
+    found += _streams(others, LEARNED_SEED, {PAIRS: approaching, MISLEADING: quiet}, settings)
     return found + _streams(some, LEARNED_SEED, {MISLEADING: quiet}, settings)
 
 
@@ -143,10 +142,12 @@ def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     found = _streams(names, EXAM_SEED, minutes, settings)
     if settings.moving_ego or settings.quick:
         return found
-    others = {
-        first + i: letter + name for letter, first in OTHERS.items() for i, name in enumerate(EXAM_OTHERS)
-    }
-    return found + _streams(others, EXAM_SEED, {name: one / 3.0 for name, one in minutes.items()}, settings)
+    third = {name: one / 3.0 for name, one in minutes.items()}
+    return found + _streams(_others(dict(enumerate(EXAM_OTHERS))), EXAM_SEED, third, settings)
+
+
+def _others(names: Mapping[int, str]) -> dict[int, str]:
+    return {first + i: letter + name for letter, first in OTHERS.items() for i, name in names.items()}
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
