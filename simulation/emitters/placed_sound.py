@@ -34,13 +34,13 @@ def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator)
     # What the road adds is heard of the tyres alone.
     engine_db = preset.engine_spread_db * rng.standard_normal() - site.surface_db + engine_bass_db(preset)
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
-    sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
     if renderer := RENDERERS.get(site.renderer):
         source = PlacedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M)
         renderer.add_source(street, source, rng)
         return
+    sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
     around = _around(street)
     far = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
     add_sources(static, sources, around, ANY_ORDER[:POINT_REFLECTIONS])

@@ -10,7 +10,6 @@ Acoust. Soc. Am. 65, 943-950, 1979; T. Funkhouser et al., "A beam tracing approa
 interactive virtual environments", SIGGRAPH 1998.
 """
 
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -275,9 +274,7 @@ def _diffracted(
     site: Site, images: Images, lit: FloatArray, place: FloatArray, centre_m: FloatArray, height_m: float
 ) -> Iterator[Way]:
     """Yield the ways from images of a source in an arm round its corner to images of the microphones."""
-    seen: dict[tuple[float, ...], FloatArray] = defaultdict(lambda: np.zeros(lit.shape[1]))
-    for mirror, weight in zip(images.mirror, lit, strict=True):
-        seen[_key(mirror)] = seen[_key(mirror)] + weight
+    keys = [_key(one) for one in images.mirror]
     knots = np.arange(lit.shape[1])
     some = np.r_[knots[:-1:EVERY], knots[-1]]
     for side, across in ((1.0, site.corner_left_m), (-1.0, site.corner_right_m)):
@@ -290,7 +287,9 @@ def _diffracted(
             unfolded = (np.linalg.inv(mirror) @ place)[:2]
             # Images behind a face of the corner are in the coefficient of the wedge.
             open_to = reached[there] * (unfolded[0, some] > corner[0]) * (side * at[1] < across)
-            hidden = open_to * np.maximum(1.0 - seen[_key(mirror @ images.mirror[ear])][some], 0.0)
+            key = _key(mirror @ images.mirror[ear])
+            straight = lit[[one == key for one in keys]].sum(axis=0)
+            hidden = open_to * np.maximum(1.0 - straight[some], 0.0)
             if images.order[ear] + arm.order[there] <= BENT_ORDERS and hidden.any():
                 before = np.hypot(*(unfolded - corner[:, None]))
                 gain = corner_gain(tuple(corner - at), *(unfolded[:, some] - at[:, None]))

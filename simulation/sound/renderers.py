@@ -1,8 +1,7 @@
 """What carries the sound of a street, by `Site.renderer`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 
@@ -27,12 +26,10 @@ class Renderer:
 
 
 # All other sites: along the paths of their plan, for which a vehicle has several points and a late field.
-RENDERERS: Mapping[str, Renderer] = MappingProxyType(
-    {
-        "rays": Renderer(add_traced, town_by_rays, over_roofs=True),
-        "mirrors": Renderer(add_mirrored, town_by_mirrors, over_roofs=False),
-    }
-)
+RENDERERS = {
+    "rays": Renderer(add_traced, town_by_rays, over_roofs=True),
+    "mirrors": Renderer(add_mirrored, town_by_mirrors, over_roofs=False),
+}
 
 
 def add_ambience(

@@ -158,3 +158,40 @@ def test_a_recording_has_the_town_of_its_street(name: str, monkeypatch: pytest.M
     pair = MicrophoneArray(np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]))
     simulate_recording(settings, np.random.default_rng(1), pair)
     assert len(towns) == 1 and towns[0].opened.sum() > 0.0
+
+
+@given(plans, st.sampled_from([1.0, -1.0]))
+@settings(max_examples=15, deadline=None)
+def test_a_vehicle_comes_out_of_a_shadow_without_a_step(plan, side) -> None:
+    """Straight sound and what its corner bends are half of the free field at the edge of the shadow."""
+    lane, centre = plan.lanes_m[0], np.array([0.0, 0.0, 1.7])
+    edge = abs(plan.sight_m(lane)[0 if side < 0 else 1])
+    y = side * (edge + np.arange(40.0, -41.0, -1.0) / 10.0)
+    source = PlacedSource(np.zeros(8, np.float32), np.arange(len(y)) * 0.02, np.full(len(y), lane), y, 0.3)
+    corner = plan.corner_ahead_m, side * (plan.corner_left_m if side > 0 else plan.corner_right_m)
+    straight, total = np.hypot(np.hypot(lane, y), 1.4), np.zeros(len(y))
+    bent = np.hypot(np.hypot(*corner) + np.hypot(lane - corner[0], y - corner[1]), 1.4)
+    for way in mirrors.ways_of(plan, source, centre):
+        length = way.length_m(centre)
+        if np.allclose(length, straight) or np.allclose(length, bent):
+            total += way.gain[:, 5] / length
+    level_db = 20.0 * np.log10(total * straight)
+    assert np.abs(np.diff(level_db)).max() < 3.0  # in 0.1 m; an edge that cuts would lose all of it
+    assert level_db[40] == pytest.approx(-6.0, abs=1.0)
+    assert level_db[0] < -9.0 and abs(level_db[-1]) < 1.0
+
+
+def test_walls_that_absorb_all_leave_what_meets_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without reflections a source is heard straight and by its corner, and by nothing else."""
+    plan = drawn_site("MA7")
+    fronts = drawn_fronts(plan)
+    monkeypatch.setattr(mirrors, "drawn_fronts", lambda _: Fronts(fronts.ends_m, 0.0 * fronts.kept))
+    mirrors.images_at.cache_clear()
+    y = np.linspace(-25.0, 25.0, 201)
+    source = PlacedSource(
+        np.zeros(8, np.float32), np.arange(201) * 0.02, np.full(201, plan.lanes_m[0]), y, 0.3
+    )
+    ways = mirrors.ways_of(plan, source, np.array([0.0, 0.0, 1.7]))
+    mirrors.images_at.cache_clear()
+    audible = [way for way in ways if way.gain.any()]
+    assert len(ways) > 6 and len(audible) == 3  # straight, round the left corner, round the right one
