@@ -1,5 +1,6 @@
 """`worldstate model make` from an array file to a model that can be read, and its exam."""
 
+import gzip
 import hashlib
 import json
 from pathlib import Path
@@ -52,6 +53,20 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()} == heard
     assert out.read_bytes() == before
+    boards = [
+        "--array",
+        "respeaker-4",
+        *command[2:4],
+        "--no-exam",
+        "--streams",
+        str(tmp_path / "model.streams"),
+    ]
+    assert main([*command[:2], *boards, "--out", str(tmp_path / "boards"), "--quick"]) == 0
+    made = {path.name: path for path in (tmp_path / "boards").iterdir()}
+    assert set(made) == {"respeaker-4.json.gz", "mics.json.gz"}
+    assert gzip.decompress(made["mics.json.gz"].read_bytes()) == before
+    other = read_model(made["respeaker-4.json.gz"])
+    assert other.domain is not None and other.domain.array == "respeaker-4"
     quiet = tmp_path / "night.wav"
     noise = np.random.default_rng(1).standard_normal((6000 * 25, 4)) * 0.01
     soundfile.write(quiet, noise, 6000, subtype="FLOAT")
