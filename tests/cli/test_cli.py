@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -13,7 +14,7 @@ import pytest
 import soundfile
 
 from worldstate.adapters.files import array_file
-from worldstate.adapters.files.model_file import read_model, save_model
+from worldstate.adapters.files.model_file import DataSource, read_model, save_model
 from worldstate.cli.main import FORMER, FORMER_OPTIONS, PROGRAM, STUDIES, main
 from worldstate.state import snapshot_schema
 
@@ -145,6 +146,16 @@ def test_a_card_needs_no_further_word(tmp_path, capsys):
         assert main(words) == 0
         cards.append(capsys.readouterr().out)
     assert len({card.partition("threshold")[2] for card in cards}) == 1
+
+
+def test_a_card_names_each_source_by_use_with_its_licence_none_stated_included(tmp_path, capsys):
+    sources = (DataSource("some windows", "coefficients"), DataSource("some clips", "thresholds", "CC0"))
+    made = read_model()
+    save_model(tmp_path / "m.json.gz", replace(made, provenance=replace(made.provenance, sources=sources)))
+    assert main(["model", "show", str(tmp_path / "m.json.gz")]) == 0
+    card = capsys.readouterr().out
+    assert re.search(r"source 1 +some windows: coefficients; licence: none stated\n", card)
+    assert re.search(r"source 2 +some clips: thresholds; licence: CC0\n", card)
 
 
 @pytest.mark.parametrize("word", ["array", "model"])

@@ -30,6 +30,10 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert model.sequence is not None and model.sequence.alarm is not None
     assert model.domain is not None and len(model.domain.positions_m) == 4
     assert not model.provenance.fit_for_use
+    assert main(["model", "show", str(out)]) == 0
+    card = capsys.readouterr().out
+    assert "source 1        simulated streets: coefficients; licence: Apache-2.0" in card
+    assert "simulated streets: exam" in card
     told = json.loads(report.read_text())
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
     assert set(told["mounting"]) == {"as mounted", "2 deg of yaw", "5 mm of position"}

@@ -18,7 +18,7 @@ from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES, side_ratios, visible_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of
-from worldstate.adapters.files.model_file import Model
+from worldstate.adapters.files.model_file import DataSource, Model
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
@@ -79,6 +79,12 @@ SOUNDS = 1  # Purpose of a generator
 # Road users are heard with one microphone: sounds are rendered once for all arrays, in their middle.
 MIDDLE = MicrophoneArray(np.array([[0.0, 0.01, 0.0], [0.0, -0.01, 0.0]]))
 SIMULATED = "simulated streets"
+STREETS = DataSource(SIMULATED, "coefficients", "Apache-2.0: the simulation is a part of this project")
+# Guard and road users; see what was chosen in `guard_training`.
+CHOSEN_ON = (
+    DataSource("82 recordings of passing cars and trams", "thresholds"),
+    DataSource("394 clips of UrbanSound8K", "thresholds", "CC BY-NC 3.0"),
+)
 # Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
 HAZARD_FREE_SHARE = 120.0 / 192.0
 
@@ -236,6 +242,7 @@ def commission(
     *,
     table: FeatureTable | None = None,
     source: str = "labelled windows",
+    licence: str = "none stated",
     excluded_lists: Sequence[str] = (),
     quiet: Sequence[Path] = (),
     recorded: RecordedClips | None = None,
@@ -248,6 +255,7 @@ def commission(
     Streams are heard and kept in the folder for the arrays beside, too. `on_step` is called with what is done
     next and with what was done meanwhile, in minutes of streams (`learning_minutes` are all).
 
+    The card names every source by use, the labelled windows with their licence.
     Recordings without vehicles set the alarm in place of the simulated streets without hazards; guard and
     road users are learned from recorded clips as well. The model says where the labelled windows and the
     clips come from and which lists of windows were left out.
@@ -291,7 +299,12 @@ def commission(
     if recorded is not None or not settings.quick:
         learned("sounds near by")
         model = _with_ears(model, array, streams, recorded, settings, jobs, learned)
-    provenance = replace(model.provenance, fit_for_use=not settings.quick)
+    named = [STREETS] if real is None else [STREETS, DataSource(source, "coefficients", licence)]
+    named += [] if recorded is None else [DataSource(recorded.told, "coefficients")]
+    named += CHOSEN_ON if model.guard is not None else ()
+    named += [DataSource(path.name, "thresholds") for path in quiet] or [replace(STREETS, use="thresholds")]
+    named.append(replace(STREETS, use="exam"))
+    provenance = replace(model.provenance, fit_for_use=not settings.quick, sources=tuple(named))
     made = replace(model, provenance=provenance, sequence=sequence)
     if not calm:
         return made

@@ -41,7 +41,7 @@ def _readable(card: dict[str, object]) -> dict[str, object]:
     """Return the card with one line a threshold and a limit."""
     lines: dict[str, object] = {}
     for key, value in card.items():
-        if isinstance(value, list) and key in ("budgets", "thresholds", "limits"):
+        if isinstance(value, list) and key in ("sources", "budgets", "thresholds", "limits"):
             lines |= {f"{key[:-1]} {number}": _words(one) for number, one in enumerate(value, start=1)}
         elif isinstance(value, dict) and key == "street":
             shown = "{name} {value:g} {unit} ({origin}: {why})"
@@ -53,6 +53,8 @@ def _readable(card: dict[str, object]) -> dict[str, object]:
 
 
 def _words(value: object) -> object:
+    if isinstance(value, dict) and "use" in value:
+        return "{name}: {use}; licence: {licence}".format(**value)
     if isinstance(value, dict):
         return "  ".join(f"{key} {part:.4g}" for key, part in value.items())
     return value
@@ -76,6 +78,7 @@ def model_card(model: "adapters.Model") -> dict[str, object]:
         "sites": sorted({key.split("/")[0] for key in origin.training_recordings}),
         "excluded_lists": list(origin.excluded_lists),
         "classifier": origin.classifier,
+        "sources": [asdict(one) for one in origin.sources],
         **_made_for(model),
         **_budgets(model),
         "thresholds": [
