@@ -73,7 +73,7 @@ FOLDS = 4
 # of 8 microphones all of it takes two thirds as long as they do.
 LEARNING_SHARE, LEARNING_STEPS = 0.65, 2 * FOLDS + 4
 # So many hours of streams bear all trees, fewer in proportion, and so many rounds at least: of eight minutes
-# 20 never reach an alarm; 60 and 120 do, at the same Brier skill.
+# that a board of four hears 20 never reach an alarm; 60 and 120 do, at the same Brier skill.
 HOURS_OF_TREES, LEAST_ROUNDS = 2.0, 60
 SOUNDS = 1  # Purpose of a generator
 # Road users are heard with one microphone: sounds are rendered once for all arrays, in their middle.
