@@ -15,6 +15,7 @@ from pathlib import Path
 
 from worldstate import adapters
 from worldstate.cli.common import output
+from worldstate.frontend.array.microphone_array import nearest_spacings_m
 
 # Of the coefficients that ship; the data that a user trains on has a licence of its own.
 LICENCE = "Apache-2.0 for the coefficients that ship; no row of the training data is in the file"
@@ -104,6 +105,7 @@ def _made_for(model: "adapters.Model") -> dict[str, object]:
     return {
         "array": domain.array,
         "microphones": len(domain.positions_m),
+        "spacing_mm": round(1e3 * float(nearest_spacings_m(domain.positions_m).mean()), 1),
         "extent_m": [round(extent, 3) for extent in domain.extent_m],
         "band_hz": list(domain.band_hz),
         "feature": domain.feature,
