@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -26,6 +26,15 @@ from .file_io import read_record, refused_as_file, write_text
 # Of a number of a model file. The largest that ships is a sample rate; a sum of thousands of products of two
 # such numbers, squared, is still finite.
 LARGEST = 1e12
+
+
+@dataclass(frozen=True, slots=True)
+class DataSource:
+    """What a model was made or examined with, and under which licence."""
+
+    name: str
+    use: Literal["coefficients", "thresholds", "exam"]
+    licence: str = "none stated"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +61,8 @@ class Provenance:
         What out-of-fold windows scored during training.
     fit_for_use : bool
         False of a model that was made to try a command out: no budget is stated with it.
+    sources : tuple of DataSource
+        Each source by use, with its licence; empty in files of a version before 1.8.
 
     Examples
     --------
@@ -68,6 +79,7 @@ class Provenance:
     excluded_lists: tuple[str, ...] = ()
     figures: Mapping[str, float] = field(default_factory=dict)
     fit_for_use: bool = field(default=True, metadata=ADDED)
+    sources: tuple[DataSource, ...] = field(default=(), metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +108,7 @@ class Model:
     """
 
     LAYOUT: ClassVar = Layout(
-        "worldstate.Model", "1.7.0", order="provenance signature policies sequence guard road_users street"
+        "worldstate.Model", "1.8.0", order="provenance signature policies sequence guard road_users street"
     )
 
     signature: AnySignature

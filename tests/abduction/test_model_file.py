@@ -221,7 +221,7 @@ def test_a_checkpoint_holds_the_numbers_of_its_street(values):
 
 def test_unknown_keys_are_ignored_and_another_major_version_is_not():
     read({**DEFAULT, "later": 1})
-    newer = {**DEFAULT, "schema": {"name": "worldstate.Model", "version": "1.8.0"}}
+    newer = {**DEFAULT, "schema": {"name": "worldstate.Model", "version": "1.9.0"}}
     read(newer)
     with pytest.raises(SchemaVersionError, match=r"bad\.json: expected"):
         read({**DEFAULT, "schema": {"name": "worldstate.Model", "version": "2.0.0"}})

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.files.model_file import read_model, save_model
+from worldstate.adapters.files import array_file
+from worldstate.adapters.files.model_file import DataSource, read_model, save_model
 from worldstate.cli.main import FORMER, FORMER_OPTIONS, PROGRAM, STUDIES, main
 from worldstate.state import snapshot_schema
 
@@ -109,7 +111,11 @@ def test_progress_is_a_line_where_there_is_no_terminal(monkeypatch, capsys):
     with progress.progress_bar("working", 4) as bar:
         bar.advance()
         time.sleep(0.2)
-    assert "worldstate: working: 25 % after 0 s" in capsys.readouterr().err
+        bar.go_on("cleaning up", 1.0)
+        time.sleep(0.2)
+    told = capsys.readouterr().err
+    assert "worldstate: working: 25 % after 0 s, some 0 s left" in told
+    assert "worldstate: working: cleaning up: 50 % after 0 s" in told
 
 
 @pytest.mark.parametrize("former", FORMER)
@@ -140,6 +146,35 @@ def test_a_card_needs_no_further_word(tmp_path, capsys):
         assert main(words) == 0
         cards.append(capsys.readouterr().out)
     assert len({card.partition("threshold")[2] for card in cards}) == 1
+
+
+def test_a_card_names_each_source_by_use_with_its_licence_none_stated_included(tmp_path, capsys):
+    sources = (DataSource("some windows", "coefficients"), DataSource("some clips", "thresholds", "CC0"))
+    made = read_model()
+    save_model(tmp_path / "m.json.gz", replace(made, provenance=replace(made.provenance, sources=sources)))
+    assert main(["model", "show", str(tmp_path / "m.json.gz")]) == 0
+    card = capsys.readouterr().out
+    assert re.search(r"source 1 +some windows: coefficients; licence: none stated\n", card)
+    assert re.search(r"source 2 +some clips: thresholds; licence: CC0\n", card)
+
+
+@pytest.mark.parametrize("word", ["array", "model"])
+def test_a_list_names_what_there_is_and_what_ships(word, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(array_file, "MODELS", tmp_path)
+    save_model(tmp_path / "uma-8.json.gz", read_model())
+    assert main([word, "list", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    if word == "array":
+        assert list(told) == list(array_file.named_arrays())
+        assert [name for name, row in told.items() if row["model"]] == ["uma-8"]
+        assert told["respeaker-4"]["microphones"] == 4
+        # Neighbours on a ring of four: its radius times the root of two.
+        assert told["respeaker-4"]["spacing_mm"] == pytest.approx(40.5 * 2**0.5, abs=0.05)
+    else:
+        assert list(told) == ["standing", "moving", "uma-8"]
+        assert [row["ego_motion"] for row in told.values()] == ["standing", "moving", "standing"]
+    assert main([word, "list"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == len(told)
 
 
 @pytest.mark.parametrize("words", [["nothing"], ["array", "nothing"], ["array"], []])

@@ -45,7 +45,8 @@ def test_real_windows_alone_are_fitted_once_for_all_folds_of_a_moving_ego(tmp_pa
         assert fit(streams[:1]) is fit(streams)
         raise LearnedError
 
-    for name in ("heard_streams", "open_field_features", "open_field_windows"):
+    monkeypatch.setattr(commission, "heard_streams", lambda plan, *rest: plan)
+    for name in ("open_field_features", "open_field_windows"):
         monkeypatch.setattr(commission, name, lambda *given: [1, 2])
     monkeypatch.setattr(commission, "window_model", lambda *given: fitted.append(given) or object())
     monkeypatch.setattr(commission, "learn_sequence", learn)

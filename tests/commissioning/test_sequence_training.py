@@ -4,13 +4,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from worldstate.abduction.sequence.sequence_inputs import sequence_inputs
-from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
+from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S, SequenceModel
 from worldstate.commissioning import commission
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import (
+    MOVING,
+    STANDING,
     Growth,
     LabelledStream,
     StreamTruth,
@@ -20,6 +24,7 @@ from worldstate.commissioning.sequence_training import (
     train_sequence,
 )
 from worldstate.commissioning.stream_exam import smoothed_log_odds
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_table import HopTable
 
 
@@ -91,6 +96,25 @@ def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten()
     assert 0.85 < inside.mean() < 0.96
 
 
+def levels_of_readings(calm: tuple[object, object, SequenceModel, FloatArray]) -> FloatArray:
+    """Without sound there are no windows: the alarm goes by the readings alone."""
+    _, _, model, found = calm
+    return smoothed_log_odds(model.posterior(found))
+
+
+@given(st.lists(st.integers(10, 40_000), min_size=1, max_size=8), st.booleans())
+def test_more_sound_bears_more_trees_up_to_those_that_were_chosen(hops: list[int], moves: bool) -> None:
+    """Of seven minutes (--quick) a tenth of the trees: all of them took most of its time."""
+    streams = [SimpleNamespace(hops=range(n), ego_moves=moves) for n in hops]
+    most, few = (MOVING if moves else STANDING), commission.dealt_growth(streams[:1])
+    every = commission.dealt_growth(streams)
+    assert 20 <= few.rounds <= every.rounds <= most.rounds and every.leaves == most.leaves
+    if sum(hops) >= 72_000:
+        assert every == most
+    if sum(hops) <= 4_200:
+        assert every.rounds <= 20
+
+
 @pytest.mark.long
 def test_what_is_learned_does_not_depend_on_how_many_processes_learn(monkeypatch) -> None:
     rng = np.random.default_rng(3)
@@ -102,9 +126,7 @@ def test_what_is_learned_does_not_depend_on_how_many_processes_learn(monkeypatch
     monkeypatch.setattr(commission, "stream_evidence", lambda windows, street: made_up[id(street)][0])
     monkeypatch.setattr(commission, "stream_truth", lambda street: made_up[id(street)][1])
     monkeypatch.setattr(commission, "STANDING", Growth(4, 6))
-    # Without sound there are no windows: the alarm goes by the readings alone.
-    monkeypatch.setattr(commission, "stream_states", lambda _, __, model, found: model.posterior(found))
-    monkeypatch.setattr(commission, "alarm_levels", smoothed_log_odds)
+    monkeypatch.setattr(commission, "_quiet_levels", levels_of_readings)
     one, two = (
         commission.learn_sequence(streets, lambda some: None, 30.0, np.random.default_rng(1), jobs)
         for jobs in (1, 2)

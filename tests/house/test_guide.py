@@ -79,7 +79,7 @@ def output_of(kind: str, text: str, printed: str) -> str:
 
 def without_margins(text: str) -> str:
     # A slow machine is told how far a command has come.
-    text = re.sub(r"^worldstate: .* % after \d+ s\n", "", text, flags=re.M)
+    text = re.sub(r"^worldstate: .* % after \d+ s(, some \d+ s left)?\n", "", text, flags=re.M)
     return "\n".join(line.rstrip() for line in text.strip("\n").splitlines()) + "\n"
 
 

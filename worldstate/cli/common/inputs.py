@@ -59,7 +59,9 @@ def add_channel_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_array_options(
-    parser: argparse.ArgumentParser, default: str = "the data set's, OVAD's where it names none"
+    parser: argparse.ArgumentParser,
+    default: str = "the data set's, OVAD's where it names none",
+    action: str = "store",
 ) -> None:
     """Declare --array and --array-axes.
 
@@ -75,7 +77,8 @@ def add_array_options(
     """
     describe(parser, add_array_options)
     add = parser.add_argument
-    add("--array", type=Path, metavar="FILE", help=f"microphone positions (default: {default})")
+    told = f"microphone positions (default: {default})"
+    add("--array", type=Path, action=action, metavar="FILE", help=told)
     axes = "x right, y up, z forward, or x forward, y left, z up (default: by the form of the file)"
     add("--array-axes", choices=("acoular", "base_link"), help=axes)
 

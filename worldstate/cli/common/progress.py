@@ -22,7 +22,7 @@ class Bar:
     """Handle of one running progress bar."""
 
     def __init__(self, total: float | None) -> None:
-        self.total = total
+        self.total, self.stage = total, ""
         self.done = 0.0
         self.shown: Callable[[float], object] = lambda amount: None
 
@@ -30,6 +30,11 @@ class Bar:
         """Move the bar on by `amount` of its total."""
         self.done += amount
         self.shown(amount)
+
+    def go_on(self, stage: str, amount: float) -> None:
+        """Say what is done from now on, and move the bar on by what was done before."""
+        self.stage = f": {stage}"
+        self.advance(amount)
 
 
 @contextmanager
@@ -65,7 +70,9 @@ def _drawn(description: str, bar: Bar) -> Iterator[None]:
     columns = told, BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(printable(description), total=bar.total)
-        bar.shown = lambda amount: progress.advance(task, amount)
+        bar.shown = lambda amount: progress.update(
+            task, advance=amount, description=printable(description + bar.stage)
+        )
         yield
 
 
@@ -76,8 +83,11 @@ def _told(description: str, bar: Bar) -> Iterator[None]:
 
     def tell() -> None:
         while not ended.wait(EVERY_S):
+            gone_s = time.monotonic() - begun_s
             share = f"{100.0 * bar.done / bar.total:.0f} %" if bar.total else f"{bar.done:g} done"
-            say(f"{description}: {share} after {time.monotonic() - begun_s:.0f} s")
+            left_s = gone_s * (bar.total / bar.done - 1.0) if bar.total and bar.done else None
+            left = "" if left_s is None else f", some {left_s:.0f} s left"
+            say(f"{description}{bar.stage}: {share} after {gone_s:.0f} s{left}")
 
     teller = threading.Thread(target=tell, daemon=True)
     teller.start()

@@ -11,8 +11,12 @@ Examples
 
 import argparse
 
-from worldstate import adapters, frontend
+from worldstate import adapters
 from worldstate.cli.common import output
+
+from .show import model_card
+
+_SHOWN = ("array", "microphones", "spacing_mm", "ego_motion", "data")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -23,13 +27,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.files.array_file import shipped_models
 
-    roof = {name: adapters.read_model(moving_ego=name == "moving") for name in ("standing", "moving")}
-    rows: dict[str, dict[str, object]] = {}
-    for name, model in (roof | {name: adapters.read_model(name) for name in shipped_models()}).items():
-        if (domain := model.domain) is None:
-            continue
-        spacing_mm = round(1e3 * frontend.MicrophoneArray(domain.positions_m).mean_spacing_m, 1)
-        rows[name] = {"array": domain.array, "microphones": len(domain.positions_m), "spacing_mm": spacing_mm}
-        rows[name] |= {"ego_motion": domain.ego_motion, "data": model.provenance.dataset}
+    models = {name: adapters.read_model(moving_ego=name == "moving") for name in ("standing", "moving")}
+    models |= {name: adapters.read_model(name) for name in shipped_models()}
+    cards = {name: model_card(model) for name, model in models.items()}
+    rows = {name: {key: card[key] for key in _SHOWN} for name, card in cards.items()}
     line = "{array}, {microphones} microphones, {spacing_mm:g} mm apart; {ego_motion} ego; of {data}"
     return output.CommandResult(rows, {name: line.format(**row) for name, row in rows.items()})

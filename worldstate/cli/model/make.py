@@ -10,12 +10,14 @@ tram, motorcycle or bicycle. Every recording counts as much as a simulated clip.
 reversing beeper, bicycle bell (warning signals) and street is a foreign sound. The model says that it was
 learned so.
 
-Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes on
-there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
+With several --array every street is rendered once for all of them; --out is then a folder, with NAME.json.gz
+of each. Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes
+on there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
 
 Examples
 --------
   worldstate model make --array mics.csv --out my_model.json --streams streams --jobs 2
+  worldstate model make --array uma-8 --array mics.csv --out models --streams streams --jobs 2
   worldstate model make --array mics.csv --out my_model.json --streams streams --quiet night.wav
   worldstate model make --array mics.csv --out my_model.json --streams streams --mounting-errors
   worldstate model make --array mics.csv --out my_model.json --sounds my_sounds --kinds my_sounds/clips.csv
@@ -24,6 +26,7 @@ Examples
 """
 
 import argparse
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,8 +47,8 @@ NEEDS = ("sklearn",)
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    inputs.add_array_options(parser, "OVAD's")
-    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    inputs.add_array_options(parser, "OVAD's; repeated, a model for each", "append")
+    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file; of several a folder")
     add("--report", type=Path, metavar="JSON", help="write what the exam found")
     add("--figure", type=Path, metavar="PNG", help="draw what the exam found")
     streams = "keep streams that were listened to, and take those that are there (default: beside MODEL)"
@@ -55,6 +58,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     ids = "CSV files with a column ID: leave out the recordings of these labelled windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
+    licence = "licence of the labelled windows, for the card (default: none stated)"
+    add("--licence", default="none stated", metavar="TEXT", help=licence)
     quiet = "recordings without a vehicle: the alarm is set on them"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
     add("--sounds", type=Path, metavar="FOLDER", help="clips of your own, which --kinds lists")
@@ -77,54 +82,93 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
+    from worldstate.commissioning import stream_exam
+
+    arrays = [adapters.read_array(one, arguments.array_axes) for one in arguments.array or ()]
+    outs = _outs(arguments, arrays)
+    output.check_outputs(arguments, *(() if len(arrays) > 1 else ("out",)), "report", figures=("figure",))
+    command.check_beside(arguments, exclude="labelled", source="labelled", figure="exam")
+    settings, recorded = _settings(arguments), _recorded(arguments)
+    reports, lines = dict[str, dict[str, object]](), list[str]()
+    for out, number in zip(outs, count(1)):
+        array, *beside = arrays[number - 1 :] or [frontend.ovad_array()]
+        reports[array.name] = _made(arguments, settings, array, beside, out, recorded, lines)
+    report: dict[str, object] = {"models": reports} if len(arrays) > 1 else next(iter(reports.values()))
+    told = {"out": str(arguments.out)} if len(arrays) > 1 else report
+    # The figures of the 56 microphones are those of a standing ego.
+    if not settings.moving_ego:
+        told = stream_exam.beside_reference(told)
+        report["reference"] = dict(stream_exam.REFERENCE)
+    if len(arrays) > 1 and arguments.exam:
+        lines += ["", *stream_exam.figure_lines("array", reports)]
+    if arguments.report is not None:
+        output.write_report(arguments.report, report)
+    lines += [] if recorded is None else ["", recorded.told]
+    lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
+    return output.CommandResult(report, told, lines)
+
+
+def _outs(arguments: argparse.Namespace, arrays: "list[frontend.MicrophoneArray]") -> list[Path]:
+    """Return the file of the model of each array; of several they stand in the folder --out."""
+    if len(arrays) <= 1:
+        return [arguments.out]
+    for option in ("labelled", "quiet", "figure", "mounting_errors"):
+        if getattr(arguments, option):
+            name = option.replace("_", "-")
+            raise InvalidArgumentError(f"--{name}: expected one --array with it, got {len(arrays)}")
+    names = [f"{Path(array.name).stem}.json.gz" for array in arrays]
+    if len({*names}) < len(names):
+        raise InvalidArgumentError(f"--array: expected each name once, got {', '.join(names)}")
+    return [output.output_folder(arguments.out, *names) / name for name in names]
+
+
+def _made(
+    arguments: argparse.Namespace,
+    settings: "CommissionSettings",
+    array: "frontend.MicrophoneArray",
+    beside: "list[frontend.MicrophoneArray]",
+    out: Path,
+    recorded: "RecordedClips | None",
+    lines: list[str],
+) -> dict[str, object]:
+    """Make and examine the model of one array; return its report."""
     from worldstate.commissioning import commission, heard_stream, stream_exam
 
-    output.check_outputs(arguments, "out", "report", figures=("figure",))
-    command.check_beside(arguments, exclude="labelled", source="labelled", figure="exam")
-    settings = _settings(arguments)
     folder = arguments.streams or arguments.out.with_suffix(".streams")
-    array = inputs.given_array(arguments) or frontend.ovad_array()
-    recorded = _recorded(arguments)
-    # Streams take nearly all of the time; what is learned from them counts as a few more.
-    steps = len(heard_stream.learned_streams(settings)) + commission.LEARNING_STEPS
-    with progress.progress_bar("commissioning", steps) as bar:
+    minutes = sum(one.minutes for one in heard_stream.learned_streams(settings))
+    with progress.progress_bar(f"making {out.name}", minutes + commission.learning_minutes(settings)) as bar:
         model = commission.commission(
             array,
             settings,
             folder,
             table=_labelled(arguments),
             source=arguments.source or getattr(arguments.labelled, "name", ""),
+            licence=arguments.licence,
             excluded_lists=[path.name for path in arguments.exclude],
             quiet=arguments.quiet,
             recorded=recorded,
+            beside=beside,
             jobs=arguments.jobs,
-            on_step=bar.advance,
+            on_step=bar.go_on,
         )
-    adapters.save_model(arguments.out, model)
-    report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": model.provenance.fit_for_use}
+    adapters.save_model(out, model)
+    report: dict[str, object] = {"out": str(out), "fit_for_use": model.provenance.fit_for_use}
     if arguments.exam:
-        with progress.progress_bar("exam", len(heard_stream.exam_streams(settings))) as bar:
+        exam = heard_stream.exam_streams(settings)
+        with progress.progress_bar(f"exam of {out.name}", sum(one.minutes for one in exam)) as bar:
             examined = commission.exam_of(
-                array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance
+                array, model, settings, folder, beside=beside, jobs=arguments.jobs, on_step=bar.advance
             )
         report |= stream_exam.exam_figures(examined)
         if arguments.figure is not None:
             stream_exam.write_exam_figure(examined, arguments.figure)
-    # The figures of the 56 microphones are those of a standing ego.
-    told, lines = report if settings.moving_ego else stream_exam.beside_reference(report), list[str]()
     if arguments.mounting_errors:
         heard = commission.exam_of_mountings(array, model, settings, folder, arguments.jobs)
         every = list(progress.track(heard, "mounting", len(heard_stream.mounting_streams(settings))))
         mounted = {name: stream_exam.exam_figures([one[name] for one in every]) for name in every[0]}
         report["mounting"] = mounted
         lines += ["", *stream_exam.mounting_lines(mounted)]
-    if not settings.moving_ego:
-        report["reference"] = dict(stream_exam.REFERENCE)
-    if arguments.report is not None:
-        output.write_report(arguments.report, report)
-    lines += [] if recorded is None else ["", recorded.told]
-    lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
-    return output.CommandResult(report, told, lines)
+    return report
 
 
 def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":

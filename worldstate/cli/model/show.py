@@ -15,6 +15,7 @@ from pathlib import Path
 
 from worldstate import adapters
 from worldstate.cli.common import output
+from worldstate.frontend.array.microphone_array import nearest_spacings_m
 
 # Of the coefficients that ship; the data that a user trains on has a licence of its own.
 LICENCE = "Apache-2.0 for the coefficients that ship; no row of the training data is in the file"
@@ -41,7 +42,7 @@ def _readable(card: dict[str, object]) -> dict[str, object]:
     """Return the card with one line a threshold and a limit."""
     lines: dict[str, object] = {}
     for key, value in card.items():
-        if isinstance(value, list) and key in ("budgets", "thresholds", "limits"):
+        if isinstance(value, list) and key in ("sources", "budgets", "thresholds", "limits"):
             lines |= {f"{key[:-1]} {number}": _words(one) for number, one in enumerate(value, start=1)}
         elif isinstance(value, dict) and key == "street":
             shown = "{name} {value:g} {unit} ({origin}: {why})"
@@ -53,6 +54,8 @@ def _readable(card: dict[str, object]) -> dict[str, object]:
 
 
 def _words(value: object) -> object:
+    if isinstance(value, dict) and "use" in value:
+        return "{name}: {use}; licence: {licence}".format(**value)
     if isinstance(value, dict):
         return "  ".join(f"{key} {part:.4g}" for key, part in value.items())
     return value
@@ -76,6 +79,7 @@ def model_card(model: "adapters.Model") -> dict[str, object]:
         "sites": sorted({key.split("/")[0] for key in origin.training_recordings}),
         "excluded_lists": list(origin.excluded_lists),
         "classifier": origin.classifier,
+        "sources": [asdict(one) for one in origin.sources],
         **_made_for(model),
         **_budgets(model),
         "thresholds": [
@@ -101,6 +105,7 @@ def _made_for(model: "adapters.Model") -> dict[str, object]:
     return {
         "array": domain.array,
         "microphones": len(domain.positions_m),
+        "spacing_mm": round(1e3 * float(nearest_spacings_m(domain.positions_m).mean()), 1),
         "extent_m": [round(extent, 3) for extent in domain.extent_m],
         "band_hz": list(domain.band_hz),
         "feature": domain.feature,

@@ -28,7 +28,7 @@ from worldstate.abduction.signature.ensemble_training import (
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable, Group
 from worldstate.adapters.files.acoustic_domain import ego_motion_of
-from worldstate.adapters.files.model_file import Model, Provenance
+from worldstate.adapters.files.model_file import DataSource, Model, Provenance
 from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError
@@ -302,6 +302,7 @@ def train_model(
         training_recordings=tuple(np.unique(table.recording_keys).tolist()),
         excluded_lists=tuple(excluded_lists),
         figures=_figures(table, levels[-1], settings.repeats),
+        sources=(DataSource(dataset, "coefficients"), DataSource(dataset, "thresholds")),
     )
     policies = _policies(table, signature, levels, settings)
     return Model(signature, policies, provenance, street=StreetModel())
