@@ -121,7 +121,7 @@ class Site:
     @property
     def renderer(self) -> str:
         """What carries sound: "paths", "rays" through drawn houses (TA1), "mirrors": smooth walls (MA1)."""
-        return _RENDERERS[self.name[0]] if _DRAWN.fullmatch(self.name) else "paths"
+        return renderer_named(self.name)
 
     @property
     def far_kerb_m(self) -> float:
@@ -152,6 +152,17 @@ class Site:
         x, y = eye_m
         reach = (ahead_m - x) / (self.corner_ahead_m - x)
         return y + (-self.corner_right_m - y) * reach, y + (self.corner_left_m - y) * reach
+
+
+def renderer_named(name: str) -> str:
+    """Return what carries the sound of a junction of this name.
+
+    Examples
+    --------
+    >>> renderer_named("SA1"), renderer_named("TA911"), renderer_named("MB1")
+    ('paths', 'rays', 'mirrors')
+    """
+    return _RENDERERS[name[0]] if _DRAWN.fullmatch(name) else "paths"
 
 
 def _check_name(name: str) -> None:

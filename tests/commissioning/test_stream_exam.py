@@ -31,6 +31,7 @@ from worldstate.commissioning.stream_exam import (
     alarm_outcomes,
     approaches,
     auroc_before,
+    exam_figures,
     examine,
     warned_before,
 )
@@ -63,7 +64,8 @@ def heard(vehicles: list[Vehicle], duration_s: float = 60.0, site: str = "SB1") 
     }
     names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
     columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * len(names)
-    hops = HopTable({"time_s": np.round(np.arange(1.0, duration_s, 0.1), 1)}, about={"site": site})
+    hop_s = np.round(np.arange(1.0, duration_s, 0.1), 1)
+    hops = HopTable({"time_s": hop_s, "bearing_rad": np.zeros(len(hop_s))}, about={"site": site})
     return HeardStream(hops, HopTable(told), HopTable(dict(zip(names, columns, strict=True))))
 
 
@@ -173,6 +175,18 @@ def test_figures_are_those_counted_by_hand() -> None:
     assert (figures["approaches_heavy"], figures["detected_heavy"]) == (1, 1.0)
     assert figures["lead_heavy_s"] == pytest.approx(2.9, abs=0.11)
     assert figures["lead_missed_as_0_s"] == pytest.approx(0.75 * float(figures["lead_s"] or 0.0))
+
+
+def test_each_renderer_has_figures_of_its_own() -> None:
+    """One that is easy must not hide another one that is not."""
+    found, missed = [(8.0, 12.0, 0)], list[tuple[float, float, int]]()
+    streams = [
+        examined(heard([("left", "light", "left", 12.0)], 30.0, site), spans)
+        for site, spans in (("SB1", found), ("TA911", missed), ("MB911", found), ("MA912", missed))
+    ]
+    figures = exam_figures(streams)
+    named = [figures[f"{name}detected"] for name in ("", "rays_", "mirrors_")]
+    assert named == [1.0, 0.0, 0.5] and figures["approaches"] == 1
 
 
 def test_the_worst_junction_stands_beside_the_mean() -> None:

@@ -24,7 +24,15 @@ from worldstate.ground import InvalidArgumentError
 from worldstate.ground.checks import check_ranges
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
-from worldstate.simulation.scene.junction import MOVING_SITES, SITES, Site, drawn_site, ego_moves, site
+from worldstate.simulation.scene.junction import (
+    MOVING_SITES,
+    SITES,
+    Site,
+    drawn_site,
+    ego_moves,
+    renderer_named,
+    site,
+)
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import rate_for
 from worldstate.simulation.stream.rendering import Block
@@ -240,6 +248,11 @@ class HeardStream:
     def site(self) -> str:
         """Name of the junction."""
         return str(self.hops.about["site"])
+
+    @property
+    def renderer(self) -> str:
+        """What carried its sound, as `Site.renderer` has it; recordings are with the first renderer."""
+        return renderer_named(self.site)
 
     @property
     def ego_moves(self) -> bool:

@@ -315,9 +315,27 @@ _COST_OF = {
 }
 
 
+_RENDERERS = ("paths", "rays", "mirrors")
+_OF_OTHERS = (
+    *("approaches", "detected", "advised_last_second", "advised_at_t0", "auroc_last_second"),
+    *("onsets_per_hour", "onsets_per_hour_worst_junction", "skill_2s"),
+)
+
+
 def exam_figures(streams: Sequence[ExaminedStream]) -> Figures:
-    """Return all that an exam tells of some streams, ready for a table and for JSON."""
-    return examine(streams) | in_view_bearings([one.heard for one in streams])
+    """Return the figures of an exam, ready for a table and for JSON.
+
+    Those of the first renderer have no prefix, and some of each other one have its name before them.
+    """
+    of = {
+        name: [one for one in streams if one.heard.renderer == name] for name in ("paths", "rays", "mirrors")
+    }
+    first = of.pop("paths")
+    found = examine(first) | in_view_bearings([one.heard for one in first])
+    for name, others in of.items():
+        figures = examine(others) if others else {}
+        found |= {f"{name}_{key}": figures[key] for key in _OF_OTHERS if others}
+    return found
 
 
 def beside_reference(report: Mapping[str, object]) -> dict[str, object]:

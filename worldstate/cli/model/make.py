@@ -161,7 +161,8 @@ def _made(
             )
         report |= stream_exam.exam_figures(examined)
         if arguments.figure is not None:
-            stream_exam.write_exam_figure(examined, arguments.figure)
+            first = [one for one in examined if one.heard.renderer == "paths"]
+            stream_exam.write_exam_figure(first, arguments.figure)
     if arguments.mounting_errors:
         heard = commission.exam_of_mountings(array, model, settings, folder, arguments.jobs)
         every = list(progress.track(heard, "mounting", len(heard_stream.mounting_streams(settings))))
