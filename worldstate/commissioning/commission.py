@@ -83,7 +83,7 @@ STREETS = DataSource(SIMULATED, "coefficients", "Apache-2.0: the simulation is a
 # Guard and road users; see what was chosen in `guard_training`.
 CHOSEN_ON = (
     DataSource("82 recordings of passing cars and trams", "thresholds"),
-    DataSource("394 clips of UrbanSound8K", "thresholds", "CC BY-NC 3.0"),
+    DataSource("195 recordings of buses and trams", "thresholds", "CC0-1.0"),
 )
 # Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
 HAZARD_FREE_SHARE = 120.0 / 192.0
@@ -300,7 +300,9 @@ def commission(
         learned("sounds near by")
         model = _with_ears(model, array, streams, recorded, settings, jobs, learned)
     named = [STREETS] if real is None else [STREETS, DataSource(source, "coefficients", licence)]
-    named += [] if recorded is None else [DataSource(recorded.told, "coefficients")]
+    named += (
+        [] if recorded is None else [DataSource(recorded.told, "coefficients", "; ".join(recorded.licences))]
+    )
     named += CHOSEN_ON if model.guard is not None else ()
     named += [DataSource(path.name, "thresholds") for path in quiet] or [replace(STREETS, use="thresholds")]
     named.append(replace(STREETS, use="exam"))
