@@ -80,7 +80,7 @@ def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten()
     learned = [
         LabelledStream.of(sequence_inputs(heard), truth) for heard, truth in (_stream(rng), _stream(rng))
     ]
-    model = train_sequence(learned, 5, Growth(8, 16))
+    model = train_sequence(learned, 5, Growth(8, 16, 0.2))
     fresh, coming_to = _stream(rng)
     others = [_stream(rng), _stream(rng)]
     margin_s = calibrated_margin_s([(model.posterior(heard), truth) for heard, truth in others])
@@ -125,7 +125,7 @@ def test_what_is_learned_does_not_depend_on_how_many_processes_learn(monkeypatch
     made_up = {id(street): _stream(rng, 600) for street in streets}
     monkeypatch.setattr(commission, "stream_evidence", lambda windows, street: made_up[id(street)][0])
     monkeypatch.setattr(commission, "stream_truth", lambda street: made_up[id(street)][1])
-    monkeypatch.setattr(commission, "STANDING", Growth(4, 6))
+    monkeypatch.setattr(commission, "STANDING", Growth(4, 6, 0.2))
     monkeypatch.setattr(commission, "_quiet_levels", levels_of_readings)
     one, two = (
         commission.learn_sequence(streets, lambda some: None, 30.0, np.random.default_rng(1), jobs)
