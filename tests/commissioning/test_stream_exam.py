@@ -18,7 +18,13 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.files.model_file import read_model
 from worldstate.belief.street_model import StreetModel
 from worldstate.commissioning import alarm_curve, commission
-from worldstate.commissioning.alarm_curve import LOUDEST, advised, measured_curve, raised_at
+from worldstate.commissioning.alarm_curve import (
+    LOUDEST,
+    advised,
+    budgets_elsewhere,
+    measured_curve,
+    raised_at,
+)
 from worldstate.commissioning.heard_stream import (
     CommissionSettings,
     HeardStream,
@@ -304,6 +310,14 @@ def test_a_budget_for_other_junctions_is_kept_by_those_left_out_and_is_that_of_r
     _, bound = get_r_hat_plus(worst, points, "crc", None, None, None)
     kept = find_best_predict_param(points, bound, np.array([1.0 / LOUDEST * (1.0 + 1e-9)]))[0]
     assert curve.default(rate).threshold_nats == curve.threshold_nats[int(kept)]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 60))
+def test_more_onsets_ask_for_no_smaller_budget_of_however_many_junctions(seed: int, junctions: int) -> None:
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(0.02, (junctions, 200)).cumsum(axis=1)
+    budgets = budgets_elsewhere(counts / rng.uniform(0.01, 0.3, (junctions, 1)))
+    assert (np.diff(budgets, prepend=0.0) >= 0.0).all()
 
 
 OF_A_MODEL = {

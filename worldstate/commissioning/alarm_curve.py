@@ -237,7 +237,9 @@ def budgets_elsewhere(worst: FloatArray) -> FloatArray:
     others = fewer.sum(axis=0) - np.concatenate([np.zeros((1, fewer.shape[1])), np.cumsum(fewer, axis=0)])
     left = junctions + 1 - LOUDEST * np.arange(1, junctions + 2)
     # Of two junctions nothing is cut off, and only what neither of them has is kept.
-    return np.asarray((others[left >= 0.0] / np.maximum(left[left >= 0.0, None], _LEAST)).min(axis=0))
+    least = (others[left >= 0.0] / np.maximum(left[left >= 0.0, None], _LEAST)).min(axis=0)
+    # More onsets ask for no smaller budget, but sums of many junctions are rounded.
+    return np.asarray(np.maximum.accumulate(np.maximum(least, 0.0)))
 
 
 def _variation(onsets: FloatArray, hours: FloatArray) -> float:

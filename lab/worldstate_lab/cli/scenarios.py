@@ -30,6 +30,7 @@ from worldstate.cli.common.progress import track
 from worldstate.commissioning.commission import parts_of
 from worldstate.commissioning.heard_stream import hear_stream, junction_named
 from worldstate.commissioning.stream_exam import approach_table
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray
 from worldstate.operations.metrics.approach_table import Figures, mean_of
 from worldstate.simulation.parallel import in_processes
@@ -79,18 +80,23 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     streams: dict[str, list[Followed]] = {}
     for settings, one in zip(plan, track(found, "following", len(plan)), strict=True):
         streams.setdefault(settings.traffic.name, []).append(one)
-    rows = {name: scenario_figures([*chain(*map(streams.get, SCENARIOS[name]))]) for name in names}
+    rows = {
+        name: scenario_figures([*chain.from_iterable(streams[one] for one in SCENARIOS[name])])
+        for name in names
+    }
     return CommandResult({"scenarios": rows}, table={}, lines=figure_lines(rows, ".3f"))
 
 
 def followed(settings: StreamSettings, model: Model, folder: Path) -> Followed:
     """Return a stream as the filter follows it, rendered unless it lies in the folder."""
+    if model.domain is None:
+        raise InvalidArgumentError("model: expected one that names its array, got one that names none")
     path, array = folder / f"{settings.name}-{settings.minutes:g}.npz", array_of(model.domain)
     if not path.is_file():
         hear_stream(settings, [array])[0].save(path)
     passed = passed_stream(path, model, "none")
     in_gust = np.zeros(len(passed.followed.time_s), bool)
-    for one in draw_sounds(settings, array.n_microphones, settings.generator(SOUNDS)):
+    for one in draw_sounds(settings, [array.n_microphones], settings.generator(SOUNDS)):
         since_s = passed.followed.time_s - one.start_s - one.sound.start_s
         in_gust |= (one.sound.kind == "wind") & (since_s > 0.0) & (since_s < one.sound.duration_s + WINDOW_S)
     return passed, in_gust
