@@ -60,7 +60,7 @@ def test_a_street_with_other_sounds_sets_no_threshold() -> None:
     pair = MicrophoneArray([[0.0, 0.3, 1.7], [0.0, -0.3, 1.7]])
     for name in ("empty", "music"):
         settings = StreamSettings(junction_named("SA101"), 0.2, 1, traffic_named(name), sample_rate_hz=6000.0)
-        kinds = set(street_rows(hear_stream(settings, pair)[0]).kinds.tolist())
+        kinds = set(street_rows(hear_stream(settings, [pair])[0]).kinds.tolist())
         assert kinds == ({"none"} if name == "empty" else {""})
     assert threshold_of([]) == -np.inf
 
