@@ -18,8 +18,9 @@ from .occluders import OccludingBody, box
 SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, in this order
 MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
 MAX_OCCLUDERS = 4
-_MOVING = re.compile(r"D([AB]\d+)")  # Named or drawn: where the ego moves at the place S..
-# By the first letter of a drawn site: TA1, MB917. All others are heard along the paths of their plan.
+# Named or drawn: where the ego moves at the place S.., T.. or M..; DA1, DTA101.
+_MOVING = re.compile(r"D([TM]?)([AB]\d+)")
+# By the first letter of a drawn place: TA1, MB917. All others are heard along the paths of their plan.
 _RENDERERS = {"T": "rays", "M": "mirrors"}
 _DRAWN = re.compile(r"[TM][AB]\d{1,6}")
 # The fits want smooth side walls, and a rough one opposite: shop fronts, doors, parked bicycles.
@@ -159,10 +160,11 @@ def renderer_named(name: str) -> str:
 
     Examples
     --------
-    >>> renderer_named("SA1"), renderer_named("TA911"), renderer_named("MB1")
-    ('paths', 'rays', 'mirrors')
+    >>> [renderer_named(name) for name in ("SA1", "DA1", "TA911", "DMB1")]
+    ['paths', 'paths', 'rays', 'mirrors']
     """
-    return _RENDERERS[name[0]] if _DRAWN.fullmatch(name) else "paths"
+    place = standing_name(name)
+    return _RENDERERS[place[0]] if _DRAWN.fullmatch(place) else "paths"
 
 
 def _check_name(name: str) -> None:
@@ -179,7 +181,8 @@ def site(name: str) -> Site:
     Parameters
     ----------
     name : str
-        One of `SITES` or `MOVING_SITES`, or TA1, TB1, ... and MA1, ... of the other renderers.
+        One of `SITES` or `MOVING_SITES`, or TA1, TB1, ... and MA1, ... of the other renderers; DTA1 and DMA1
+        are these places with an ego that moves.
 
     Returns
     -------
@@ -196,8 +199,8 @@ def site(name: str) -> Site:
     >>> site("SB1").opposite_wall_m is None, site("SA2") == site("SA2")
     (True, True)
     """
-    if name in MOVING_SITES:
-        return replace(site("S" + name[1:]), name=name)
+    if ego_moves(name):
+        return replace(site(standing_name(name)), name=name)
     if not _DRAWN.fullmatch(name):
         one_of("site", name, (*SITES, *MOVING_SITES, "TA1", "TB1", "MA1", "MB1"))
     return PLANS[name] if name in PLANS else drawn_site(name)
@@ -253,10 +256,22 @@ def ego_moves(name: str) -> bool:
 
     Examples
     --------
-    >>> [ego_moves(name) for name in ("SA1", "DA1", "DB101")]
-    [False, True, True]
+    >>> [ego_moves(name) for name in ("SA1", "DA1", "DB101", "DTA101")]
+    [False, True, True, True]
     """
     return _MOVING.fullmatch(name) is not None
+
+
+def standing_name(name: str) -> str:
+    """Return the name of the same place for an ego that stands there.
+
+    Examples
+    --------
+    >>> [standing_name(name) for name in ("DA1", "DTA101", "MB203")]
+    ['SA1', 'TA101', 'MB203']
+    """
+    found = _MOVING.fullmatch(name)
+    return (found[1] or "S") + found[2] if found else name
 
 
 def drawn_site(name: str) -> Site:
@@ -269,10 +284,12 @@ def drawn_site(name: str) -> Site:
     >>> drawn_site("DA101") == replace(drawn_site("SA101"), name="DA101")  # there the ego moves
     True
     """
+    if ego_moves(name):
+        return replace(drawn_site(standing_name(name)), name=name)
     rng = site_generator(name)
     if _DRAWN.fullmatch(name):
         return _wider_site(name, rng)
-    with_wall = name[:2] in ("SA", "DA")
+    with_wall = name[:2] == "SA"
     ahead, corners = rng.uniform(4.5, 5.2), rng.uniform(2.3, 3.1, 2)
     walls = corners - rng.uniform(0.1, 0.7, 2)
     begins = rng.uniform(-1.5, 1.2, 2)
@@ -321,8 +338,7 @@ def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:
     >>> site_generator("SA1").random() == site_generator("SA1").random()
     True
     """
-    place = _MOVING.sub(r"S\1", name) if ego_moves(name) else name
-    digest = hashlib.sha256(f"worldstate {place} {purpose}".encode()).digest()
+    digest = hashlib.sha256(f"worldstate {standing_name(name)} {purpose}".encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:8], "little"))
 
 

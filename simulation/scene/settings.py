@@ -12,7 +12,7 @@ import numpy as np
 from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import check_ranges, finite_array, in_range, one_of
 
-from .junction import MOVING_SITES, Site, Way, place_of, site
+from .junction import Site, Way, ego_moves, place_of, site
 from .kinds import FLAT, Octaves, VehicleKind, vehicle_kind
 from .presets import Preset, preset, site_ambience
 from .vehicle import EgoMotion, along
@@ -417,7 +417,7 @@ def draw_settings(
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
         parked_car=bool(rng.random() < 0.3) and known is None,
         kind=kind,
-        ego=_draw_ego(rng, duration_s) if site_name in MOVING_SITES else EgoMotion(),
+        ego=_draw_ego(rng, duration_s) if ego_moves(site_name) else EgoMotion(),
         preset=levels,
     )
     way = None if known is None else known.drawn_way(approach, rng)

@@ -25,7 +25,7 @@ from worldstate.simulation.scene.presets import Ambience
 from .background import Town, direction_numbers
 from .delay import Emission
 from .diffraction import air_gain, corner_gain, ground_gain
-from .receiver import Receiver, add_to_all
+from .receiver import Passed, Receiver, add_to_all, passed_places
 from .static_field import PlacedSource, StreetSound
 
 ORDERS = 10  # reflections that are followed
@@ -34,6 +34,7 @@ FADE_M = 1.0  # of a source's way over which an image appears: the first Fresnel
 FAINTEST = 0.03  # of the amplitude of the loudest: an image below it is left out
 NARROWEST_RAD = 1e-5  # of a beam
 BESIDE_M = 0.01  # a corner is reached where a point so far beside it is
+PLACES_M = 1.0  # along the way of an ego that moves, between which the beams of two places are blended
 EVERY = 4  # knots, for gains of corners change slowly
 DIRECTIONS, SKY_SHARE, LOUDER_DB = 36, (0.1, 0.9), (-8.0, 2.0)
 OWN_STREET_M, ARM_M = (10.0, 60.0), (20.0, 90.0)  # how far walls go on behind the ego, and along an arm
@@ -217,7 +218,7 @@ def _side(fronts: Fronts, wall: int, apex_m: FloatArray) -> FloatArray:
     return np.asarray(line * np.sign(line @ [*apex_m, 1.0]))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def images_at(site: Site, x_m: float, y_m: float) -> Images:
     """Follow the beams from a place of a site once."""
     return trace(drawn_fronts(site), np.array([x_m, y_m]))
@@ -234,26 +235,40 @@ class Way:
     number: int  # The image of the microphones where it ends
     height_m: float  # Of the source
 
-    def length_m(self, position_m: FloatArray, span: slice = slice(None)) -> FloatArray:
-        """Length to a position (3,) at some of the knots."""
-        last = np.hypot(*(self.from_m - self.images.of(self.number, position_m)[:, None]))
-        return np.asarray(np.hypot(self.before_m + last, position_m[2] - self.height_m)[span])
+    def length_m(self, position_m: FloatArray, ego_x_m: float | FloatArray = 0.0) -> FloatArray:
+        """Length to a position (3,) on an ego at `ego_x_m` (T,)."""
+        ahead = self.images.mirror[self.number, :2, :1] * ego_x_m
+        last = np.hypot(*(self.from_m - self.images.of(self.number, position_m)[:, None] - ahead))
+        return np.asarray(np.hypot(self.before_m + last, position_m[2] - self.height_m))
 
 
 def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
     """Add a moving or standing source by all its images, and by the waves that both corners diffract."""
-    receiver, centre = street.receiver, street.receiver.centre_m
+    receiver = street.receiver
     emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
-    ways = ways_of(street.site, source, centre)
+    _, heard_x = source.straight_m(receiver.centre_m, receiver)
+    for place in passed_places(heard_x, PLACES_M):
+        _add_near(street, source.during(place.span), emission, place)
+
+
+def _add_near(street: StreetSound, source: PlacedSource, emission: Emission, place: Passed) -> None:
+    """Add what is heard of a source while the ego is near a place; lengths are those of the ego's way."""
+    receiver, centre = street.receiver, street.receiver.centre_m + np.array([place.x_m, 0.0, 0.0])
+    ways, whole = ways_of(street.site, source, centre), np.zeros((len(emission.knots_s), len(OCTAVES_HZ)))
     lengths = [way.length_m(centre) for way in ways]
     loud = np.array([way.gain[:, 3] / length for way, length in zip(ways, lengths, strict=True)])
     for way, length, level in zip(ways, lengths, loud, strict=True):
         road = ground_gain(length, source.height_m, float(centre[2]))
-        audible = level > FAINTEST * loud.max(axis=0)
-        made = emission.table(way.gain * air_gain(length) * road * audible[:, None])
+        share = place.share * (level > FAINTEST * loud.max(axis=0))
+        whole[place.span] = way.gain * air_gain(length) * road * share[:, None]
+        made = emission.table(whole, receiver.beyond_knots)
         if made is not None:
             table, span = made
-            travel = partial(way.length_m, span=span)
+            near = slice(span.start - place.span.start, span.stop - place.span.start)
+
+            def travel(position: FloatArray, way: Way = way, near: slice = near) -> FloatArray:
+                return receiver.arrivals(source.time_s, partial(way.length_m, position))[0][near]
+
             add_to_all(street.static.out, table, emission.knots_s[span], travel, receiver)
 
 

@@ -13,7 +13,8 @@ uniform geometrical theory of diffraction for an edge in a perfectly conducting 
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import product
 
 import numpy as np
 import scipy
@@ -26,7 +27,7 @@ from worldstate.simulation.scene.presets import Ambience
 from .background import Town, direction_numbers
 from .delay import Emission, SampledSignal
 from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS, corner_gain
-from .receiver import Receiver, add_along, add_to_all
+from .receiver import Receiver, add_along, add_to_all, passed_places
 from .static_field import PlacedSource, StreetSound, plane_wave_delays, unit_vectors
 
 RAYS, BOUNCES, STEP_M = 100_000, 40, 1.0
@@ -115,25 +116,28 @@ def azimuths_rad() -> FloatArray:
     return -np.pi + (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS
 
 
-@lru_cache(maxsize=8)
-def reached(site: Site, height_m: float) -> Reached:
-    """Trace the rays of a site once."""
-    return trace(drawn_houses(site), height_m, site_generator(site.name, "rays"))
+@lru_cache(maxsize=40)  # All places of a drive
+def reached(site: Site, height_m: float, x_m: float = 0.0) -> Reached:
+    """Trace the rays of a site once, from the stop or from another place on the way there."""
+    rays = RAYS if x_m == 0.0 else RAYS // 4
+    return trace(drawn_houses(site), height_m, site_generator(site.name, "rays"), rays, x_m)
 
 
-def _reached_by(receiver: Receiver, site: Site) -> Reached:
-    return reached(site, round(float(receiver.centre_m[2]), 3))
+def _reached_by(receiver: Receiver, site: Site, x_m: float = 0.0) -> Reached:
+    return reached(site, round(float(receiver.centre_m[2]), 3), x_m)
 
 
-def trace(houses: Houses, height_m: float, rng: np.random.Generator, rays: int = RAYS) -> Reached:
-    r"""Send rays from the array at the origin, so high, and collect what they leave in the plan.
+def trace(
+    houses: Houses, height_m: float, rng: np.random.Generator, rays: int = RAYS, x_m: float = 0.0
+) -> Reached:
+    r"""Send rays from the array at (x, 0), so high, and collect what they leave in the plan.
 
     .. math:: p^2(\text{cell}, \text{direction}) = 4 \pi \frac{\sum E\, l}{V}
 
     of rays that left in this direction, l metres of which lie in the cell of volume V; the road mirrors, and
     source levels stand over hard ground already.
     """
-    going = _launched(height_m, rays, rng)
+    going = _launched(height_m, rays, rng, x_m)
     shape = (*(round((high - low) / CELL_M) for low, high in PLAN_M), DIRECTIONS, len(OCTAVES_HZ))
     left, early, out = np.zeros(shape), np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     lengths, heard = [], []
@@ -169,13 +173,13 @@ class _Rays:
     energy: FloatArray  # shape (n, 8)
 
 
-def _launched(height_m: float, count: int, rng: np.random.Generator) -> _Rays:
+def _launched(height_m: float, count: int, rng: np.random.Generator, x_m: float) -> _Rays:
     """Send rays from the array into all azimuths, and elevations up to the steepest, alike."""
     azimuth = rng.uniform(-np.pi, np.pi, count)
     sine = rng.uniform(-STEEPEST, STEEPEST, count)
     return _Rays(
         direction_numbers(azimuth, DIRECTIONS),
-        np.zeros((count, 2)),
+        np.tile([x_m, 0.0], (count, 1)),
         np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1),
         np.full(count, height_m),
         np.asarray(sine / np.sqrt(1.0 - sine**2)),
@@ -274,11 +278,12 @@ def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generat
     """Add a moving or standing source by all that rays found, round both corners, over roofs, straight."""
     static, site, receiver = street.static, street.site, street.receiver
     emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
-    lit, length = _lit(site, source), _way_m(site, source)
-    ways = [*_echoes(source, site, receiver, rng), *_edges(source, site, receiver, lit)]
+    length, heard_x = receiver.arrivals(source.time_s, partial(_way_m, site, source))
+    lit = _lit(site, source, heard_x)
+    ways = [*_echoes(source, street, heard_x, rng), *_edges(source, street, heard_x, lit)]
     waves = np.zeros((len(ways), receiver.samples), np.float32)
     for wave, way in zip(waves, ways, strict=True):
-        made = emission.table(way.gain * length[:, None])
+        made = emission.table(way.gain * length[:, None], receiver.beyond_knots)
         if made is not None:
             table, span = made
             if way.early < 1.0:
@@ -303,10 +308,17 @@ class _Way:
     later_m: float = 0.0  # Beyond the way by the mouth
 
 
-def _echoes(source: PlacedSource, site: Site, receiver: Receiver, rng: np.random.Generator) -> list[_Way]:
-    """Return the directions from which rays came."""
-    here = _reached_by(receiver, site)
-    energy = _at(here.energy, source.x_m, source.y_m)
+def _echoes(
+    source: PlacedSource, street: StreetSound, heard_x_m: FloatArray, rng: np.random.Generator
+) -> list[_Way]:
+    """Return the directions from which rays came; between two places their energy is blended."""
+    energy = np.zeros((len(heard_x_m), DIRECTIONS, len(OCTAVES_HZ)))
+    early, decay_s = np.zeros(DIRECTIONS), 0.0
+    for place in passed_places(heard_x_m, CELL_M):
+        here = _reached_by(street.receiver, street.site, place.x_m)
+        near, part = source.during(place.span), float(place.share.sum()) / len(energy)
+        energy[place.span] += place.share[:, None, None] * _at(here.energy, near.x_m, near.y_m)
+        early, decay_s = early + part * here.early, decay_s + part * here.decay_s
     loud = energy.sum(axis=2).max(axis=0)
     # Echoes do not come all at once.
     return [
@@ -314,23 +326,26 @@ def _echoes(source: PlacedSource, site: Site, receiver: Receiver, rng: np.random
             azimuths_rad()[k],
             abs(ELEVATION_RAD * rng.standard_normal()),
             np.sqrt(energy[:, k]),
-            float(here.early[k]),
-            here.decay_s,
+            float(early[k]),
+            decay_s,
             rng.exponential(LATER_M),
         )
         for k in np.flatnonzero(loud > FAINTEST * loud.max())
     ]
 
 
-def _edges(source: PlacedSource, site: Site, receiver: Receiver, lit: FloatArray) -> list[_Way]:
+def _edges(source: PlacedSource, street: StreetSound, heard_x_m: FloatArray, lit: FloatArray) -> list[_Way]:
     """Return the ways round both corners and over the nearest roof, of a source that is not seen."""
-    x, y, ways = source.x_m, source.y_m, []
-    for across in (site.corner_left_m, -site.corner_right_m):
-        place = site.corner_ahead_m, across
-        gain = corner_gain(place, x, y) * ((1.0 - lit) * (np.sign(y) == np.sign(across)))[:, None]
-        ways.append(_Way(float(np.arctan2(*place[::-1])), 0.0, gain))
-    middle = len(x) // 2
-    over = _roof_gain(source, receiver) * (1.0 - lit)[:, None]
+    site, ways, dark = street.site, list[_Way](), 1.0 - lit
+    corners = site.corner_left_m, -site.corner_right_m
+    for place, across in product(passed_places(heard_x_m, CELL_M), corners):
+        near, corner = source.during(place.span), (site.corner_ahead_m - place.x_m, across)
+        share = place.share * dark[place.span] * (np.sign(near.y_m) == np.sign(across))
+        gain = np.zeros((len(dark), len(OCTAVES_HZ)))
+        gain[place.span] = corner_gain(corner, near.x_m - place.x_m, near.y_m) * share[:, None]
+        ways.append(_Way(float(np.arctan2(*corner[::-1])), 0.0, gain))
+    x, y, middle = source.x_m - heard_x_m, source.y_m, len(dark) // 2
+    over = _roof_gain(np.hypot(x, y), source.height_m, street.receiver) * dark[:, None]
     return [*ways, _Way(float(np.arctan2(y[middle], x[middle])), ROOF_RAD, over)]
 
 
@@ -344,20 +359,18 @@ def _add_straight(
     table, span = made
 
     def travel(position: FloatArray) -> FloatArray:
-        rise = position[2] - source.height_m
-        flat = np.hypot(source.x_m[span] - position[0], source.y_m[span] - position[1])
-        return np.asarray(np.hypot(flat, rise))
+        return source.straight_m(position, receiver)[0][span]
 
     add_to_all(out, table, emission.knots_s[span], travel, receiver)
 
 
-def _roof_gain(source: PlacedSource, receiver: Receiver) -> FloatArray:
+def _roof_gain(way_m: FloatArray, height_m: float, receiver: Receiver) -> FloatArray:
     r"""Amplitude over the nearest roof, shape (T, 8): ISO 9613-2, eq. (14), a thin screen, at most 20 dB.
 
     .. math:: D = 10 \log_{10}(3 + 20 z / \lambda)
     """
-    away = np.maximum(np.hypot(source.x_m, source.y_m), 2.0 * ROOF_M[0])
-    low, high = (ROOF_M[1] - height for height in (float(receiver.centre_m[2]), source.height_m))
+    away = np.maximum(way_m, 2.0 * ROOF_M[0])
+    low, high = (ROOF_M[1] - height for height in (float(receiver.centre_m[2]), height_m))
     detour = np.hypot(ROOF_M[0], low) + np.hypot(away - ROOF_M[0], max(high, 0.0)) - away
     loss = 10.0 * np.log10(3.0 + 20.0 * detour[:, None] * OCTAVES_HZ / SPEED_OF_SOUND_MPS)
     return np.asarray(10.0 ** (-np.minimum(loss, 20.0) / 20.0) / away[:, None])
@@ -366,19 +379,20 @@ def _roof_gain(source: PlacedSource, receiver: Receiver) -> FloatArray:
 ROOF_M, ROOF_RAD = (6.0, 8.0), 0.5  # how far away and how high it is, and how steep sound comes from there
 
 
-def _lit(site: Site, source: PlacedSource) -> FloatArray:
+def _lit(site: Site, source: PlacedSource, heard_x_m: FloatArray) -> FloatArray:
     """1 where the array sees a source, 0 where a corner is before it, shape (T,)."""
-    right, left = site.sights_m(np.maximum(source.x_m, site.corner_ahead_m), (0.0, 0.0))
+    right, left = site.sights_m(np.maximum(source.x_m, site.corner_ahead_m), (heard_x_m, 0.0))
     inside = np.minimum(left - source.y_m, source.y_m - right)
     return np.clip(0.5 + inside / LIT_BLEND_M, 0.0, 1.0) ** 2
 
 
-def _way_m(site: Site, source: PlacedSource) -> FloatArray:
+def _way_m(site: Site, source: PlacedSource, ego_x_m: FloatArray) -> FloatArray:
     """Way from above by the middle of the mouth where a source is beside it, shape (T,)."""
     wide = min(site.corner_left_m, site.corner_right_m)
     over = np.sign(source.y_m) * np.minimum(np.abs(source.y_m), wide)
     return np.asarray(
-        np.hypot(source.x_m - site.corner_ahead_m, source.y_m - over) + np.hypot(site.corner_ahead_m, over)
+        np.hypot(source.x_m - site.corner_ahead_m, source.y_m - over)
+        + np.hypot(site.corner_ahead_m - ego_x_m, over)
     )
 
 

@@ -1,6 +1,6 @@
 """Microphones that stand or move, and what sound meets on its way to them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +18,7 @@ from .diffraction import SPEED_OF_SOUND_MPS
 
 NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
 ARRIVAL_ROUNDS = 4
+BEYOND = 2  # With one the first block is left out, and what fades in at a place begins with a step
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +51,11 @@ class Receiver:
         offsets = np.linalg.norm(self.positions_m - self.centre_m, axis=1) / SPEED_OF_SOUND_MPS
         return int(np.ceil((offsets + np.abs(self.skew_s)).max() * self.sample_rate_hz / KNOT_SAMPLES)) + 1
 
+    @property
+    def beyond_knots(self) -> int:
+        """Knots before and after what is heard; for a standing ego the one with which presets were set."""
+        return 1 if self.ego.stands else BEYOND
+
     def above(self, height_m: float) -> float:
         """Height of the array's centre above a source."""
         return float(self.centre_m[2]) - height_m
@@ -68,6 +74,34 @@ class Receiver:
             x = self.ego.x_m(emit_s + length / SPEED_OF_SOUND_MPS)
             length = length_m(x)
         return length, x
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passed:
+    """A place on the way of the ego, and the emission knots of what is heard near it."""
+
+    x_m: float
+    span: slice  # With `BEYOND` knots more at either end than are heard there
+    share: FloatArray  # shape (span,): 1 at the place, 0 at the next one and beyond, straight in between
+
+
+def passed_places(heard_x_m: FloatArray, step_m: float) -> Iterator[Passed]:
+    """Yield the places, evenly spaced, near which an ego at `heard_x_m` (T,) is when a source arrives.
+
+    The shares of all places add up to one at every knot, so that gains of places blend without a step.
+
+    Examples
+    --------
+    >>> [(one.x_m, one.share.tolist()) for one in passed_places(np.array([-2.0, -1.5, 0.0]), 2.0)]
+    [(-2.0, [1.0, 0.75, 0.0]), (0.0, [0.0, 0.25, 1.0])]
+    """
+    at = heard_x_m / step_m
+    for number in range(int(np.floor(at.min())), int(np.ceil(at.max())) + 1):
+        share = np.maximum(1.0 - np.abs(at - number), 0.0)
+        near = np.flatnonzero(share)
+        if len(near):
+            span = slice(max(int(near[0]) - BEYOND, 0), int(near[-1]) + 1 + BEYOND)
+            yield Passed(step_m * number, span, share[span])
 
 
 def standing_m(array: MicrophoneArray) -> FloatArray:

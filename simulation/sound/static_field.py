@@ -6,7 +6,8 @@ from the spectra, once per microphone however many sources there are: sources ar
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
@@ -17,7 +18,7 @@ from worldstate.simulation.scene.presets import Preset
 
 from .delay import KNOT_SAMPLES
 from .diffraction import SPEED_OF_SOUND_MPS
-from .receiver import Receiver
+from .receiver import Receiver, distance_m
 
 BLOCK = 4096
 HOP = BLOCK // 2
@@ -164,6 +165,15 @@ class PlacedSource:
     x_m: FloatArray  # shape (T,)
     y_m: FloatArray
     height_m: float
+
+    def straight_m(self, position_m: FloatArray, receiver: Receiver) -> tuple[FloatArray, FloatArray]:
+        """Way to a position (3,) on the ego and where the ego is when sound arrives, shape (T,) each."""
+        place = np.stack([self.x_m, self.y_m, np.full(len(self.x_m), self.height_m)])
+        return receiver.arrivals(self.time_s, partial(distance_m, place, offset_m=position_m))
+
+    def during(self, span: slice) -> "PlacedSource":
+        """Return it at some of its knots."""
+        return replace(self, time_s=self.time_s[span], x_m=self.x_m[span], y_m=self.y_m[span])
 
 
 def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Generator) -> None:

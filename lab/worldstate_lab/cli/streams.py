@@ -50,6 +50,7 @@ from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.metrics.approach_table import ApproachTable, Figures
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.simulation.parallel import in_processes
+from worldstate.simulation.scene.junction import standing_name
 from worldstate_lab.passes.budget_days import budget_days
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
 from worldstate_lab.passes.pass_outcomes import (
@@ -142,9 +143,9 @@ def promised_and_found(
 ) -> dict[str, Figures]:
     """Return what the curve promises at some budgets and shares, and what the streams of each renderer have.
 
-    The first letter of a junction's name is its renderer's. A found rate has its exact Poisson interval.
+    The first letter of a place's name is its renderer's. A found rate has its exact Poisson interval.
     """
-    rows, groups = dict[str, Figures](), {name[0] for name in levels}
+    rows, groups = dict[str, Figures](), {standing_name(name)[0] for name in levels}
     asked = [("budget", one) for one in BUDGETS] + [("alpha", one) for one in ALPHAS]
     for name, value in asked:
         try:
@@ -155,7 +156,8 @@ def promised_and_found(
         row: Figures = {"threshold_nats": alarm.threshold_nats}
         row |= {} if alarm.promise is None else asdict(alarm.promise)
         for group in sorted(groups):
-            some = [one for site, streams in levels.items() if site[0] == group for one in streams]
+            here = [streams for site, streams in levels.items() if standing_name(site)[0] == group]
+            some = [one for streams in here for one in streams]
             false = ApproachTable([], [raised_at(one, alarm.threshold_nats) for one in some]).false_alarms()
             names = ("onsets_per_hour", "onsets_low", "onsets_high", "hazard_free_share")
             row |= {f"{group}: {figure}": false[figure] for figure in names}
