@@ -1,6 +1,7 @@
 """An exam of made-up streams, counted by hand: who is detected, when, on which side, and what alarms cost."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -438,13 +439,18 @@ def test_a_model_learns_each_flow_in_weather_that_varies_and_is_examined_in_the_
 def test_a_moving_ego_drives_again_and_again_and_no_drive_is_another() -> None:
     chosen = CommissionSettings(moving_ego=True, junctions=3, approach_minutes=1.5, hazard_free_minutes=1.0)
     learned, exam = learned_streams(chosen), exam_streams(chosen)
-    assert {one.site.name for one in exam} == {"DA1", "DA2", "DB1", "DB2", "DB3"}
-    assert not any(one.ego.stands for one in learned)
+    others = {f"D{letter}{plan}" for letter in "TM" for plan in ("A911", "B911", "A912", "B912", "A913")}
+    assert {one.site.name for one in exam} == {"DA1", "DA2", "DB1", "DB2", "DB3"} | others
+    assert not any(one.ego.stands for one in (*learned, *exam))
+    for streams in (learned, exam):
+        drives = Counter((one.site.renderer, one.traffic.name) for one in streams)
+        for traffic in ("approaches", "no-hazard"):
+            assert len({drives[renderer, traffic] for renderer in ("paths", "rays", "mirrors")}) == 1
     minutes = {
         traffic: sum(one.minutes for one in learned if one.traffic.name == traffic)
         for traffic in ("approaches", "no-hazard")
     }
-    assert minutes == {"approaches": pytest.approx(4.5), "no-hazard": pytest.approx(3.0)}
+    assert minutes == {"approaches": pytest.approx(3 * 4.5), "no-hazard": pytest.approx(3 * 3.0)}
     # A seed is shared by an approach and a hazard-free drive, which are different traffic.
-    assert len({one.seed for one in learned}) == 3 * 5
+    assert len({one.seed for one in learned}) == 3 * 3 * 5
     assert not {one.seed for one in learned} & {one.seed for one in exam}

@@ -65,7 +65,7 @@ class CommissionSettings:
     ----------
     junctions : int
         Drawn junctions of each renderer to learn from, half with a wall across the crossing street; with few,
-        a model learns these streets instead of streets. A moving ego has those of the first renderer.
+        a model learns these streets instead of streets.
     approach_minutes, hazard_free_minutes : float
         Stream at each of them.
     exam_minutes : float
@@ -123,45 +123,40 @@ def quick_settings(settings: CommissionSettings) -> CommissionSettings:
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams that a model learns from: drawn junctions, none of the five with a name.
 
-    For an ego that stands as many of each renderer, none of which outweighs the others.
+    As many of each renderer, none of which outweighs the others.
     """
     plans = {i: f"{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
-    approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
-    if settings.moving_ego:
-        names = {i: f"D{plan}" for i, plan in plans.items()}
-        return _streams(names, LEARNED_SEED, _usual(approaching, quiet, settings), settings)
-    found: list[StreamSettings] = []
-    for (letter, first), (i, plan) in product(RENDERERS.items(), plans.items()):
-        without = MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
-        name = {first + i: f"{letter}{plan}"}
-        found += _streams(name, LEARNED_SEED, {TOWN: approaching, without: quiet}, settings)
-    return [replace(one, preset=preset(LEARNED_PRESET)) for one in found]
+    minutes, found = (settings.approach_minutes, settings.hazard_free_minutes), list[StreamSettings]()
+    for letter, (i, plan) in product(RENDERERS, plans.items()):
+        traffics = TOWN, MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
+        if settings.moving_ego:
+            traffics = APPROACHES, HAZARD_FREE
+        name, minutes_of = _numbered(letter, {i: plan}, settings), dict(zip(traffics, minutes, strict=True))
+        found += _streams(name, LEARNED_SEED, minutes_of, settings)
+    # The noise of a moving ego was set beside the levels of the preset that is usual.
+    return found if settings.moving_ego else [replace(one, preset=preset(LEARNED_PRESET)) for one in found]
 
 
-def _usual(
-    approach_minutes: float, hazard_free_minutes: float, settings: CommissionSettings
-) -> dict[str, float]:
-    hazards = APPROACHES if settings.moving_ego else PAIRS
-    return {hazards: approach_minutes, HAZARD_FREE: hazard_free_minutes}
+def _numbered(letter: str, plans: Mapping[int, str], settings: CommissionSettings) -> dict[int, str]:
+    """Return the junctions of a renderer, by numbers of its own."""
+    prefix = "D" + letter.removeprefix("S") if settings.moving_ego else letter
+    return {RENDERERS[letter] + i: prefix + plan for i, plan in plans.items()}
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams of an exam: the five junctions with a name, twenty singles of each and more.
 
-    For an ego that stands, five junctions of each of the other renderers for a third of the time.
+    Five junctions of each of the other renderers too, of an ego that stands for a third of the time.
     """
     names = {i: name for i, name in enumerate(settings.sites) if i == MOUNTING or not settings.quick}
-    minutes = _usual(0.6 * settings.exam_minutes, settings.exam_minutes, settings)
+    hazards = APPROACHES if settings.moving_ego else PAIRS
+    minutes = {hazards: 0.6 * settings.exam_minutes, HAZARD_FREE: settings.exam_minutes}
     found = _streams(names, EXAM_SEED, minutes, settings)
-    if settings.moving_ego or settings.quick:
+    if settings.quick:
         return found
-    others = {
-        first + i: letter + plan
-        for letter, first in RENDERERS.items()
-        for i, plan in enumerate(EXAM_OTHERS)
-        if letter != "S"
-    }
-    return found + _streams(others, EXAM_SEED, {name: one / 3.0 for name, one in minutes.items()}, settings)
+    others = [_numbered(letter, dict(enumerate(EXAM_OTHERS)), settings) for letter in "TM"]
+    part = {name: one / (1.0 if settings.moving_ego else 3.0) for name, one in minutes.items()}
+    return found + [stream for names in others for stream in _streams(names, EXAM_SEED, part, settings)]
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
