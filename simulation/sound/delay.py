@@ -178,15 +178,15 @@ class Emission:
         """Emission times of the knots, shape (K + 1,)."""
         return self.start_s + np.arange(len(self.bands) + 1) * KNOT_SAMPLES / self.sample_rate_hz
 
-    def table(self, gain: FloatArray, beyond: int = 1) -> tuple[SampledSignal, slice] | None:
+    def table(self, gain: FloatArray, *, fades: bool = False) -> tuple[SampledSignal, slice] | None:
         """Add up the bands, weighted by gains (K + 1, 8) at the knots, over the span where any is not 0.
 
-        A block that is heard in part is left out: what fades in must begin two knots before.
+        A block that is heard in part is left out: what `fades` in has a knot more before and after it.
         """
         loud = np.flatnonzero(gain.max(axis=1) > 0.0)
         if not len(loud):
             return None
-        first, last = max(loud[0] - beyond, 0), min(loud[-1] + 1 + beyond, len(gain))
+        first, last = max(loud[0] - 1 - fades, 0), min(loud[-1] + 2 + fades, len(gain))
         span = slice(first, last)
         ends = gain[span].astype(np.float32)
         both = np.matmul(np.stack([ends[:-1], np.diff(ends, axis=0)], axis=1), self.bands[first : last - 1])

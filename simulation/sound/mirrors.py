@@ -25,7 +25,7 @@ from worldstate.simulation.scene.presets import Ambience
 from .background import Town, direction_numbers
 from .delay import Emission
 from .diffraction import air_gain, corner_gain, ground_gain
-from .receiver import Passed, Receiver, add_to_all, passed_places
+from .receiver import Receiver, add_to_all, passed_places
 from .static_field import PlacedSource, StreetSound
 
 ORDERS = 10  # reflections that are followed
@@ -248,28 +248,31 @@ def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Gener
     emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
     _, heard_x = source.straight_m(receiver.centre_m, receiver)
     for place in passed_places(heard_x, PLACES_M):
-        _add_near(street, source.during(place.span), emission, place)
+        _add_near(street, source.during(place[1]), emission, *place)
 
 
-def _add_near(street: StreetSound, source: PlacedSource, emission: Emission, place: Passed) -> None:
+def _add_near(
+    street: StreetSound, source: PlacedSource, emission: Emission, x_m: float, span: slice, share: FloatArray
+) -> None:
     """Add what is heard of a source while the ego is near a place; lengths are those of the ego's way."""
-    receiver, centre = street.receiver, street.receiver.centre_m + np.array([place.x_m, 0.0, 0.0])
+    receiver, centre = street.receiver, street.receiver.centre_m + np.array([x_m, 0.0, 0.0])
     ways, whole = ways_of(street.site, source, centre), np.zeros((len(emission.knots_s), len(OCTAVES_HZ)))
     lengths = [way.length_m(centre) for way in ways]
     loud = np.array([way.gain[:, 3] / length for way, length in zip(ways, lengths, strict=True)])
     for way, length, level in zip(ways, lengths, loud, strict=True):
         road = ground_gain(length, source.height_m, float(centre[2]))
-        share = place.share * (level > FAINTEST * loud.max(axis=0))
-        whole[place.span] = way.gain * air_gain(length) * road * share[:, None]
-        made = emission.table(whole, receiver.beyond_knots)
+        audible = share * (level > FAINTEST * loud.max(axis=0))
+        whole[span] = way.gain * air_gain(length) * road * audible[:, None]
+        # A standing ego's sound begins as that with which presets were set.
+        made = emission.table(whole, fades=not receiver.ego.stands)
         if made is not None:
-            table, span = made
-            near = slice(span.start - place.span.start, span.stop - place.span.start)
+            table, part = made
+            near = slice(part.start - span.start, part.stop - span.start)
 
             def travel(position: FloatArray, way: Way = way, near: slice = near) -> FloatArray:
                 return receiver.arrivals(source.time_s, partial(way.length_m, position))[0][near]
 
-            add_to_all(street.static.out, table, emission.knots_s[span], travel, receiver)
+            add_to_all(street.static.out, table, emission.knots_s[part], travel, receiver)
 
 
 def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]:

@@ -283,7 +283,7 @@ def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generat
     ways = [*_echoes(source, street, heard_x, rng), *_edges(source, street, heard_x, lit)]
     waves = np.zeros((len(ways), receiver.samples), np.float32)
     for wave, way in zip(waves, ways, strict=True):
-        made = emission.table(way.gain * length[:, None], receiver.beyond_knots)
+        made = emission.table(way.gain * length[:, None], fades=not receiver.ego.stands)
         if made is not None:
             table, span = made
             if way.early < 1.0:
@@ -314,10 +314,9 @@ def _echoes(
     """Return the directions from which rays came; between two places their energy is blended."""
     energy = np.zeros((len(heard_x_m), DIRECTIONS, len(OCTAVES_HZ)))
     early, decay_s = np.zeros(DIRECTIONS), 0.0
-    for place in passed_places(heard_x_m, CELL_M):
-        here = _reached_by(street.receiver, street.site, place.x_m)
-        near, part = source.during(place.span), float(place.share.sum()) / len(energy)
-        energy[place.span] += place.share[:, None, None] * _at(here.energy, near.x_m, near.y_m)
+    for x_m, span, share in passed_places(heard_x_m, CELL_M):
+        here, part = _reached_by(street.receiver, street.site, x_m), float(share.sum()) / len(energy)
+        energy[span] += share[:, None, None] * _at(here.energy, source.x_m[span], source.y_m[span])
         early, decay_s = early + part * here.early, decay_s + part * here.decay_s
     loud = energy.sum(axis=2).max(axis=0)
     # Echoes do not come all at once.
@@ -338,11 +337,11 @@ def _edges(source: PlacedSource, street: StreetSound, heard_x_m: FloatArray, lit
     """Return the ways round both corners and over the nearest roof, of a source that is not seen."""
     site, ways, dark = street.site, list[_Way](), 1.0 - lit
     corners = site.corner_left_m, -site.corner_right_m
-    for place, across in product(passed_places(heard_x_m, CELL_M), corners):
-        near, corner = source.during(place.span), (site.corner_ahead_m - place.x_m, across)
-        share = place.share * dark[place.span] * (np.sign(near.y_m) == np.sign(across))
+    for (x_m, span, share), across in product(passed_places(heard_x_m, CELL_M), corners):
+        near, corner = source.during(span), (site.corner_ahead_m - x_m, across)
+        hidden = share * dark[span] * (np.sign(near.y_m) == np.sign(across))
         gain = np.zeros((len(dark), len(OCTAVES_HZ)))
-        gain[place.span] = corner_gain(corner, near.x_m - place.x_m, near.y_m) * share[:, None]
+        gain[span] = corner_gain(corner, near.x_m - x_m, near.y_m) * hidden[:, None]
         ways.append(_Way(float(np.arctan2(*corner[::-1])), 0.0, gain))
     x, y, middle = source.x_m - heard_x_m, source.y_m, len(dark) // 2
     over = _roof_gain(np.hypot(x, y), source.height_m, street.receiver) * dark[:, None]

@@ -18,7 +18,6 @@ from .diffraction import SPEED_OF_SOUND_MPS
 
 NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
 ARRIVAL_ROUNDS = 4
-BEYOND = 2  # With one the first block is left out, and what fades in at a place begins with a step
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +50,6 @@ class Receiver:
         offsets = np.linalg.norm(self.positions_m - self.centre_m, axis=1) / SPEED_OF_SOUND_MPS
         return int(np.ceil((offsets + np.abs(self.skew_s)).max() * self.sample_rate_hz / KNOT_SAMPLES)) + 1
 
-    @property
-    def beyond_knots(self) -> int:
-        """Knots before and after what is heard; for a standing ego the one with which presets were set."""
-        return 1 if self.ego.stands else BEYOND
-
     def above(self, height_m: float) -> float:
         """Height of the array's centre above a source."""
         return float(self.centre_m[2]) - height_m
@@ -76,23 +70,15 @@ class Receiver:
         return length, x
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Passed:
-    """A place on the way of the ego, and the emission knots of what is heard near it."""
+def passed_places(heard_x_m: FloatArray, step_m: float) -> Iterator[tuple[float, slice, FloatArray]]:
+    """Yield the places, evenly spaced, near which an ego at `heard_x_m` (T,) is when sound arrives.
 
-    x_m: float
-    span: slice  # With `BEYOND` knots more at either end than are heard there
-    share: FloatArray  # shape (span,): 1 at the place, 0 at the next one and beyond, straight in between
-
-
-def passed_places(heard_x_m: FloatArray, step_m: float) -> Iterator[Passed]:
-    """Yield the places, evenly spaced, near which an ego at `heard_x_m` (T,) is when a source arrives.
-
-    The shares of all places add up to one at every knot, so that gains of places blend without a step.
+    Each with the knots at which sound is heard near it, two more at either end, and its share at these: 1 at
+    the place, 0 at the next one. All shares add up to one, so that the gains of places blend without a step.
 
     Examples
     --------
-    >>> [(one.x_m, one.share.tolist()) for one in passed_places(np.array([-2.0, -1.5, 0.0]), 2.0)]
+    >>> [(x_m, share.tolist()) for x_m, _, share in passed_places(np.array([-2.0, -1.5, 0.0]), 2.0)]
     [(-2.0, [1.0, 0.75, 0.0]), (0.0, [0.0, 0.25, 1.0])]
     """
     at = heard_x_m / step_m
@@ -100,8 +86,8 @@ def passed_places(heard_x_m: FloatArray, step_m: float) -> Iterator[Passed]:
         share = np.maximum(1.0 - np.abs(at - number), 0.0)
         near = np.flatnonzero(share)
         if len(near):
-            span = slice(max(int(near[0]) - BEYOND, 0), int(near[-1]) + 1 + BEYOND)
-            yield Passed(step_m * number, span, share[span])
+            span = slice(max(int(near[0]) - 2, 0), int(near[-1]) + 3)
+            yield step_m * number, span, share[span]
 
 
 def standing_m(array: MicrophoneArray) -> FloatArray:

@@ -8,12 +8,16 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from worldstate.adapters.acoustic import heard_of
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.stream import FrontEnd
 from worldstate.simulation import preset
 from worldstate.simulation.scene.junction import drawn_site, ego_moves, renderer_named, site
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.vehicle import EgoMotion
+from worldstate.simulation.sound import ego_sound
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.receiver import Receiver, passed_places
 from worldstate.simulation.sound.renderers import RENDERERS
@@ -102,6 +106,21 @@ def test_the_ego_is_heard_while_it_drives_and_leaves_off_when_it_stands() -> Non
     assert seconds[1:7].min() > 1.4 * seconds[10:].max()
     again = [block.pressure_pa for block in draw_stream(drawn, PAIR).blocks()]
     np.testing.assert_array_equal(np.concatenate(again, axis=1), heard)
+
+
+@pytest.mark.parametrize("name", ["DB101", "DTA101", "DMA101"])
+def test_own_wind_that_drowns_the_street_is_heard_as_that(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every hop of a drive is read as simulated, none with 20 dB more of the ego's own wind."""
+    array, usable = ovad_array(), []
+    for more_db in (0.0, 20.0):
+        monkeypatch.setattr(ego_sound, "WIND_AT_10_DB", 74.0 + more_db)
+        stream = draw_stream(
+            replace(drive(5, "empty", 0.08), site=drawn_site(name), sample_rate_hz=6000.0), array
+        )
+        front_end = FrontEnd(array, 6000.0, FrontEndSettings.heard_at(6000.0))
+        frames = [frame for block in stream.blocks() for frame in front_end.process(stream.recorded(block))]
+        usable.append([heard_of(frame).usable for frame in frames])
+    assert len(usable[0]) > 30 and all(usable[0]) and not any(usable[1])
 
 
 @pytest.mark.parametrize("later_s", [-3.0, 2.0, 7.0])
@@ -216,8 +235,8 @@ def test_an_ego_hears_at_a_place_what_an_array_does_that_stands_there(
 @given(st.lists(st.floats(-60.0, 0.0), min_size=1, max_size=30), st.sampled_from([1.0, 2.0]))
 def test_places_share_every_moment_of_a_drive(heard_x: list[float], step_m: float) -> None:
     x, total, mean = np.array(sorted(heard_x)), np.zeros(len(heard_x)), np.zeros(len(heard_x))
-    for one in passed_places(x, step_m):
-        total[one.span] += one.share
-        mean[one.span] += one.share * one.x_m
+    for place_m, span, share in passed_places(x, step_m):
+        total[span] += share
+        mean[span] += share * place_m
     np.testing.assert_allclose(total, 1.0)
     np.testing.assert_allclose(mean, x, atol=1e-9)
