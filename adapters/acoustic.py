@@ -202,13 +202,14 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         rate, settings = self.front_end.sample_rate_hz, self.front_end.settings
         self.front_end = SpectrumFrontEnd(spectra, rate, settings, start_ns=start_ns)
 
-    def interpret(self, frame: AcousticFrame) -> Measurement:
+    def interpret(self, frame: AcousticFrame, outside: str | None = None) -> Measurement:
         """Turn what was heard at one hop into a measurement, the camera's answer included.
 
         The bearing of direct sound votes for its side; that of reflected sound, or a coarse one, says which
-        half of the street the peak is in, not where the vehicle is: then the side is the signature's.
+        half of the street the peak is in, not where the vehicle is: then the side is the signature's. Nothing
+        is read of a hop that is `outside` of what the models learned, which is the reason why.
         """
-        self.last_frame, heard = frame, heard_of(frame)
+        self.last_frame, heard = frame, heard_of(frame) if outside is None else Heard(0.0, outside)
         measured = self._unheard(frame, heard)
         if heard.usable:
             measured = self._read(frame, measured)

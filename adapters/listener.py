@@ -16,10 +16,12 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import StreetListener
+from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.audio.sound_file import Audio, RawPcm, SoundInput, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras, VisionQuery
+from worldstate.adapters.files.acoustic_domain import outside_of
 from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.core.fixed_lag import LAG_NS, Timed
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -31,6 +33,7 @@ from worldstate.ground.checks import in_range, one_of
 from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import integer_ns, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.odometry import Odometry
 from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
@@ -193,6 +196,9 @@ class Listener:
         self._first_ns, self._samples, self._warned = source.start_ns, 0, set[str]()
         self._ahead: list[tuple[int, str, Callable[[], int], int]] = []  # In the order of their stamps
         self._ahead_bytes = 0
+        domain: ModelDomain | None = getattr(source.model, "domain", None)
+        self._domain, ego = None if source.settings.uncalibrated else domain, self.world.state.ego
+        self._speed_mps = 0.0 if ego is None else ego.speed_mps
         senses = None if source.before is None else source.before.senses
         if isinstance(senses, Senses) and start_s is None:
             self._go_on(senses)
@@ -381,9 +387,11 @@ class Listener:
     def steps(self, block: Float32Array | None) -> Iterator[Step]:
         """Yield the hops that end in the next samples, or wait at the end, as heard and measured."""
         reader = self._reader if self._source.settings.site_adaptation else None
-        for frame, measurement in self.measured(block):
-            for other in self._waiting.until(measurement.stamp_ns):
+        for frame in self._frames(block):
+            for other in self._waiting.until(frame.stamp_ns):
                 self.world = self.world.update(other)
+                self._speed_mps = other.speed_mps if isinstance(other, Odometry) else self._speed_mps
+            measurement = self._adapter.interpret(frame, self._outside())
             self.world = self.world.predict_to(measurement.stamp_ns).update(measurement)
             if isinstance(reader, SequenceReader):
                 learn_passes(reader.street, self.world.state)
@@ -391,6 +399,17 @@ class Listener:
 
     def measured(self, block: Float32Array | None) -> Iterator[tuple[AcousticFrame, Measurement]]:
         """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
+        return ((frame, self._adapter.interpret(frame)) for frame in self._frames(block))
+
+    def _outside(self) -> str | None:
+        """Return why the model reads nothing at the speed of the ego; warn of the first such hop."""
+        reason = outside_of(self._domain, self._speed_mps)
+        if reason is not None:
+            self.refuse(0, reason, f"is heard at {self._speed_mps:.1f} m/s begins no advisory")
+        return reason
+
+    def _frames(self, block: Float32Array | None) -> Iterator[AcousticFrame]:
+        """Yield the hops that end in the next samples, or wait at the end."""
         hear = self._adapter.front_end
         for part in [None] if block is None else self._parts(block):
             frames = hear.finish() if part is None else hear.process(part)
@@ -399,7 +418,7 @@ class Listener:
             for frame in frames:
                 # What the belief to go on from has taken in already only fills the windows.
                 if frame.stamp_ns > self._since_ns:
-                    yield frame, self._adapter.interpret(frame)
+                    yield frame
         while self._ahead and not self._is_near(*self._ahead[-1][:2]):
             self._ahead_bytes -= self._ahead.pop()[-1]
 

@@ -41,6 +41,8 @@ class ModelDomain:
         Name and version of the feature.
     ego_motion : {"standing", "moving", "any"}
         What the ego vehicle did.
+    fastest_mps : float, optional
+        How fast it drove at most; None in files that do not state it.
 
     Raises
     ------
@@ -59,6 +61,7 @@ class ModelDomain:
     band_hz: tuple[float, float]
     feature: str
     ego_motion: EgoMotion
+    fastest_mps: float | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         freeze_arrays(self, positions_m=(None, 3))

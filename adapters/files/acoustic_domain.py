@@ -15,6 +15,7 @@ from worldstate.ground.typing import IndexArray
 
 from .array_match import TRAIN, WAY_OUT, matched_order
 from .model_file import Model
+from .odometry_file import STANDING_MPS
 
 UNFIT = "the model says that it is unfit for use"
 
@@ -85,6 +86,16 @@ def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> boo
     if not model.provenance.fit_for_use:
         _LOG.warning("%s: no budget is stated, its sequence is not used, advisories are rare", UNFIT)
     return model.provenance.fit_for_use
+
+
+def outside_of(domain: ModelDomain | None, speed_mps: float) -> str | None:
+    """Return why a model reads nothing at a speed of the ego; None if it does, or if no speed is stated."""
+    if domain is None or abs(speed_mps) <= STANDING_MPS:
+        return None
+    if domain.ego_motion == "standing":
+        return "the ego drives, the model was made for one that stands"
+    is_fast = domain.fastest_mps is not None and abs(speed_mps) > domain.fastest_mps
+    return f"the ego drives faster than the model learned ({domain.fastest_mps:.1f} m/s)" if is_fast else None
 
 
 def feature_order(

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from worldstate_lab.cli.main import main as study
 
 from conftest import Approach
@@ -16,9 +18,10 @@ from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files import array_file as arrays
-from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
+from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, outside_of, ovad_domain
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
+from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.listener import Listener, listen, measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
@@ -27,6 +30,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.serialisation import encode
 from worldstate.measurement.measurement import Bearing
+from worldstate.measurement.odometry import Odometry
 from worldstate.state.context import Context
 
 RATE = 47_998
@@ -204,6 +208,40 @@ def test_an_ego_that_moves_is_heard_by_the_model_that_was_made_for_it(alone: Pat
     # One that is given stays, and states no budget where the ego does otherwise than it was made for.
     assert open_source(folder, model=standing).policy.alpha == 0.0
     assert open_source(alone, context=stands, model=moving).policy.alpha == 0.0
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.lists(st.floats(-15.0, 15.0), min_size=6, max_size=6), st.booleans())
+def test_hops_of_a_speed_that_was_not_learned_are_unheard(speeds_mps: list[float], moves: bool) -> None:
+    """By hand: the newest speed at each hop; the model for drives learned up to 30 km/h, the other none."""
+    sound = np.random.default_rng(1).uniform(-0.01, 0.01, (72_000, 56)).astype(np.float32)
+    listener = Listener(ovad_array(), 48_000, moving_ego=moves)
+    for hop, speed_mps in enumerate(speeds_mps):
+        listener.add(Odometry("wheels", 950_000_000 + 100_000_000 * hop, speed_mps))
+    states = listener.push(sound)
+    outside = [abs(one) > (30.0 / 3.6 if moves else 0.2) for one in speeds_mps]
+    heard = [one.heard for one in states]
+    assert [bool(one and one[0].share == 0.0 and "ego" in (one[0].reason or "")) for one in heard] == outside
+    assert not [one for one, out in zip(states, outside, strict=True) if out and one.no_sequence is None]
+
+
+def test_a_drive_outside_is_named_once_and_begins_no_advisory(
+    alone: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fast = OdometryLog((Odometry("wheels", 0, 12.0), Odometry("wheels", 1_500_000_000, 3.0)))
+    states = [*listen(alone, ego=fast)]
+    told = [one for one in caplog.messages if "faster than the model learned" in one]
+    assert len(told) == 1 and "12.0 m/s" in told[0] and "8.3" in told[0]
+    assert not [cue for one in states for cue in one.cues if one.stamp_ns < 1.5e9 and cue.advisory]
+    slow = [one.heard for one in states if one.stamp_ns >= 1.5e9]
+    assert slow and all(one and one[0].share > 0.0 for one in slow)
+
+
+def test_a_model_of_a_file_without_a_speed_hears_every_drive() -> None:
+    domain = read_model(moving_ego=True).domain
+    assert domain is not None and domain.fastest_mps == pytest.approx(30.0 / 3.6)
+    assert outside_of(replace(domain, fastest_mps=None), 30.0) is None
+    assert outside_of(replace(domain, ego_motion="any"), 30.0) == outside_of(domain, -30.0)
 
 
 def test_too_low_a_rate_other_frames_or_another_feature_are_refused() -> None:

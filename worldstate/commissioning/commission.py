@@ -265,6 +265,7 @@ def commission(
     plan = learned_streams(settings)
     # What is a user's own is read and checked before hours of streets are simulated.
     domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
+    domain = replace(domain, fastest_mps=max(one.ego.speed_mps for one in plan) or None)
     real = None if table is None else windows_of_array(table, settings, domain)
     calm = quiet_streams(quiet, array, settings.onsets_per_hour) if quiet else []
     on_step("streets", 0.0)

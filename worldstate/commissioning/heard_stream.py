@@ -128,9 +128,8 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     plans = {i: f"{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
     minutes, found = (settings.approach_minutes, settings.hazard_free_minutes), list[StreamSettings]()
     for letter, (i, plan) in product(RENDERERS, plans.items()):
-        traffics = TOWN, MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
-        if settings.moving_ego:
-            traffics = APPROACHES, HAZARD_FREE
+        without = MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
+        traffics = (APPROACHES, HAZARD_FREE) if settings.moving_ego else (TOWN, without)
         name, minutes_of = _numbered(letter, {i: plan}, settings), dict(zip(traffics, minutes, strict=True))
         found += _streams(name, LEARNED_SEED, minutes_of, settings)
     # The noise of a moving ego was set beside the levels of the preset that is usual.

@@ -327,9 +327,7 @@ def exam_figures(streams: Sequence[ExaminedStream]) -> Figures:
 
     Those of the first renderer have no prefix, and some of each other one have its name before them.
     """
-    of = {
-        name: [one for one in streams if one.heard.renderer == name] for name in ("paths", "rays", "mirrors")
-    }
+    of = {name: [one for one in streams if one.heard.renderer == name] for name in _RENDERERS}
     first = of.pop("paths")
     found = examine(first) | in_view_bearings([one.heard for one in first])
     for name, others in of.items():

@@ -100,8 +100,8 @@ class Heard:
         Probability that a hidden vehicle would have been noticed, in [0, 1].
     reason : str or None
         Why it would not: "lost samples", "clipped", "noise far above this place's usual", "wind", "dead
-        channels", "loud source in view" or "a sound that the models do not know"; None where nothing is
-        against it.
+        channels", "loud source in view", "a sound that the models do not know" or a speed of the ego that
+        they did not learn; None where nothing is against it.
     excess_db : float
         How far the sound lies above what is usual at this place, dB.
     measured : bool

@@ -144,4 +144,6 @@ def _limits(model: "adapters.Model") -> list[str]:
     if domain.ego_motion != "any":
         other = "moving" if domain.ego_motion == "standing" else "standing"
         limits.insert(2, f"a {other} ego: no budget is stated")
+    if domain.fastest_mps is not None:
+        limits.insert(2, f"an ego faster than {domain.fastest_mps:.1f} m/s by odometry: nothing is read")
     return [*unfit, *limits]
