@@ -34,7 +34,10 @@ FADE_M = 1.0  # of a source's way over which an image appears: the first Fresnel
 FAINTEST = 0.03  # of the amplitude of the loudest: an image below it is left out
 NARROWEST_RAD = 1e-5  # of a beam
 BESIDE_M = 0.01  # a corner is reached where a point so far beside it is
-PLACES_M = 1.0  # along the way of an ego that moves, between which the beams of two places are blended
+# Along the way of an ego that moves; gains of two places are blended. Against an array that stands between
+# them (60 sources) the level is off by 0.8 dB at most and by 0.34 in one of ten; with places every metre by
+# 0.34 and 0.14, at twice the cost.
+PLACES_M = 2.0
 EVERY = 4  # knots, for gains of corners change slowly
 DIRECTIONS, SKY_SHARE, LOUDER_DB = 36, (0.1, 0.9), (-8.0, 2.0)
 OWN_STREET_M, ARM_M = (10.0, 60.0), (20.0, 90.0)  # how far walls go on behind the ego, and along an arm
