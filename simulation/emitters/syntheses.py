@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
-from scipy.signal import fftconvolve
 
 from worldstate.ground.typing import Complex128Array, FloatArray
 from worldstate.simulation.scene.octave_bands import octave_masks
@@ -543,7 +543,7 @@ def hammered(
         decay_s = min(rng.uniform(*MODE_CYCLES) / mode_hz, LONGEST_MODE_S)
         add_ringing(response, 0.0, rate_hz, [(mode_hz, rng.uniform(0.3, 1.0), decay_s)])
     decay = np.exp(-np.arange(len(response)) / rate_hz / impact_s)
-    ringing, envelope = (fftconvolve(blows, one)[:samples] for one in (response, decay))
+    ringing, envelope = (scipy.signal.fftconvolve(blows, one)[:samples] for one in (response, decay))
     noise = octave_noise(BLOW_DB, samples, rate_hz, rng)
     air = rng.uniform(*BETWEEN) * running * _unit(noise)
     return np.asarray(_unit(ringing) + rng.uniform(*IMPACT) * _unit(noise * envelope) + air)

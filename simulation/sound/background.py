@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
+import scipy
 from scipy.fft import irfft, next_fast_len, rfftfreq
-from scipy.signal import lfilter
 
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.junction import Site
@@ -108,7 +108,7 @@ class WaveField:
         kept = np.exp(-self.grid.hop / self.grid.sample_rate_hz / FLICKER_S)
         drawn = rng.standard_normal((octaves + 1, len(self.power)))
         drawn[:, 1:] *= np.sqrt(1.0 - kept**2)
-        wander = self.flicker_db * lfilter([1.0], [1.0, -kept], drawn)
+        wander = self.flicker_db * scipy.signal.lfilter([1.0], [1.0, -kept], drawn)
         octave = np.log2(np.clip(self.grid.frequencies_hz, OCTAVES_HZ[0], OCTAVES_HZ[-1]) / OCTAVES_HZ[0])
         near = np.maximum(1.0 - np.abs(octave[:, None] - np.arange(octaves)), 0.0)
         # Between the middles of two octaves both count, and independent changes add up by their squares.
