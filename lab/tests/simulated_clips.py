@@ -17,10 +17,10 @@ from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 from worldstate.simulation.scene.presets import Preset, preset
 from worldstate.simulation.scene.vehicle import SourceSignal, drive, emit
-from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, add_delayed, emission_times
 from worldstate.simulation.sound.diffraction import air_gain, ground_gain
 from worldstate.simulation.sound.receiver import NEAREST_M, Receiver
+from worldstate.simulation.sound.renderers import add_ambience
 
 # Twice the highest band and some, at half the cost of 48 kHz.
 RATE_HZ = 24_000.0
@@ -145,7 +145,7 @@ def _ambience(levels: Preset, rng: np.random.Generator) -> Float32Array:
     """Draw the pressure of a street without a vehicle, Pa, shape (n,)."""
     receiver = Receiver(np.array([[0.0, 0.0, MICROPHONE_HEIGHT_M]]), np.zeros(1), KNOTS_S)
     heard = np.zeros((1, receiver.samples), np.float32)
-    add_background(heard, receiver, site("SB1"), levels, rng)
+    add_ambience(heard, receiver, site("SB1"), levels, rng)
     return np.asarray(heard[0])
 
 

@@ -16,7 +16,7 @@ from scipy.fft import irfft, next_fast_len, rfftfreq
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, level_curve
-from worldstate.simulation.scene.presets import OPENINGS, Ambience, Preset, recording_ambience, site_ambience
+from worldstate.simulation.scene.presets import OPENINGS, Ambience, Preset
 
 from .paths import trace_paths
 from .receiver import Receiver
@@ -173,15 +173,10 @@ def add_background(
     site: Site,
     preset: Preset,
     rng: np.random.Generator,
-    here: Ambience | None = None,
+    here: Ambience,
 ) -> None:
-    """Add everything that a street without a vehicle sounds like; what a recording makes of it, unless given.
-
-    Shapes: out (M, n).
-    """
+    """Add everything that a street without a vehicle sounds like in an ambience, shape (M, n)."""
     grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
-    if here is None:
-        here = recording_ambience(site_ambience(site, preset), preset, rng)
     azimuth = azimuths_all_round(preset.ambient_waves, rng)
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, len(azimuth)))
     directions, offsets = unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m

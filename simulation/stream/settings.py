@@ -132,8 +132,8 @@ TRAFFICS = {
 }
 # In its last 3 s before T0, 300 to 2000 Hz, a vehicle of `pairs` raises the level over ambience and wind by
 # 8.7 dB in the median stream of the first renderer and by 3.6 dB of the second, between streams by 4.6 to
-# 13.2 and 0.2 to 8.2 (5 to 95 %; 16 and 8 streams). With the background of `varied` by 14.0 and 5.7, 3.0 to
-# 24.8 and 1.2 to 11.4. Rates of gusts and the share of rain are assumed.
+# 13.2 and 0.2 to 8.2 (5 to 95 %; 16 and 8 streams). With a background of -14 to 8 dB by 14.0 and 5.7, 3.0 to
+# 24.8 and 1.2 to 11.4; that of `varied` was not measured. Rates of gusts and the share of rain are assumed.
 _WEATHERS: Mapping[str, Mapping[str, Any]] = {
     "gusts": {"sounds": {"wind": 360.0}},
     "rain": {"rain_share": 1.0},

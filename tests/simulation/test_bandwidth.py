@@ -30,10 +30,10 @@ from worldstate.simulation.scene.settings import (
     rate_for,
 )
 from worldstate.simulation.scene.vehicle import LIGHT, SOURCE_HEIGHT_M, SourceSignal, drive, emit
-from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings, standing_m
+from worldstate.simulation.sound.renderers import add_ambience
 from worldstate.simulation.sound.scatter import add_scattered, scattering
 from worldstate.simulation.sound.static_field import StaticSources
 
@@ -88,7 +88,7 @@ def feature_errors(number: int, duration_s: float, array: MicrophoneArray = ARRA
     ambience = np.zeros((array.n_microphones, round(duration_s * SAMPLE_RATE_HZ)), np.float32)
     knots_s = np.arange(2) * KNOT_SAMPLES / SAMPLE_RATE_HZ
     receiver = Receiver(standing_m(array), np.zeros(array.n_microphones), knots_s)
-    add_background(ambience, receiver, settings.site, settings.preset, rng)
+    add_ambience(ambience, receiver, settings.site, settings.preset, rng)
     full = ambience + vehicle_sound(settings, array, whole, ambience.shape[1], SAMPLE_RATE_HZ)
     low = decimated(ambience)
     low += vehicle_sound(settings, array, less, low.shape[1], LOW_HZ)

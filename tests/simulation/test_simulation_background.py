@@ -20,13 +20,13 @@ from worldstate.simulation.sound.background import (
     FLICKER_SHARED,
     BlockGrid,
     WaveField,
-    add_background,
     opening_images,
 )
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes, ego_noise
 from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.renderers import add_ambience
 from worldstate.simulation.sound.static_field import (
     StaticSources,
     StreetSound,
@@ -112,7 +112,7 @@ def empty_window(name: str, seed: int, levels=None) -> np.ndarray:
     rng, positions = np.random.default_rng(seed), ovad_array().centred_m
     out = np.zeros((len(positions), round(RATE_HZ)), np.float32)
     receiver = Receiver(positions, np.zeros(len(positions)), np.array([0.0, KNOT_SAMPLES]) / RATE_HZ)
-    add_background(out, receiver, site(name), levels or preset(), rng)
+    add_ambience(out, receiver, site(name), levels or preset(), rng)
     return published_feature(out.T, ovad_array(), RATE_HZ)
 
 

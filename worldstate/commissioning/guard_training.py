@@ -53,7 +53,8 @@ SIGNALS = {
     **{"beeper": "reversing beeper", "bicycle-bell": "bicycle bell"},
 }
 CLOSE = "close"  # What passes or idles some metres away, at no junction
-STREET = ("none", "front", "hidden", CLOSE)
+OF_STREETS = ("none", "front", "hidden")  # Hops at junctions, which set the threshold
+STREET = (*OF_STREETS, CLOSE)
 # Recorded where little else is heard.
 CALM = ("horn", "horns", "dog", "shots", "steps", "bell", "bicycle-bell", "drums", "drill", "saw")
 IDLING = ("light", "medium", "heavy", "motorcycle")
@@ -287,8 +288,8 @@ def train_guard(
 ) -> DomainGuard:
     """Train a guard on streets that were listened to, of two sites at least, and on sounds."""
     rows = SoundRows.joined([guard_rows(array, streets, rng, jobs=jobs), of_guard(close)])
-    held = {label: one for label, one in street_excesses(rows).items() if label != CLOSE}
-    found = [excess[~np.isnan(excess)] for excess in held.values()]
+    excesses = street_excesses(rows)
+    found = [excesses[label][~np.isnan(excesses[label])] for label in OF_STREETS]
     return fit_guard(rows, max(threshold_of(found), CC0_THRESHOLD))
 
 
@@ -325,7 +326,7 @@ def fit_guard(rows: SoundRows, threshold: float = 0.0) -> DomainGuard:
     others = {kind: kind for kind in np.unique(rows.kinds).tolist() if kind not in names}
     foreign, signals = (_named(rows, kinds) for kinds in (FOREIGN | others, SIGNALS))
     names |= others
-    kept = ~np.isin(rows.kinds, (*STREET[:-1], "")) | (np.arange(len(rows.kinds)) % _EVERY == 0)
+    kept = ~np.isin(rows.kinds, (*OF_STREETS, "")) | (np.arange(len(rows.kinds)) % _EVERY == 0)
     order = ["street", *foreign, *signals]
     kinds = rows.kinds[kept]
     labels = np.array([order.index(names[kind]) for kind in kinds.tolist()])

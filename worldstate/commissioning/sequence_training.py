@@ -124,7 +124,7 @@ class LabelledStream:
 
     @classmethod
     def of(cls, inputs: FloatArray, truth: StreamTruth, weight: float = 1.0) -> "LabelledStream":
-        """Return some hops of a stream."""
+        """Return one in `EVERY_HOPS` hops of a stream."""
         return cls(inputs[::EVERY_HOPS], truth.groups()[::EVERY_HOPS], weight)
 
 

@@ -29,11 +29,11 @@ from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import open_road
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS
-from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings, standing_m
+from worldstate.simulation.sound.renderers import add_ambience
 from worldstate.simulation.sound.static_field import StaticSources
 
 from .heard_stream import HeardStream
@@ -246,7 +246,7 @@ def open_feature(
     sound, ambience = np.zeros((2, array.n_microphones, receiver.samples), np.float32)
     with one_blas_thread():
         _add_source(sound, source, receiver, rng)
-        add_background(ambience, receiver, open_road().site, preset(), rng)
+        add_ambience(ambience, receiver, open_road().site, preset(), rng)
     if ego_mps:
         # Its own noise is part of what a source stands out from; that the array moves on is left out.
         speed = np.full(receiver.samples, ego_mps)

@@ -364,14 +364,14 @@ def mounting_lines(mounted: Mapping[str, Figures]) -> list[str]:
     as mounted       |            - |     0.85 |      - |        - |        3.14
     sound and camera 50 ms apart: a bearing lies 1.3 deg beside its box
     """
-    lines = figure_lines("mounted", mounted)
+    lines = exam_lines("mounted", mounted)
     apart = next((one.get("offset_50ms_deg") for one in mounted.values()), None)
     if apart is not None:
         lines.append(f"sound and camera 50 ms apart: a bearing lies {apart:.2g} deg beside its box")
     return lines
 
 
-def figure_lines(heading: str, every: Mapping[str, Mapping[str, object]]) -> list[str]:
+def exam_lines(heading: str, every: Mapping[str, Mapping[str, object]]) -> list[str]:
     """Return a table with a row for each of several exams."""
     rows = [
         [f"{name:<16}", *(_cell(figures.get(key), len(title)) for title, key in _COST_OF.items())]

@@ -29,6 +29,7 @@ from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import (
     CC0_THRESHOLD,
     FOREIGN,
+    OF_STREETS,
     SIGNALS,
     STREET,
     SoundRows,
@@ -116,7 +117,7 @@ def _verdicts(rows: SoundRows, without: Collection[str], kinds: Collection[str])
     for one, guard in guards.items():
         others = [
             np.concatenate([excesses[other, label] for other in sites if other != one])
-            for label in STREET[:-1]
+            for label in OF_STREETS
         ]
         chosen = replace(guard, threshold=max(threshold_of(others), CC0_THRESHOLD))
         here = np.flatnonzero((rows.sites == one) & np.isin(rows.kinds, list(kinds)))

@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         told = stream_exam.beside_reference(told)
         report["reference"] = dict(stream_exam.REFERENCE)
     if len(arrays) > 1 and arguments.exam:
-        lines += ["", *stream_exam.figure_lines("array", reports)]
+        lines += ["", *stream_exam.exam_lines("array", reports)]
     if arguments.report is not None:
         output.write_report(arguments.report, report)
     lines += [] if recorded is None else ["", recorded.told]
