@@ -29,17 +29,24 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_exported_trees_say_what_the_classifier_says(seed: int) -> None:
+@pytest.mark.parametrize("sizes", [(6,), (4, 9), (8, 3, 5)])
+def test_exported_trees_are_the_geometric_mean_of_their_classifiers(seed: int, sizes: tuple[int, ...]) -> None:
     rng = np.random.default_rng(seed)
     inputs, groups = rng.normal(size=(400, 7)), rng.choice([0, 3, 14], 400)
-    machine = HistGradientBoostingClassifier(max_iter=5, max_leaf_nodes=6, random_state=seed)
-    machine.fit(inputs, groups)
+    machines = [
+        HistGradientBoostingClassifier(max_iter=3 + one, max_leaf_nodes=one, random_state=seed).fit(
+            inputs, groups
+        )
+        for one in sizes
+    ]
     fresh = rng.normal(size=(200, 7)) * 2.0
-    scores = exported(machine, inputs[:5]).scores(fresh)
+    scores = exported(machines, inputs[:5]).scores(fresh)
     exponent = np.exp(scores - scores.max(axis=1, keepdims=True))
-    said = exponent / exponent.sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(said[:, [0, 3, 14]], machine.predict_proba(fresh), atol=1e-6)
-    assert said[:, 1].max() < 1e-9
+    averaged = exponent / exponent.sum(axis=1, keepdims=True)
+    product = np.prod([one.predict_proba(fresh) for one in machines], axis=0) ** (1.0 / len(sizes))
+    expected = product / product.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(averaged[:, [0, 3, 14]], expected, atol=1e-6)
+    assert averaged[:, 1].max() < 1e-9
 
 
 def _stream(rng: np.random.Generator, hops: int = 1200) -> tuple[np.ndarray, StreamTruth]:
@@ -80,7 +87,7 @@ def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten()
     learned = [
         LabelledStream.of(sequence_inputs(heard), truth) for heard, truth in (_stream(rng), _stream(rng))
     ]
-    model = train_sequence(learned, 5, Growth(8, 16, 0.2))
+    model = train_sequence(learned, 5, [Growth(8, 16, 0.2)])
     fresh, coming_to = _stream(rng)
     others = [_stream(rng), _stream(rng)]
     margin_s = calibrated_margin_s([(model.posterior(heard), truth) for heard, truth in others])
@@ -106,13 +113,13 @@ def levels_of_readings(calm: tuple[object, object, SequenceModel, FloatArray]) -
 def test_more_sound_bears_more_trees_up_to_those_that_were_chosen(hops: list[int], moves: bool) -> None:
     """Of seven minutes (--quick) a tenth of the trees: all of them took most of its time."""
     streams = [SimpleNamespace(hops=range(n), ego_moves=moves) for n in hops]
-    most, few = (MOVING if moves else STANDING), commission.dealt_growth(streams[:1])
-    every = commission.dealt_growth(streams)
-    assert 20 <= few.rounds <= every.rounds <= most.rounds and every.leaves == most.leaves
-    if sum(hops) >= 72_000:
-        assert every == most
-    if sum(hops) <= 4_200:
-        assert every.rounds <= 20
+    sizes, few = (MOVING if moves else STANDING), commission.dealt_growth(streams[:1])
+    for most, less, every in zip(sizes, few, commission.dealt_growth(streams), strict=True):
+        assert 20 <= less.rounds <= every.rounds <= most.rounds and every.leaves == most.leaves
+        if sum(hops) >= 72_000:
+            assert every == most
+        if sum(hops) <= 4_200:
+            assert every.rounds <= 20
 
 
 @pytest.mark.long
@@ -125,7 +132,7 @@ def test_what_is_learned_does_not_depend_on_how_many_processes_learn(monkeypatch
     made_up = {id(street): _stream(rng, 600) for street in streets}
     monkeypatch.setattr(commission, "stream_evidence", lambda windows, street: made_up[id(street)][0])
     monkeypatch.setattr(commission, "stream_truth", lambda street: made_up[id(street)][1])
-    monkeypatch.setattr(commission, "STANDING", Growth(4, 6, 0.2))
+    monkeypatch.setattr(commission, "STANDING", [Growth(4, 6, 0.2), Growth(3, 3, 0.1)])
     monkeypatch.setattr(commission, "_quiet_levels", levels_of_readings)
     one, two = (
         commission.learn_sequence(streets, lambda some: None, 30.0, np.random.default_rng(1), jobs)

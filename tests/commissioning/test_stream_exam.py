@@ -415,8 +415,8 @@ def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_w
     learned = {one.name: one.seed for plan in plans for one in learned_streams(plan)}
     exams = {one.name: one.seed for plan in plans for one in exam_streams(plan)}
     # Approaches and the hazard-free stream of a junction are different traffic under one seed.
-    # As many junctions of each renderer.
-    assert len(set(learned.values())) == 2 * 3 * 40 and len(set(exams.values())) == 2 * (5 + 5 + 5)
+    # As many junctions of each renderer, each with weather and without.
+    assert len(set(learned.values())) == 2 * 2 * 3 * 40 and len(set(exams.values())) == 2 * (5 + 5 + 5)
     assert not set(learned.values()) & set(exams.values())
     assert not {one.split("-")[0] for one in learned} & {one.split("-")[0] for one in exams}
 
@@ -428,9 +428,13 @@ def test_a_model_learns_each_flow_in_weather_that_varies_and_is_examined_in_the_
     for renderer in "STM":
         mine = [one for one in learned if one.site.name[0] == renderer]
         assert {one.traffic.hazard_free for one in mine} == {True, False}
-        above = [one.drawn_preset.wind_100hz_db - one.preset.wind_100hz_db for one in mine]
+        usual = [one for one in mine if one.preset == exam[0].preset]
+        assert {one.traffic.name for one in usual} == {"pairs", "no-hazard"}
+        varied = [one for one in mine if one not in usual]
+        assert sum(one.minutes for one in varied) == pytest.approx(2 * sum(one.minutes for one in usual))
+        above = [one.drawn_preset.wind_100hz_db - one.preset.wind_100hz_db for one in varied]
         assert np.ptp(above) > 10.0
-        assert all(one.traffic.sounds["wind"] for one in mine)
+        assert all(one.traffic.sounds["wind"] for one in varied)
     assert any(one.rain_db is not None for one in learned)
     assert {one.traffic.name for one in exam} == {"pairs", "no-hazard"}
     assert all(one.drawn_preset == one.preset and one.rain_db is None for one in exam)

@@ -183,8 +183,8 @@ def learn_sequence(
     for outside in folds:
         inside = [one for i, one in enumerate(labelled) if i not in outside]
         lessons.append((inside, int(rng.integers(2**31))))
-    growth, threads = dealt_growth(streams), None if jobs == 1 else 1
-    learned = in_processes(partial(_learned, growth, threads), lessons, jobs)
+    sizes, threads = dealt_growth(streams), None if jobs == 1 else 1
+    learned = in_processes(partial(_learned, sizes, threads), lessons, jobs)
     margins, calm = list[float](), list[tuple[HeardStream, EnsembleModel, SequenceModel, FloatArray]]()
     for outside, windows, one in zip(folds, fitted, learned, strict=True):
         margins.append(calibrated_margin_s([(one.of_inputs(inputs[i]), truths[i]) for i in outside]))
@@ -197,25 +197,27 @@ def learn_sequence(
     on_step("alarm")
     curve, margin_s = measured_curve(quiet, elsewhere=True), float(np.mean(margins))
     every = [labelled[i] for outside in folds for i in outside]
-    final = train_sequence(every, int(rng.integers(2**31)), growth)
+    final = train_sequence(every, int(rng.integers(2**31)), sizes)
     return replace(final, margin_s=margin_s, alarm=curve.default(onsets_per_hour), curve=curve)
 
 
-def dealt_growth(streams: Sequence[HeardStream]) -> Growth:
+def dealt_growth(streams: Sequence[HeardStream]) -> list[Growth]:
     """Return the trees that so much sound bears."""
-    growth = MOVING if streams[0].ego_moves else STANDING
     hours = sum(len(one.hops) for one in streams) * HOP_S / SECONDS_PER_HOUR
-    rounds = round(growth.rounds * min(hours / HOURS_OF_TREES, 1.0))
-    return replace(growth, rounds=min(max(rounds, LEAST_ROUNDS), growth.rounds))
+    share = min(hours / HOURS_OF_TREES, 1.0)
+    sizes = MOVING if streams[0].ego_moves else STANDING
+    return [replace(one, rounds=max(round(one.rounds * share), LEAST_ROUNDS)) for one in sizes]
 
 
 def _quiet_levels(calm: tuple[HeardStream, EnsembleModel, SequenceModel, FloatArray]) -> FloatArray:
     return alarm_levels(stream_states(*calm))
 
 
-def _learned(growth: Growth, threads: int | None, lesson: tuple[list[LabelledStream], int]) -> SequenceModel:
+def _learned(
+    sizes: Sequence[Growth], threads: int | None, lesson: tuple[list[LabelledStream], int]
+) -> SequenceModel:
     streams, seed = lesson
-    return train_sequence(streams, seed, growth, threads)
+    return train_sequence(streams, seed, sizes, threads)
 
 
 def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:

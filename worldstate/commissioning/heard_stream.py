@@ -46,11 +46,13 @@ PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
 # vehicles that come, and at two of four what is near or loud and never comes.
 TOWN, CALM_TOWN, MISLEADING_TOWN = "town-varied", "no-hazard-varied", "misleading-varied"
 LEARNED_PRESET = "street-7"
+# Beside it, half as long, the usual preset without weather: models of one of the two lose in the other.
+USUAL_SHARE = 0.5
 RENDERERS = {"S": 0, "T": 500, "M": 750}  # First letter of a junction's name, and where its numbers begin
 EXAM_OTHERS = ("A911", "B911", "A912", "B912", "A913")  # Junctions of the other renderers that examine
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
-LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
+LEARNED_SEED, USUAL_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 1_099_000, 2_000_000, 1000
 # Of a moving ego a stream is many drives, each with a seed of its own. An approach is judged to six seconds
 # after its last vehicle, and a second one of a queue comes four seconds after the first.
 DRIVES_S, DRIVES_EACH = {APPROACHES: 18.0, HAZARD_FREE: 12.0}, 1000
@@ -67,7 +69,7 @@ class CommissionSettings:
         Drawn junctions of each renderer to learn from, half with a wall across the crossing street; with few,
         a model learns these streets instead of streets.
     approach_minutes, hazard_free_minutes : float
-        Stream at each of them.
+        Stream at each of them; of an ego that stands half as much again in streets without weather.
     exam_minutes : float
         Hazard-free stream at each junction of the exam; approaches take three fifths of that.
     onsets_per_hour : float
@@ -128,12 +130,18 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     plans = {i: f"{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
     minutes, found = (settings.approach_minutes, settings.hazard_free_minutes), list[StreamSettings]()
     for letter, (i, plan) in product(RENDERERS, plans.items()):
+        name = _numbered(letter, {i: plan}, settings)
         without = MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
-        traffics = (APPROACHES, HAZARD_FREE) if settings.moving_ego else (TOWN, without)
-        name, minutes_of = _numbered(letter, {i: plan}, settings), dict(zip(traffics, minutes, strict=True))
-        found += _streams(name, LEARNED_SEED, minutes_of, settings)
-    # The noise of a moving ego was set beside the levels of the preset that is usual.
-    return found if settings.moving_ego else [replace(one, preset=preset(LEARNED_PRESET)) for one in found]
+        # The noise of a moving ego was set beside the levels of the preset that is usual.
+        first = (APPROACHES, HAZARD_FREE) if settings.moving_ego else (TOWN, without)
+        streams = _streams(name, LEARNED_SEED, dict(zip(first, minutes, strict=True)), settings)
+        if settings.moving_ego:
+            found += streams
+            continue
+        found += [replace(one, preset=preset(LEARNED_PRESET)) for one in streams]
+        usual = {PAIRS: USUAL_SHARE * minutes[0], HAZARD_FREE: USUAL_SHARE * minutes[1]}
+        found += _streams(name, USUAL_SEED, usual, settings)
+    return found
 
 
 def _numbered(letter: str, plans: Mapping[int, str], settings: CommissionSettings) -> dict[int, str]:

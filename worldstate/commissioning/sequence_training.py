@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -111,7 +112,9 @@ class Growth:
     rate: float
 
 
-STANDING, MOVING = Growth(100, 4, 0.1), Growth(120, 8, 0.2)
+# Scores of several sizes are averaged.
+STANDING = (Growth(100, 4, 0.1), Growth(200, 8, 0.1))
+MOVING = (Growth(120, 8, 0.2),)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +134,7 @@ class LabelledStream:
 def train_sequence(
     streams: Sequence[LabelledStream],
     seed: int,
-    growth: Growth = STANDING,
+    sizes: Sequence[Growth] = STANDING,
     threads: int | None = None,
 ) -> SequenceModel:
     """Train on the hops of streams, each weighted so that hazards are as frequent as in use."""
@@ -140,30 +143,36 @@ def train_sequence(
     inputs = np.concatenate([one.inputs.reshape(-1, one.inputs.shape[-1]) for one in streams])
     groups = np.concatenate([one.groups.reshape(-1) for one in streams])
     weights = np.repeat([one.weight for one in streams], [one.groups.size for one in streams])
-    machine = HistGradientBoostingClassifier(
-        max_iter=growth.rounds,
-        max_leaf_nodes=growth.leaves,
-        learning_rate=growth.rate,
-        l2_regularization=RIDGE,
-        max_features=INPUTS_EACH,
-        # Of a few minutes no leaf would have as many hops.
-        min_samples_leaf=min(SMALLEST_LEAF, max(len(inputs) // 100, 1)),
-        early_stopping=False,
-        random_state=seed,
-    )
+    # Of a few minutes no leaf would have as many hops.
+    leaf = min(SMALLEST_LEAF, max(len(inputs) // 100, 1))
+    machines = [
+        HistGradientBoostingClassifier(
+            max_iter=growth.rounds,
+            max_leaf_nodes=growth.leaves,
+            learning_rate=growth.rate,
+            l2_regularization=RIDGE,
+            max_features=INPUTS_EACH,
+            min_samples_leaf=leaf,
+            early_stopping=False,
+            random_state=seed,
+        )
+        for growth in sizes
+    ]
     # Of processes beside one another each has its core.
     with threadpool_limits(threads):
-        machine.fit(inputs, groups, sample_weight=weights)
+        for machine in machines:
+            machine.fit(inputs, groups, sample_weight=weights)
     share = np.bincount(groups, weights, len(GROUPS)) / weights.sum()
-    trees = exported(machine, inputs[:: max(len(inputs) // 100, 1)])
+    trees = exported(machines, inputs[:: max(len(inputs) // 100, 1)])
     return SequenceModel(trees, np.maximum(share, 1e-6))
 
 
-def exported(machine: object, check: FloatArray) -> BoostedTrees:
-    """Return the trees of a trained classifier, held against its own scores on some rows."""
+def exported(machines: Sequence[Any], check: FloatArray) -> BoostedTrees:
+    """Return the trees of classifiers whose scores are averaged, held against their own on some rows."""
     # scikit-learn has no public way to its histogram trees: whatever changes there must be noticed here.
-    found = [(k, one.nodes) for round_ in machine._predictors for k, one in enumerate(round_)]  # type: ignore[attr-defined]
-    classes = machine.classes_.astype(np.intp)  # type: ignore[attr-defined]
+    rounds = [round_ for machine in machines for round_ in machine._predictors]
+    found = [(k, one.nodes) for round_ in rounds for k, one in enumerate(round_)]
+    classes = machines[0].classes_.astype(np.intp)
     grid = len(found), max(len(nodes) for _, nodes in found)
     here = np.broadcast_to(np.arange(grid[1]), grid)
     split, yes, no = np.zeros(grid, np.intp), here.copy(), here.copy()
@@ -173,12 +182,13 @@ def exported(machine: object, check: FloatArray) -> BoostedTrees:
         at = np.flatnonzero(inner)
         split[row, at], threshold[row, at] = nodes["feature_idx"][at], nodes["num_threshold"][at]
         yes[row, at], no[row, at] = nodes["left"][at], nodes["right"][at]
-        value[row, : len(nodes)] = np.where(inner, 0.0, nodes["value"])
+        value[row, : len(nodes)] = np.where(inner, 0.0, nodes["value"] / len(machines))
     # Groups that no hop belonged to keep no chance.
     baseline = np.full(len(GROUPS), -30.0)
-    baseline[classes] = np.ravel(machine._baseline_prediction)  # type: ignore[attr-defined]
+    baseline[classes] = np.mean([np.ravel(one._baseline_prediction) for one in machines], axis=0)
     trees = BoostedTrees(split, threshold, yes, no, value, classes[[k for k, _ in found]], baseline)
-    if not np.allclose(trees.scores(check)[:, classes], machine.decision_function(check), atol=1e-6):  # type: ignore[attr-defined]
+    own = np.mean([one.decision_function(check) for one in machines], axis=0)
+    if not np.allclose(trees.scores(check)[:, classes], own, atol=1e-6):
         raise WorldstateError("scikit-learn keeps its trees in another way than 1.5 to 1.9 did: not exported")
     threshold, value = (significant(one, _FIGURES) for one in (trees.threshold, trees.value))
     return replace(trees, threshold=threshold, value=value)
