@@ -190,8 +190,7 @@ class Emission:
         span = slice(first, last)
         ends = gain[span].astype(np.float32)
         both = np.matmul(np.stack([ends[:-1], np.diff(ends, axis=0)], axis=1), self.bands[first : last - 1])
-        ramp = np.arange(both.shape[2], dtype=np.float32) / np.float32(both.shape[2])
-        values = (both[:, 0] + ramp * both[:, 1]).ravel()
+        values = (both[:, 0] + _one_and_ramp(both.shape[2])[1] * both[:, 1]).ravel()
         return SampledSignal(values, self.knots_s[first], self.sample_rate_hz * OVERSAMPLING), span
 
 

@@ -266,16 +266,14 @@ def _add_near(
         road = ground_gain(length, source.height_m, float(centre[2]))
         audible = share * (level > FAINTEST * loud.max(axis=0))
         whole[span] = way.gain * air_gain(length) * road * audible[:, None]
+
+        def travel(position: FloatArray, way: Way = way) -> FloatArray:
+            out = np.zeros(len(whole))
+            out[span] = receiver.arrivals(source.time_s, partial(way.length_m, position))[0]
+            return out
+
         # A standing ego's sound begins as that with which presets were set.
-        made = emission.table(whole, fades=not receiver.ego.stands)
-        if made is not None:
-            table, part = made
-            near = slice(part.start - span.start, part.stop - span.start)
-
-            def travel(position: FloatArray, way: Way = way, near: slice = near) -> FloatArray:
-                return receiver.arrivals(source.time_s, partial(way.length_m, position))[0][near]
-
-            add_to_all(street.static.out, table, emission.knots_s[part], travel, receiver)
+        add_to_all(street.static.out, emission, whole, travel, receiver, fades=not receiver.ego.stands)
 
 
 def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]:

@@ -139,7 +139,7 @@ def trace_paths(
     facades, sides = (np.ones(len(OCTAVES_HZ)),) * 2 if specular is None else specular
     paths = []
     for source, receiver in product(source_images(site, lane_x_m), receiver_images(site)):
-        end_m = receiver_x_m, float(receiver.mirror(np.zeros(1))[0])
+        end_m = receiver_x_m, receiver.offset_m
         passage = through_mouth(site, (source.x_m, source_y_m), end_m, height_m)
         walls = source.gain * receiver.gain * near_facade(site, source, source_y_m, passage.aim_y_m)
         walls = walls * side_walls(site, receiver, receiver_x_m, (site.corner_ahead_m, passage.aim_y_m))
@@ -231,8 +231,7 @@ def side_walls(
     array([0.  , 0.07])
     """
     openings = site.left_openings_m, site.right_openings_m
-    end_y = float(receiver.mirror(np.zeros(1))[0])
-    aim_x, aim_y = aim_m
+    end_y, (aim_x, aim_y) = receiver.offset_m, aim_m
     weight = np.ones_like(aim_y)
     for wall, plane in receiver.walls:
         if openings[wall]:

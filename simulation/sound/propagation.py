@@ -141,7 +141,7 @@ def _beside(
     if order:
         # The near facade comes first, and there a source in the own street stands behind it.
         return replace(path, gain=path.gain * (1.0 - share)[:, None])
-    across = source.y_m - float(image.mirror(np.zeros(1))[0])
+    across = source.y_m - image.offset_m
     above = around.receiver.above(source.height_m)
     straight = np.sqrt((source.x_m - heard_x_m) ** 2 + across**2 + above**2)
     walls = side_walls(around.site, image, heard_x_m, (source.x_m, source.y_m))
@@ -176,27 +176,21 @@ def _add_bent(out: Float32Array, source: MovingSource, path: Path, edge: int, ar
     table, span = made
     receiver, mouth = around.receiver, around.site.corner_ahead_m
     before, above = path.before_m[span], receiver.above(source.height_m)
-    across = path.edge_y_m[span] - float(path.receiver.mirror(np.zeros(1))[0])
-    knots = source.emission.knots_s[span]
+    knots, across = source.emission.knots_s[span], path.edge_y_m[span] - path.receiver.offset_m
     travel, _ = receiver.arrivals(knots, partial(_round, before, mouth, across, above))
     add_along(out, table, knots, travel, receiver.knots_s)
 
 
 def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Receiver) -> None:
     """Add what reaches every microphone along the straight line."""
-    made = source.emission.table(path.gain * path.lit[:, None])
-    if made is None:
-        return
-    table, span = made
-    knots = source.emission.knots_s[span]
-    ahead = (path.source.x_m + np.zeros_like(source.y_m))[span]
 
     def travel(position: FloatArray) -> FloatArray:
-        across = source.y_m[span] - path.receiver.mirror(position[1:2])
+        across = source.y_m - path.receiver.mirror(position[1:2])
         flat = across**2 + (position[2] - source.height_m) ** 2
-        return receiver.arrivals(knots, partial(_slant, ahead - position[0], flat))[0]
+        ahead = path.source.x_m - position[0]
+        return receiver.arrivals(source.emission.knots_s, partial(_slant, ahead, flat))[0]
 
-    add_to_all(out, table, knots, travel, receiver)
+    add_to_all(out, source.emission, path.gain * path.lit[:, None], travel, receiver)
 
 
 def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray) -> FloatArray:
@@ -217,18 +211,13 @@ def _add_open(out: Float32Array, source: MovingSource, around: Surroundings) -> 
 
 def _add_leg(out: Float32Array, source: MovingSource, leg: ScreenedLeg, receiver: Receiver) -> None:
     """Add what reaches every microphone by one point, or straight."""
-    made = source.emission.table(leg.gain)
-    if made is None:
-        return
-    table, span = made
-    knots = source.emission.knots_s[span]
-    before, via_x, via_y = leg.before_m[span], leg.via_x_m[span], leg.via_y_m[span]
 
     def travel(position: FloatArray) -> FloatArray:
-        rise, across = position[2] - source.height_m, via_y - position[1]
-        return receiver.arrivals(knots, partial(_round, before, via_x - position[0], across, rise))[0]
+        along, across = leg.via_x_m - position[0], leg.via_y_m - position[1]
+        length = partial(_round, leg.before_m, along, across, position[2] - source.height_m)
+        return receiver.arrivals(source.emission.knots_s, length)[0]
 
-    add_to_all(out, table, knots, travel, receiver)
+    add_to_all(out, source.emission, leg.gain, travel, receiver)
 
 
 def _round(
@@ -259,7 +248,7 @@ def _corner_delays(image: ReceiverImage, corner_y: float, mouth: float, receiver
     """Delay of every microphone against the array's centre for sound from a corner, shape (M,)."""
     x, y, z = receiver.positions_m.T
     last_leg = np.hypot(mouth - x, image.mirror(y) - corner_y)
-    to_centre = np.hypot(mouth, float(image.mirror(np.zeros(1))[0]) - corner_y)
+    to_centre = np.hypot(mouth, image.offset_m - corner_y)
     tilted = np.hypot(TYPICAL_LEG_M + last_leg, z - SOURCE_HEIGHT_M)
     centre = np.hypot(TYPICAL_LEG_M + to_centre, receiver.above(SOURCE_HEIGHT_M))
     return np.asarray((tilted - centre) / SPEED_OF_SOUND_MPS + receiver.skew_s)

@@ -19,7 +19,7 @@ from itertools import product
 import numpy as np
 import scipy
 
-from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.simulation.scene.presets import Ambience
@@ -293,7 +293,8 @@ def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generat
     directions = unit_vectors(*np.array([(way.azimuth_rad, way.elevation_rad) for way in ways]).T)
     delays = plane_wave_delays(directions, receiver.positions_m - receiver.centre_m)
     static.add(waves, delays + receiver.skew_s)
-    _add_straight(static.out, emission, source, lit, receiver)
+    straight = np.repeat(lit[:, None], len(OCTAVES_HZ), axis=1)
+    add_to_all(static.out, emission, straight, lambda place: source.straight_m(place, receiver)[0], receiver)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -346,21 +347,6 @@ def _edges(source: PlacedSource, street: StreetSound, heard_x_m: FloatArray, lit
     x, y, middle = source.x_m - heard_x_m, source.y_m, len(dark) // 2
     over = _roof_gain(np.hypot(x, y), source.height_m, street.receiver) * dark[:, None]
     return [*ways, _Way(float(np.arctan2(y[middle], x[middle])), ROOF_RAD, over)]
-
-
-def _add_straight(
-    out: Float32Array, emission: Emission, source: PlacedSource, lit: FloatArray, receiver: Receiver
-) -> None:
-    """Add what reaches every microphone along the straight line."""
-    made = emission.table(np.repeat(lit[:, None], len(OCTAVES_HZ), axis=1))
-    if made is None:
-        return
-    table, span = made
-
-    def travel(position: FloatArray) -> FloatArray:
-        return source.straight_m(position, receiver)[0][span]
-
-    add_to_all(out, table, emission.knots_s[span], travel, receiver)
 
 
 def _roof_gain(way_m: FloatArray, height_m: float, receiver: Receiver) -> FloatArray:

@@ -13,7 +13,7 @@ from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, resample_whole, smooth_step
 from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, EgoMotion
 
-from .delay import KNOT_SAMPLES, PHASES, Phases, SampledSignal, add_delayed, emission_times
+from .delay import KNOT_SAMPLES, PHASES, Emission, Phases, SampledSignal, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 
 NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
@@ -123,16 +123,22 @@ def add_along(
 
 def add_to_all(
     out: Float32Array,
-    table: SampledSignal,
-    emit_s: FloatArray,
+    emission: Emission,
+    gain: FloatArray,
     travel_m: Callable[[FloatArray], FloatArray],
     receiver: Receiver,
+    *,
+    fades: bool = False,
 ) -> None:
-    """Add a sound to all microphones, whose way to a position is `travel_m` at the emission knots."""
+    """Add a sound, weighted by gains (T, 8), to all microphones; its way to a position is `travel_m` (T,)."""
+    made = emission.table(gain, fades=fades)
+    if made is None:
+        return
+    table, span = made
     # Rendered once, for the centre: every microphone hears that a little earlier or later, and looking up
     # every sample for each of them took twice as long.
     knots, step, reach = receiver.knots_s, KNOT_SAMPLES / receiver.sample_rate_hz, receiver.reach_knots
-    way = travel_m(receiver.centre_m)
+    emit_s, way = emission.knots_s[span], travel_m(receiver.centre_m)[span]
     heard_s = emit_s + way / SPEED_OF_SOUND_MPS
     ends = (heard_s[[0, -1]] - knots[0]) / step + np.array([-reach, reach])
     first, last = (int(end) for end in np.clip(np.rint(ends), -reach, len(knots) - 1 + reach))
@@ -144,13 +150,13 @@ def add_to_all(
     phases, rows = Phases(values), slice(max(first, 0), min(last, len(knots) - 1))
     at_s = knots[rows.start : rows.stop + 1]
     for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
-        own = travel_m(position)
+        own = travel_m(position)[span]
         arrives = emit_s + own / SPEED_OF_SOUND_MPS + skew
         wanted = np.interp(at_s, arrives, heard_s, left=np.nan, right=np.nan) - centre_s[0]
         nearer = np.maximum(way, NEAREST_M) / np.maximum(own, NEAREST_M)
-        gain = np.interp(at_s[:-1], arrives, nearer)
         heard = microphone[rows.start * KNOT_SAMPLES : rows.stop * KNOT_SAMPLES]
-        phases.add_to(heard, wanted * (receiver.sample_rate_hz * PHASES), gain)
+        louder = np.interp(at_s[:-1], arrives, nearer)
+        phases.add_to(heard, wanted * (receiver.sample_rate_hz * PHASES), louder)
 
 
 def add_turning(

@@ -182,7 +182,7 @@ def seen_through_mouth(
 
     Shapes: ego_x_m (T,).
     """
-    end_m = ego_x_m, float(image.mirror(np.zeros(1))[0])
+    end_m = ego_x_m, image.offset_m
     passage = through_mouth(site, (float(place_m[0]), np.full_like(ego_x_m, place_m[1])), end_m, 0.0)
     return passage.lit * image.gain * side_walls(site, image, ego_x_m, (site.corner_ahead_m, passage.aim_y_m))
 
