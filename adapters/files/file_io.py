@@ -100,10 +100,12 @@ def write_json(path: str | Path, value: object, indent: int | None = None) -> No
     write_text(path, json.dumps(value, allow_nan=False, indent=indent) + "\n")
 
 
-def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def write_rows(
+    path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]], newline: str = "\r\n"
+) -> None:
     """Write CSV with a header, whole or not at all."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator=newline)
         writer.writerow(columns)
         writer.writerows(rows)
 

@@ -1,7 +1,5 @@
 """Recordings on disk in the OVAD layout: D/<environment>/<class>/<ID> and D/DataLog.csv."""
 
-import csv
-import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -25,7 +23,7 @@ from worldstate.adapters.datasets.ovad import (
     OvadDataset,
 )
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.adapters.files.file_io import atomic_path, read_json, write_json, write_text
+from worldstate.adapters.files.file_io import atomic_path, read_json, write_json, write_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.checks import check_ranges
@@ -366,11 +364,8 @@ def write_recording(
 
 def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     """Write `DataLog.csv`, which lists the recordings of a data set."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
-    write_text(Path(root) / LOG_NAME, text.getvalue())
+    listed = ([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
+    write_rows(Path(root) / LOG_NAME, COLUMNS, listed, newline="\n")
 
 
 def _drawn(

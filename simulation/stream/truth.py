@@ -1,9 +1,7 @@
 """What only the simulation knows of a stream: every vehicle, every tenth of a second."""
 
-import csv
-import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -225,15 +223,12 @@ def _frames(one: VehicleTruth) -> list[dict[str, Any]]:
     ]
 
 
-def rows_csv(vehicles: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> str:
-    """Return `vehicles.csv`: one row a vehicle and tenth of a second; no time to visible is an empty cell."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+def truth_rows(
+    vehicles: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]
+) -> Iterator[list[object]]:
+    """Yield the rows of `vehicles.csv`: one a vehicle and tenth of a second; None is an empty cell."""
     for one in vehicles:
         places = np.column_stack([one.x_m, one.y_m, one.speed_mps]).round(2).tolist()
         loudness, seen = loudness_db[one.number][0].round(1).tolist(), one.in_view.astype(int).tolist()
-        left = ["" if value is None else value for value in one.time_to_visible_s()]
-        for row in zip(one.time_s.tolist(), places, seen, left, loudness, strict=True):
-            writer.writerow([row[0], one.number, *row[1], *row[2:]])
-    return text.getvalue()
+        for row in zip(one.time_s.tolist(), places, seen, one.time_to_visible_s(), loudness, strict=True):
+            yield [row[0], one.number, *row[1], *row[2:]]

@@ -11,7 +11,7 @@ from scipy.fft import rfft, rfftfreq
 
 from worldstate.adapters.datasets.ovad import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.files.file_io import write_json
+from worldstate.adapters.files.file_io import write_json, write_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray
@@ -23,13 +23,14 @@ from .arrivals import SoundEvent, draw_events, draw_sounds
 from .rendering import Block, Microphones, StreamScene, draw_microphones, render_blocks
 from .settings import StreamSettings
 from .truth import (
+    COLUMNS,
     EVENTS_NAME,
     ROWS_NAME,
     VehicleTruth,
     describe_events,
     describe_stream,
     detected_frames,
-    rows_csv,
+    truth_rows,
     vehicle_truth,
 )
 
@@ -232,4 +233,4 @@ def _write_beside(folder: Path, stream: DrawnStream, loudness: dict[int, FloatAr
     write_json(folder / DETECTION_NAMES[0], to_json(frames))
     write_json(folder / TRUTH_NAME, describe_stream(settings, vehicles))
     write_json(folder / EVENTS_NAME, describe_events(vehicles, stream.sounds, loudness))
-    (folder / ROWS_NAME).write_text(rows_csv(vehicles, loudness), encoding="utf-8", newline="\n")
+    write_rows(folder / ROWS_NAME, COLUMNS, truth_rows(vehicles, loudness), newline="\n")
