@@ -223,7 +223,8 @@ def simulate_recording(
     array = ovad_array() if array is None else array
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
         audio = _record(settings, array, to_sound)
-    camera, frames = PinholeCamera.ovad(), _frame_times(settings)
+    camera = PinholeCamera.ovad()
+    frames = np.arange(max(round(settings.duration_s * FRAME_RATE_HZ), 1)) / FRAME_RATE_HZ
     seen = [path.at(frames) for path in trajectories(settings, _knots(settings))]
     ego_x = settings.ego.x_m(frames)
     sights = [line_of_sight(path, settings.site, camera, ego_x) for path in seen]
@@ -240,8 +241,12 @@ def simulate_recording(
 def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Float32Array:
     """Return what the array records, shape (n, M)."""
     to_emission, to_street, to_channels = rng.spawn(3)
-    receiver = _receiver(settings, array, to_channels)
-    sound = np.zeros((len(receiver.positions_m), receiver.samples), np.float32)
+    positions = standing_m(array)
+    skew = settings.preset.delay_mismatch_s * to_channels.standard_normal(len(positions))
+    blocks = -(-round(settings.duration_s * settings.sample_rate_hz) // KNOT_SAMPLES)
+    knots = np.arange(blocks + 1) * KNOT_SAMPLES / settings.sample_rate_hz
+    receiver = Receiver(positions, skew, knots, settings.ego)
+    sound = np.zeros((len(positions), receiver.samples), np.float32)
     static = StaticSources(sound, settings.sample_rate_hz)
     paths = trajectories(settings, _knots(settings))
     street = StreetSound(static, settings.site, settings.preset, receiver)
@@ -267,22 +272,6 @@ def _add_sounds(
         add_sound(street, sound, rng.spawn(1)[0])
 
 
-def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Receiver:
-    positions = standing_m(array)
-    skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
-    blocks = -(-_samples(settings) // KNOT_SAMPLES)
-    knots = np.arange(blocks + 1) * KNOT_SAMPLES / settings.sample_rate_hz
-    return Receiver(positions, skew, knots, settings.ego)
-
-
-def _samples(settings: SimulationSettings) -> int:
-    return round(settings.duration_s * settings.sample_rate_hz)
-
-
-def _frame_times(settings: SimulationSettings) -> FloatArray:
-    return np.arange(max(round(settings.duration_s * FRAME_RATE_HZ), 1)) / FRAME_RATE_HZ
-
-
 def _knots(settings: SimulationSettings) -> FloatArray:
     """Emission knots, from a head start before the recording to its end."""
     knot_s = KNOT_SAMPLES / settings.sample_rate_hz
@@ -293,7 +282,7 @@ def _knots(settings: SimulationSettings) -> FloatArray:
 def _to_samples(sound: Float32Array, settings: SimulationSettings, rng: np.random.Generator) -> Float32Array:
     """From Pa (M, n) to full scale (n, M), with the channels' gains."""
     gain = 10.0 ** (settings.preset.gain_mismatch_db * rng.standard_normal(len(sound)) / 20.0) / FULL_SCALE_PA
-    samples = np.empty((_samples(settings), len(sound)), np.float32)
+    samples = np.empty((round(settings.duration_s * settings.sample_rate_hz), len(sound)), np.float32)
     for at in range(0, len(samples), SAMPLES_AT_ONCE):  # a transposition at once would not fit any cache
         some = slice(at, min(at + SAMPLES_AT_ONCE, len(samples)))
         samples[some] = np.clip(sound[:, some] * gain[:, None].astype(np.float32), -1.0, 1.0).T

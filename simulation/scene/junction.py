@@ -99,7 +99,8 @@ class Site:
     in_the_open: bool = False
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        if not self.name.isascii() or not self.name.isalnum():
+            raise InvalidArgumentError(f"name: expected letters and digits, got {self.name!r}")
         check_ranges(self, corner_left_m=(1.0, 30.0), corner_right_m=(1.0, 30.0), corner_ahead_m=(1.0, 50.0))
         check_ranges(self, side_wall_left_m=(1.0, 60.0), side_wall_right_m=(1.0, 60.0))
         check_ranges(self, street_width_m=(3.0, 40.0), verge_m=(0.0, 40.0), surface_db=(-12.0, 12.0))
@@ -165,11 +166,6 @@ def renderer_named(name: str) -> str:
     """
     place = standing_name(name)
     return _RENDERERS[place[0]] if _DRAWN.fullmatch(place) else "paths"
-
-
-def _check_name(name: str) -> None:
-    if not name.isascii() or not name.isalnum():
-        raise InvalidArgumentError(f"name: expected letters and digits, got {name!r}")
 
 
 def site(name: str) -> Site:

@@ -268,14 +268,11 @@ class VehicleSettings:
         vehicle_kind(self.kind)
         check_ranges(self, entry_s=(-60.0, 120.0), speed_mps=(1.0, 30.0), braking_mps2=(0.0, 8.0))
         if self.route_m:
-            _check_route(self.route_m)
-
-
-def _check_route(route_m: tuple[tuple[float, float], ...]) -> None:
-    points = finite_array("route_m", route_m, (None, 2))
-    steps = np.hypot(*np.diff(points, axis=0).T)
-    if not 2 <= len(points) <= MAX_ROUTE_POINTS or steps.min() < SHORTEST_STEP_M:
-        raise InvalidArgumentError(f"route_m: expected 2 to {MAX_ROUTE_POINTS} points apart from each other")
+            points = finite_array("route_m", self.route_m, (None, 2))
+            steps = np.hypot(*np.diff(points, axis=0).T)
+            if not 2 <= len(points) <= MAX_ROUTE_POINTS or steps.min() < SHORTEST_STEP_M:
+                expected = f"expected 2 to {MAX_ROUTE_POINTS} points apart from each other"
+                raise InvalidArgumentError(f"route_m: {expected}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -306,7 +306,7 @@ def pieces(scene: StreamScene, events: Sequence[Event]) -> list[Piece]:
 def render_piece(scene: StreamScene, piece: Piece) -> Block:
     """Render the background of one piece and all that begins in it, to the end."""
     settings, begin = scene.settings, piece.number * scene.piece
-    rate, within, ego = settings.sample_rate_hz, scene.within_s, settings.ego
+    rate, within = settings.sample_rate_hz, scene.within_s
     ends = [
         round(max(one.start_s, within[0]) * rate) + event_blocks(one, rate, within) * KNOT_SAMPLES
         for one in piece.events.values()
@@ -315,9 +315,7 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
     sound = np.zeros((len(scene.microphones.positions_m), samples), np.float32)
     loudness = {}
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
-        _add_ambience(sound, scene, piece.number)
-        if not ego.stands:
-            _add_ego(sound, scene)
+        _add_background(sound, scene, piece.number)
         for number, event in piece.events.items():
             alone, rows_s = _event_alone(scene, number, event), row_times(event, settings)
             at = [EventSound(alone.first, alone.pressure_pa[own]) for own in scene.microphones.slices]
@@ -345,17 +343,13 @@ def _event_alone(scene: StreamScene, number: int, event: Event) -> EventSound:
 
 # What every microphone hears by itself is drawn array by array from the same generator: what an array hears
 # does not depend on the arrays beside it.
-def _add_ambience(sound: Float32Array, scene: StreamScene, number: int) -> None:
+def _add_background(sound: Float32Array, scene: StreamScene, number: int) -> None:
+    """Add the ambience of one piece and, over a drive, what the ego itself sounds like."""
+    settings, ego = scene.settings, scene.settings.ego
     for own, microphones in zip(scene.microphones.slices, scene.microphones.arrays, strict=True):
-        rng = scene.settings.generator(AMBIENCE, number)
+        rng = settings.generator(AMBIENCE, number)
         piece = ambience_piece(replace(scene, microphones=microphones), scene.piece, rng, begins=number == 0)
         sound[own, : piece.shape[1]] += piece
-
-
-def _add_ego(sound: Float32Array, scene: StreamScene) -> None:
-    """Add what the ego itself sounds like over a drive."""
-    settings = scene.settings
-    knots = np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz
-    for own, microphones in zip(scene.microphones.slices, scene.microphones.arrays, strict=True):
-        receiver = microphones.receiver(knots, settings.ego)
-        add_ego(sound[own], receiver, settings.site, settings.preset, settings.generator(EGO_NOISE))
+        if not ego.stands:
+            receiver = microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz, ego)
+            add_ego(sound[own], receiver, settings.site, settings.preset, settings.generator(EGO_NOISE))
