@@ -397,15 +397,15 @@ class _Ground:
     def paint(self, ahead: Float32Array, left: Float32Array) -> Float32Array:
         near, far = self.site.corner_ahead_m + self.site.verge_m, self.site.far_kerb_m
         image = paving(left, ahead, self.seed)
-        _put(image, asphalt(ahead, left, self.seed), (ahead > near) & (ahead < far))
+        road, pavement = (ahead > near) & (ahead < far), (ahead > far) & (ahead < far + PAVEMENT_M)
+        np.copyto(image, asphalt(ahead, left, self.seed), where=road[..., None])
         beyond = flags(left, ahead, self.seed) if self.site.opposite_wall_m else grass(ahead, left, self.seed)
-        _put(image, beyond, ahead > far)
-        pavement = flags(left, ahead, self.seed)
-        _put(image, pavement, (ahead > far) & (ahead < far + PAVEMENT_M))
+        np.copyto(image, beyond, where=(ahead > far)[..., None])
+        np.copyto(image, flags(left, ahead, self.seed), where=pavement[..., None])
         kerb = (np.abs(ahead - far) < 0.07) | (np.abs(ahead - near - 0.05) < 0.07)
         image[kerb] = (166.0, 164.0, 158.0)
         worn = tinted((206.0, 206.0, 200.0), 0.8 + 0.2 * smooth_noise(ahead, left, 0.1, self.seed))
-        _put(image, worn, self._marked(ahead, left))
+        np.copyto(image, worn, where=self._marked(ahead, left)[..., None])
         image *= self._light(ahead, left)[..., None]
         return image
 
@@ -423,10 +423,6 @@ class _Ground:
         gap = np.minimum(self.site.side_wall_left_m - left, left + self.site.side_wall_right_m)
         inside = 0.65 + 0.35 * np.clip(gap / 1.2, 0.0, 1.0)
         return np.where(ahead < self.site.corner_ahead_m, inside, 1.0).astype(np.float32)
-
-
-def _put(image: Float32Array, other: Float32Array, where: BoolArray) -> None:
-    image[where] = other[where]
 
 
 def _sky(left: Float32Array, up: Float32Array) -> Float32Array:

@@ -382,20 +382,16 @@ def _drawn(
     return settings, rng
 
 
-def _is_of(folder: Path, settings: SimulationSettings) -> bool:
-    """Whether a simulated recording is one of these settings."""
-    truth = read_json(folder / TRUTH_NAME, "a truth file")
-    return isinstance(truth, dict) and truth.get("settings") == json.loads(json.dumps(asdict(settings)))
-
-
 def _simulate_one(
     root: Path, wanted: DatasetSettings, array: MicrophoneArray, item: tuple[Plan, Path | None]
 ) -> LogRow | None:
     """Write a recording below `root`; None if it is of these settings where it is kept."""
     plan, kept = item
     settings, rng = _drawn(wanted, array, plan)
-    if kept is not None and _is_of(kept, settings):
-        return None
+    if kept is not None:
+        truth = read_json(kept / TRUTH_NAME, "a truth file")
+        if isinstance(truth, dict) and truth.get("settings") == json.loads(json.dumps(asdict(settings))):
+            return None
     recording = simulate_recording(settings, rng, array)
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = None

@@ -253,23 +253,16 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
         add_vehicle(street, path, draws)
     # Generators of their own, and only where something sounds: the rest stays what it is without.
-    _add_sounds(street, settings, paths, rng)
+    for path, vehicle in zip(paths, settings.traffic, strict=True):
+        if vehicle.signal:
+            add_signal(street, vehicle.signal, path, rng.spawn(1)[0])
+    for other in settings.sounds:
+        add_sound(street, other, rng.spawn(1)[0])
     static.render()
     add_ambience(sound, receiver, settings.site, settings.preset, to_street)
     if not settings.ego.stands:
         add_ego(sound, receiver, settings.site, settings.preset, to_channels)
     return _to_samples(sound, settings, to_channels)
-
-
-def _add_sounds(
-    street: StreetSound, settings: SimulationSettings, paths: list[Trajectory], rng: np.random.Generator
-) -> None:
-    """Add what vehicles warn with, and what else sounds."""
-    for path, vehicle in zip(paths, settings.traffic, strict=True):
-        if vehicle.signal:
-            add_signal(street, vehicle.signal, path, rng.spawn(1)[0])
-    for sound in settings.sounds:
-        add_sound(street, sound, rng.spawn(1)[0])
 
 
 def _knots(settings: SimulationSettings) -> FloatArray:

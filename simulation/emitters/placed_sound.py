@@ -10,7 +10,7 @@ from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, split_octaves
 from worldstate.simulation.scene.presets import Preset
 from worldstate.simulation.scene.settings import SoundKind, SoundSettings, sound_kind
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
-from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import screen_attenuation_db
 from worldstate.simulation.sound.propagation import ANY_ORDER, add_sources
 from worldstate.simulation.sound.receiver import Receiver, Surroundings
@@ -36,14 +36,13 @@ def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator)
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
+    point = PlacedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M)
     if renderer := RENDERERS.get(site.renderer):
-        source = PlacedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M)
-        renderer.add_source(street, source, rng)
+        renderer.add_source(street, point, rng)
         return
-    sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
-    around = _around(street)
-    far = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
-    add_sources(static, sources, around, ANY_ORDER[:POINT_REFLECTIONS])
+    around, far = _around(street), point.moving(rate)
+    near = [PlacedSource(one.signal, path.time_s, *path.behind(one.behind_m), one.height_m) for one in parts]
+    add_sources(static, [one.moving(rate) for one in near], around, ANY_ORDER[:POINT_REFLECTIONS])
     add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
     add_scattered(static, far, around)
     add_late_sound(street, whole, path.behind(0.0), path.time_s, rng)
@@ -63,12 +62,6 @@ def engine_bass_db(preset: Preset) -> FloatArray:
     [3.0, 3.0, 0.0]
     """
     return np.where(OCTAVES_HZ < BASS_BELOW_HZ, preset.engine_bass_db, 0.0)[:, None]
-
-
-def _moving(
-    path: Trajectory, signal: Float32Array, behind_m: float, height_m: float, rate: float
-) -> MovingSource:
-    return MovingSource(Emission.of(signal, path.time_s[0], rate), *path.behind(behind_m), height_m)
 
 
 # Silence before and after: the octave bands of a sound that begins at once begin a little earlier.
@@ -128,17 +121,18 @@ def _add_from(
     angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad
     towards = _gained(signal, directivity(kind, angle), rate) * GROUND_GAIN
     renderer, around = RENDERERS.get(site.renderer), _around(street)
+    source = PlacedSource(towards, track.time_s, track.x_m, track.y_m, kind.height_m)
     if not (renderer and renderer.over_roofs) and not in_the_streets(site, track).all():
         over = _gained(towards, over_roofs(track, kind.height_m, receiver, around.cap_db), rate)
-        add_sources(static, [_source(over, track, kind, rate)], replace(around, site=in_the_open(site)))
+        beyond = replace(source, signal=over).moving(rate)
+        add_sources(static, [beyond], replace(around, site=in_the_open(site)))
         return
     if renderer:
-        source = PlacedSource(towards, track.time_s, track.x_m, track.y_m, kind.height_m)
         renderer.add_source(street, source, rng)
         return
-    add_sources(static, [_source(towards, track, kind, rate)], around)
+    add_sources(static, [source.moving(rate)], around)
     mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN
-    add_scattered(static, _source(mean, track, kind, rate), around)
+    add_scattered(static, replace(source, signal=mean).moving(rate), around)
     add_late_sound(street, mean, (track.x_m, track.y_m), track.time_s, rng)
 
 
@@ -192,7 +186,3 @@ def _gained(signal: Float32Array, gain: FloatArray, rate_hz: float) -> Float32Ar
     for band, values in zip(split_octaves(signal, rate_hz), gain.T, strict=True):
         out += band * np.interp(samples, knots, values).astype(np.float32)
     return out
-
-
-def _source(signal: Float32Array, track: SoundTrack, kind: SoundKind, rate_hz: float) -> MovingSource:
-    return MovingSource(Emission.of(signal, track.time_s[0], rate_hz), track.x_m, track.y_m, kind.height_m)

@@ -468,13 +468,10 @@ def with_sounds(
     >>> [sound.kind for sound in settings.sounds], settings.signal
     (['voice'], 'horn')
     """
-    carried = "" if settings.approach == "none" else _last_signal(kinds)
+    signals = ["", *(kind for kind in kinds if sound_kind(kind).origin == VEHICLE)]
+    carried = "" if settings.approach == "none" else signals[-1]
     drawn = [_drawn(kind, settings, microphones, rng) for kind in kinds if kind != carried]
     return replace(settings, sounds=(*settings.sounds, *drawn), signal=carried)
-
-
-def _last_signal(kinds: Sequence[str]) -> str:
-    return next((kind for kind in reversed(kinds) if sound_kind(kind).origin == VEHICLE), "")
 
 
 def _drawn(

@@ -248,7 +248,7 @@ class Way:
 def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
     """Add a moving or standing source by all its images, and by the waves that both corners diffract."""
     receiver = street.receiver
-    emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
+    emission = source.moving(receiver.sample_rate_hz).emission
     _, heard_x = source.straight_m(receiver.centre_m, receiver)
     for place in passed_places(heard_x, PLACES_M):
         _add_near(street, source.during(place[1]), emission, *place)

@@ -25,7 +25,7 @@ from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.simulation.scene.presets import Ambience
 
 from .background import Town, direction_numbers
-from .delay import Emission, SampledSignal
+from .delay import SampledSignal
 from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS, corner_gain
 from .receiver import Receiver, add_along, add_to_all, passed_places
 from .static_field import PlacedSource, StreetSound, plane_wave_delays, unit_vectors
@@ -277,7 +277,7 @@ LIT_BLEND_M = 0.5  # of a source's way, over which it comes into the straight li
 def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
     """Add a moving or standing source by all that rays found, round both corners, over roofs, straight."""
     static, site, receiver = street.static, street.site, street.receiver
-    emission = Emission.of(source.signal, float(source.time_s[0]), receiver.sample_rate_hz)
+    emission = source.moving(receiver.sample_rate_hz).emission
     length, heard_x = receiver.arrivals(source.time_s, partial(_way_m, site, source))
     lit = _lit(site, source, heard_x)
     ways = [*_echoes(source, street, heard_x, rng), *_edges(source, street, heard_x, lit)]

@@ -89,19 +89,16 @@ def patches(site: Site) -> list[Patches]:
 
 
 def _side_walls(site: Site, rng: np.random.Generator) -> Patches:
-    x = _spread(-BEHIND_M, site.corner_ahead_m, rng)
-    left = np.column_stack([x, np.full_like(x, site.side_wall_left_m), rng.uniform(*HEIGHTS_M, len(x))])
-    x = _spread(-BEHIND_M, site.corner_ahead_m, rng)
-    right = np.column_stack([x, np.full_like(x, -site.side_wall_right_m), rng.uniform(*HEIGHTS_M, len(x))])
-    normals = np.repeat([[0.0, -1.0], [0.0, 1.0]], [len(left), len(right)], axis=0)
-    positions = np.concatenate([left, right])
-    strengths = _strengths(len(positions), site.side_reflection, rng)
-    sides = (site.left_openings_m, left), (site.right_openings_m, right)
-    walled = [
-        share * on_wall(openings, places[:, 0])
-        for share, (openings, places) in zip(site.side_shares, sides, strict=True)
-    ]
-    return Patches(positions, normals, strengths * np.concatenate(walled), False)
+    left = site.side_wall_left_m, site.left_openings_m, site.side_shares[0]
+    right = -site.side_wall_right_m, site.right_openings_m, site.side_shares[1]
+    positions, walled = [], []
+    for y, openings, share in (left, right):
+        x = _spread(-BEHIND_M, site.corner_ahead_m, rng)
+        positions.append(np.column_stack([x, np.full_like(x, y), rng.uniform(*HEIGHTS_M, len(x))]))
+        walled.append(share * on_wall(openings, x))
+    normals = np.repeat([[0.0, -1.0], [0.0, 1.0]], list(map(len, positions)), axis=0)
+    strengths = _strengths(len(normals), site.side_reflection, rng) * np.concatenate(walled)
+    return Patches(np.concatenate(positions), normals, strengths, False)
 
 
 def _opposite_wall(site: Site, wall_m: float, rng: np.random.Generator) -> Patches:
@@ -133,18 +130,14 @@ FirstLeg: TypeAlias = tuple[FloatArray, FloatArray]
 
 def first_legs(group: Patches, index: int, source: MovingSource, around: Surroundings) -> list[FirstLeg]:
     """Ways of one source to one patch: direct and by the facades of the crossing street."""
-    if group.beyond_mouth:
-        return [_open_leg(group, index, source)]
-    near = [image for image in source_images(around.site, source.x_m) if image.order <= IMAGE_ORDERS]
-    return [_mouth_leg(group, index, image, source, around) for image in near]
-
-
-def _open_leg(group: Patches, index: int, source: MovingSource) -> FirstLeg:
+    if not group.beyond_mouth:
+        near = [image for image in source_images(around.site, source.x_m) if image.order <= IMAGE_ORDERS]
+        return [_mouth_leg(group, index, image, source, around) for image in near]
     x, y, z = group.positions_m[index]
     away = np.stack([source.ahead_m - x, source.y_m - y], axis=1)
     length = np.sqrt((away**2).sum(axis=1) + (z - source.height_m) ** 2)
     cosine = np.abs(away @ group.normals[index]) / np.maximum(length, NEAREST_M)
-    return length, (group.strengths_m[index] * np.sqrt(cosine))[:, None] * np.ones(len(OCTAVES_HZ))
+    return [(length, (group.strengths_m[index] * np.sqrt(cosine))[:, None] * np.ones(len(OCTAVES_HZ)))]
 
 
 def _mouth_leg(

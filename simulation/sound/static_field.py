@@ -16,7 +16,7 @@ from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.presets import Preset
 
-from .delay import KNOT_SAMPLES
+from .delay import KNOT_SAMPLES, Emission, MovingSource
 from .diffraction import SPEED_OF_SOUND_MPS
 from .receiver import Receiver, distance_m
 
@@ -92,17 +92,11 @@ def _phase_ramps(delays_s: FloatArray, gains: FloatArray, sample_rate_hz: float)
     return ramps.reshape(-1, *delays_s.shape)[:BINS]
 
 
-def _blocks(samples: int) -> int:
-    """Blocks that cover `samples`, beginning one hop before the first."""
-    return -(-samples // HOP) + 1
-
-
 def _analyse(signals: list[Float32Array]) -> Iterator[tuple[int, Complex64Array]]:
     """Spectra (F, blocks, Q) of Hann-windowed blocks, which sum to the signal, a few blocks at a time."""
     window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(BLOCK) / BLOCK)).astype(np.float32)
     sources, samples = sum(len(one) for one in signals), signals[0].shape[1]
-    blocks = _blocks(samples)
-    cut = np.empty((sources, BLOCK), np.float32)
+    cut, blocks = np.empty((sources, BLOCK), np.float32), -(-samples // HOP) + 1
     for start in range(0, blocks, BLOCKS_AT_ONCE):
         stop = min(start + BLOCKS_AT_ONCE, blocks)
         spectra = np.empty((BINS, stop - start, sources), np.complex64)
@@ -175,6 +169,11 @@ class PlacedSource:
         """Return it at some of its knots."""
         return replace(self, time_s=self.time_s[span], x_m=self.x_m[span], y_m=self.y_m[span])
 
+    def moving(self, rate_hz: float) -> MovingSource:
+        """Return it as the first renderer carries it."""
+        emission = Emission.of(self.signal, float(self.time_s[0]), rate_hz)
+        return MovingSource(emission, self.x_m, self.y_m, self.height_m)
+
 
 def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Generator) -> None:
     """Add a diffuse tail of a dry signal: its energy without its direction.
@@ -238,9 +237,7 @@ def _late_gain(street: StreetSound, x_m: FloatArray, y_m: FloatArray, time_s: Fl
 def _until_the_end(signal: Float32Array, start_s: float, receiver: Receiver) -> Float32Array:
     """Return a signal from its start, or the recording's if that is earlier, to the recording's end."""
     offset = round((start_s - receiver.knots_s[0]) * receiver.sample_rate_hz)
-    before = max(-offset, 0)
-    out = np.zeros(before + receiver.samples, np.float32)
-    at = max(offset, 0)
+    out, at = np.zeros(max(-offset, 0) + receiver.samples, np.float32), max(offset, 0)
     piece = signal[: max(len(out) - at, 0)]
     out[at : at + len(piece)] = piece
     return out

@@ -14,6 +14,7 @@ from scipy.fft import irfft, rfft, rfftfreq
 
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.emitters.emitter import emitted
+from worldstate.simulation.emitters.placed_sound import in_the_open
 from worldstate.simulation.emitters.signals import drift
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind
@@ -151,9 +152,8 @@ def _in_the_open(
     route = along([[distance, FAR_M], [distance, -FAR_M]])
     event = VehicleEvent("passes", Manoeuvre(LEFT, Motion(route, time, driven, speeds, kind, -1), 0.0), 0.0)
     alone = Microphones(np.array([[0.0, 0.0, height]]), np.zeros(1), np.ones(1), rate_hz)
-    street = replace(site, in_the_open=True, opposite_wall_m=None)
     # The preset takes bass from engines, which streets do not have and close passes do.
-    heard = event_sound(event, street, replace(preset, engine_bass_db=0.0), alone, rng)
+    heard = event_sound(event, in_the_open(site), replace(preset, engine_bass_db=0.0), alone, rng)
     sound = heard.pressure_pa[0].astype(np.float64)
     first, length = round(FADE_S * rate_hz), round(0.1 * len(speeds_mps) * rate_hz)
     spread_db = _MOTORCYCLE_DB if kind.turns_hz else _VEHICLE_DB

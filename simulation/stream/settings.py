@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -151,9 +152,8 @@ def _under(base: Traffic, weather: str) -> Traffic:
     return replace(base, **changed)
 
 
-for _name in ("pairs", "no-hazard", "town", "misleading"):
-    for _one in (_under(TRAFFICS[_name], weather) for weather in _WEATHERS):
-        TRAFFICS[_one.name] = _one
+for _name, _weather in product(("pairs", "no-hazard", "town", "misleading"), _WEATHERS):
+    TRAFFICS[f"{_name}-{_weather}"] = _under(TRAFFICS[_name], _weather)
 
 
 def traffic_named(name: str) -> Traffic:

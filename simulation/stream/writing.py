@@ -213,10 +213,7 @@ def _write_sound(
     microphones, settings = stream.scene.microphones, stream.scene.settings
     channels, rate = len(microphones.positions_m), settings.sample_rate_hz
     heard, loudness = Spectrogram(rate), dict[int, FloatArray]()
-    with (
-        sound_writer(path, settings.samples, channels, rate) as file,
-        closing(stream.blocks(jobs)) as blocks,
-    ):
+    with sound_writer(path, settings.samples, channels, rate) as file, closing(stream.blocks(jobs)) as blocks:
         for block in blocks:
             file.write(stream.recorded(block))
             heard.add(block.pressure_pa[stream.arrays[0].middle])
