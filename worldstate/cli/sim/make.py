@@ -85,10 +85,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--minutes", type=float, metavar="M", help="its length")
     # Any word is taken: the library refuses a moving ego with its reason.
     sites = simulation.SITES
-    add(
-        "--site",
-        help=f"{', '.join(sites)}, or TA1, MB7, ... of the other renderers (default: {sites[0]})",
-    )
+    add("--site", help=f"{', '.join(sites)}, or TA1, MB7, ... of the other renderers (default: {sites[0]})")
     add("--traffic", choices=[*TRAFFICS], help="how much drives (default: calm)")
 
 
