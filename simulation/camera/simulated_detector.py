@@ -82,9 +82,8 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
         return [()] * frames
     noise = rng.normal(0.0, PARKED_NOISE_PX, (frames, 4))
     scores = np.clip(rng.normal(0.92, 0.02, frames), 0.3, 0.999).round(4)
-    return [
-        (SimulatedDetection(inside(box + n, camera), float(s)),) for n, s in zip(noise, scores, strict=True)
-    ]
+    boxes = (inside(box + one, camera) for one in noise)
+    return [(SimulatedDetection(*seen),) for seen in zip(boxes, scores.tolist(), strict=True)]
 
 
 def through_rain(

@@ -214,9 +214,8 @@ def tinted(colour: Colour, shade: ArrayLike) -> Float32Array:
 def asphalt(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
     """Paint asphalt: dark, mottled, with patches."""
     patches = np.where(smooth_noise(a, b, 2.7, seed) > 0.62, -0.07, 0.0)
-    shade = (
-        0.85 + 0.16 * smooth_noise(a, b, 0.6, seed + 1) + 0.22 * (cell_noise(a / 0.02, b / 0.02, seed) - 0.5)
-    )
+    grain = cell_noise(a / 0.02, b / 0.02, seed) - 0.5
+    shade = 0.85 + 0.16 * smooth_noise(a, b, 0.6, seed + 1) + 0.22 * grain
     return tinted((96.0, 97.0, 99.0), shade + patches)
 
 

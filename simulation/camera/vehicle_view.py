@@ -119,9 +119,8 @@ def _cast_shadow(colours: Float32Array, depth: Float32Array, rays: Float32Array,
         road = np.float32(-eye[2]) / rays[..., 2]
     across = eye[0] + road * rays[..., 0]
     behind = eye[1] + road * rays[..., 1]
-    beyond = np.hypot(
-        np.maximum(np.abs(across) - HALF_M, 0.0), np.maximum(np.maximum(-behind, behind - LENGTH_M), 0.0)
-    )
+    past_an_end = np.maximum(np.maximum(-behind, behind - LENGTH_M), 0.0)
+    beyond = np.hypot(np.maximum(np.abs(across) - HALF_M, 0.0), past_an_end)
     strength = SHADOW * np.clip(1.0 - beyond / SHADOW_REACH_M, 0.0, 1.0)
     on_road = (road > 0.0) & (np.abs(road - depth) < 1e-3 * depth)
     colours[on_road] *= (1.0 - strength[on_road])[:, None].astype(np.float32)
@@ -129,13 +128,11 @@ def _cast_shadow(colours: Float32Array, depth: Float32Array, rays: Float32Array,
 
 def _paint_body(car: Car, places: Float32Array, face: TextArray) -> Float32Array:
     across, behind, up = places.T
-    light = np.select(
-        [face == "top", face == "hood", np.isin(face, ("front", "rear"))], [1.12, 1.12, 0.9], 0.0
-    )
+    end = np.isin(face, ("front", "rear"))
+    light = np.select([face == "top", face == "hood", end], [1.12, 1.12, 0.9], 0.0)
     # A side mirrors the bright sky above and the dark road below.
     light = np.where(light > 0.0, light, 0.74 + 0.3 * np.clip(up / WAIST_M, 0.0, 1.0))
     colours = tinted(car.colour, light)
-    end = np.isin(face, ("front", "rear"))
     lamps = end & (np.abs(across) > 0.5) & (up > 0.5) & (up < 0.66)
     colours[lamps & (face == "front")] = LAMP
     colours[lamps & (face == "rear")] = TAIL

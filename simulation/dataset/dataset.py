@@ -139,9 +139,8 @@ class DatasetSettings:
         if self.scene not in (JUNCTION, ALL):
             place(self.scene)
         if self.n_dynamic and self.scene != JUNCTION:
-            raise InvalidArgumentError(
-                f"n_dynamic: expected 0 with scene {self.scene!r}, got {self.n_dynamic}"
-            )
+            problem = f"expected 0 with scene {self.scene!r}, got {self.n_dynamic}"
+            raise InvalidArgumentError(f"n_dynamic: {problem}")
         if self.video and (self.n_dynamic or self.scene != JUNCTION):
             raise InvalidArgumentError("video: expected only static recordings of the scene 'junction'")
 
@@ -410,9 +409,8 @@ def _name_array(path: Path, array: MicrophoneArray) -> None:
     if not path.exists():
         write_array_xml(path, array)
     elif not np.array_equal(read_array(path).positions_m, array.positions_m):
-        raise InputFileError(
-            path, "expected the array of these recordings; another one needs a folder of its own"
-        )
+        way_on = "another one needs a folder of its own"
+        raise InputFileError(path, f"expected the array of these recordings; {way_on}")
 
 
 def _listed(root: Path) -> dict[Path, LogRow]:

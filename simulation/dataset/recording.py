@@ -122,9 +122,8 @@ def sound_writer(
         with soundfile.SoundFile(path, "w", round(sample_rate_hz), channels, "PCM_24", format=kind) as file:
             yield file
     except soundfile.SoundFileError as error:
-        raise InputFileError(
-            path, f"expected to write {samples} samples, the disk may be full: {error}"
-        ) from error
+        problem = f"expected to write {samples} samples, the disk may be full: {error}"
+        raise InputFileError(path, problem) from error
 
 
 def refuse_foreign(target: Path) -> None:

@@ -141,9 +141,8 @@ def _tract(frequency_hz: FloatArray, formants_hz: FloatArray) -> Complex128Array
 
 def _fricatives(samples: int, rate_hz: float, syllables: Spans, rng: np.random.Generator) -> FloatArray:
     """Noise of the teeth before some of the syllables, shape (samples,)."""
-    spans = [
-        (start - rng.uniform(*FRICATIVE_S), start) for start, _ in syllables if rng.random() < FRICATIVE_SHARE
-    ]
+    starts = (start for start, _ in syllables if rng.random() < FRICATIVE_SHARE)
+    spans = [(start - rng.uniform(*FRICATIVE_S), start) for start in starts]
     noise = octave_noise(FRICATIVE_DB, samples, rate_hz, rng)
     return noise * gate(samples, rate_hz, spans, 0.02)
 
@@ -559,9 +558,8 @@ def motor_sound(running: FloatArray, rate_hz: float, rng: np.random.Generator) -
     """Motor, gears and what is ground, at a speed 0..1 that sags under load, of power one."""
     samples = len(running)
     load = gate(samples, rate_hz, bursts(samples / rate_hz, LOAD_S, LOADED_S, rng), 0.2)
-    speed = (
-        running * (1.0 - rng.uniform(0.0, MOST_SAG) * load) * (1.0 + 0.01 * drift(samples, rate_hz, 0.1, rng))
-    )
+    speed = running * (1.0 - rng.uniform(0.0, MOST_SAG) * load)
+    speed *= 1.0 + 0.01 * drift(samples, rate_hz, 0.1, rng)
     fastest_hz, chatter_s = rng.uniform(*MOTOR_HZ), 1.0 / rng.uniform(*CHATTER_HZ)
     both_hz = fastest_hz, float(np.exp(rng.uniform(*np.log(GEARS_HZ))))
     whine = [harmonics(one * speed, rng.uniform(0.1, 1.0, 8).tolist(), rate_hz) for one in both_hz]

@@ -101,9 +101,8 @@ def add_gusts(
 ) -> None:
     """Add gusts to the microphones that they hit, to each of them by itself."""
     if max(sound.channels) >= len(static.out) or min(sound.channels) < 0:
-        raise InvalidArgumentError(
-            f"channels of gusts: expected 0 to {len(static.out) - 1}, got {sound.channels}"
-        )
+        problem = f"expected 0 to {len(static.out) - 1}, got {sound.channels}"
+        raise InvalidArgumentError(f"channels of gusts: {problem}")
     rate, samples = receiver.sample_rate_hz, static.out.shape[1]
     level_db = sound.what.level_db + sound.level_offset_db
     density = wind_density(level_db, noise_frequencies(samples, rate)) * rate

@@ -156,9 +156,8 @@ class SoundSettings:
             raise InvalidArgumentError("route_m: expected points apart from each other and from place_m")
         check_ranges(self, speed_mps=(0.1, 30.0), level_offset_db=(-60.0, 30.0), lens_missed=(0.0, 1.0))
         if kind.name == "gusts" and not 1 <= len(self.channels) <= MAX_CHANNELS:
-            raise InvalidArgumentError(
-                f"channels: expected 1 to {MAX_CHANNELS} of gusts, got {self.channels}"
-            )
+            problem = f"expected 1 to {MAX_CHANNELS} of gusts, got {self.channels}"
+            raise InvalidArgumentError(f"channels: {problem}")
 
     @property
     def what(self) -> SoundKind:
@@ -425,10 +424,8 @@ def _on_way(settings: SimulationSettings, way: Way) -> SimulationSettings:
     """Return a recording of a vehicle that takes a way: the one of the approach, or one that is no hazard."""
     if way.approach != "none":
         return replace(settings, route_m=way.route_m)
-    plain = VehicleSettings(
-        "left", settings.entry_s, settings.speed_mps, 0.0, settings.kind, route_m=way.route_m
-    )
-    return replace(settings, others=(plain,))
+    own = settings.entry_s, settings.speed_mps, 0.0, settings.kind
+    return replace(settings, others=(VehicleSettings("left", *own, route_m=way.route_m),))
 
 
 def speeds_mps(site: Site, kind: VehicleKind, levels: Preset) -> tuple[float, float]:

@@ -214,12 +214,10 @@ def drive(
     heading = -1 if entry_y_m > 0 else 1
     step = time_s[1] - time_s[0]
     # Where it passes before the first time or after the last, it is followed to there.
-    before, after = (
-        int(np.ceil(max(out_s, 0.0) / step)) for out_s in (time_s[0] - entry_s, entry_s - time_s[-1])
-    )
-    clock = np.r_[
-        time_s[0] - step * np.arange(before, 0, -1), time_s, time_s[-1] + step * np.arange(1, after + 1)
-    ]
+    outside_s = time_s[0] - entry_s, entry_s - time_s[-1]
+    before, after = (int(np.ceil(max(out_s, 0.0) / step)) for out_s in outside_s)
+    earlier, later = step * np.arange(before, 0, -1), step * np.arange(1, after + 1)
+    clock = np.r_[time_s[0] - earlier, time_s, time_s[-1] + later]
     slowed = braking_mps2 * np.clip(clock - (entry_s - 2.0), 0.0, 2.0)
     speed = np.maximum(speed_mps - slowed, 0.25 * speed_mps)
     mean = np.r_[0.0, 0.5 * (speed[1:] + speed[:-1])]

@@ -197,14 +197,10 @@ def through_mouth(
     clearance = np.minimum(left - crossing, crossing - right)
     # Over a vertical edge both legs lie in one unfolded plane. The shorter way round counts: both are equal
     # where the corner changes, so nothing jumps there.
-    legs = [
-        np.stack(
-            np.broadcast_arrays(
-                np.hypot(x - mouth, y - at), np.hypot(depth, at - end_y), sign * (y - at), sign * (at - end_y)
-            )
-        )
-        for sign, at in ((1.0, left), (-1.0, right))
-    ]
+    legs = []
+    for sign, at in ((1.0, left), (-1.0, right)):
+        both = np.hypot(x - mouth, y - at), np.hypot(depth, at - end_y)
+        legs.append(np.stack(np.broadcast_arrays(*both, sign * (y - at), sign * (at - end_y))))
     ways = [np.hypot(before + after, height_m) for before, after, _, _ in legs]
     across = y - end_y
     straight = np.sqrt(run * run + across * across + height_m * height_m)

@@ -27,9 +27,8 @@ class OpenImage:
 
     x_m: FloatArray  # shape (T,): Where it stands
     y_m: FloatArray
-    gain: (
-        FloatArray  # shape (T, 8): Amplitude that the wall leaves, per octave; 0 where there is no reflection
-    )
+    # shape (T, 8): Amplitude that the wall leaves, per octave; 0 where there is no reflection.
+    gain: FloatArray
     occluders: tuple[OccludingBody, ...]
 
 

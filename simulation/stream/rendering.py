@@ -133,9 +133,8 @@ def ambience_piece(
         # From a second before the piece to a second after it: a shower sets in and ends slowly.
         lasts_s = sound.shape[1] / settings.sample_rate_hz + 2.0
         static = StaticSources(sound, settings.sample_rate_hz)
-        add_rain(
-            static, SoundSettings("rain", -1.0, lasts_s, level_offset_db=settings.rain_db), receiver, rng
-        )
+        shower = SoundSettings("rain", -1.0, lasts_s, level_offset_db=settings.rain_db)
+        add_rain(static, shower, receiver, rng)
         static.render()
     rise = np.sin(0.5 * np.pi * (np.arange(overlap) + 0.5) / overlap).astype(np.float32)
     if not begins:
@@ -319,9 +318,10 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
         for number, event in piece.events.items():
             alone, rows_s = _event_alone(scene, number, event), row_times(event, settings)
             at = [EventSound(alone.first, alone.pressure_pa[own]) for own in scene.microphones.slices]
-            loudness[number] = np.array(
-                [[loudness_db(one, rows_s, rate, banded=banded) for banded in (False, True)] for one in at]
-            )
+            levels = [
+                [loudness_db(one, rows_s, rate, banded=banded) for banded in (False, True)] for one in at
+            ]
+            loudness[number] = np.array(levels)
             heard = alone.pressure_pa[:, max(-alone.first, 0) :]
             first = max(alone.first, 0) - begin
             sound[:, first : first + heard.shape[1]] += heard

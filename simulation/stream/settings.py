@@ -221,9 +221,8 @@ class StreamSettings:
         longest = MAX_DRIVE_MINUTES if ego_moves(self.site.name) else MAX_MINUTES
         check_ranges(self, minutes=(0.05, longest), seed=(0, 2**63), sample_rate_hz=(2_000.0, 96_000.0))
         if self.site.is_open:
-            raise InvalidArgumentError(
-                f"site: expected a junction, got {self.site.name}: no arms to come out of"
-            )
+            problem = f"expected a junction, got {self.site.name}: no arms to come out of"
+            raise InvalidArgumentError(f"site: {problem}")
 
     @property
     def name(self) -> str:
@@ -246,11 +245,9 @@ class StreamSettings:
     @property
     def drawn_preset(self) -> Preset:
         """The preset, with its ambience and wind at the level that this stream draws."""
-        level_db = self.background_db
-        octaves_db = tuple(octave_db + level_db for octave_db in self.preset.ambient_octaves_db)
-        return replace(
-            self.preset, ambient_octaves_db=octaves_db, wind_100hz_db=self.preset.wind_100hz_db + level_db
-        )
+        level_db, usual = self.background_db, self.preset
+        octaves_db = tuple(octave_db + level_db for octave_db in usual.ambient_octaves_db)
+        return replace(usual, ambient_octaves_db=octaves_db, wind_100hz_db=usual.wind_100hz_db + level_db)
 
     @property
     def rain_db(self) -> float | None:
