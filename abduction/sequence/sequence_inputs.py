@@ -60,9 +60,8 @@ COLUMNS = (
     *("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing"),
     *_BANDS,
 )
-_HIGHEST, _LOUDNESS, _PROMINENCE, _RATE, _SPREAD, _BEARING = map(
-    COLUMNS.index, COLUMNS[COLUMNS.index("level") : -BANDS]
-)
+_OF_LEVEL = COLUMNS[COLUMNS.index("level") : -BANDS]
+_HIGHEST, _LOUDNESS, _PROMINENCE, _RATE, _SPREAD, _BEARING = map(COLUMNS.index, _OF_LEVEL)
 _CHANGING = _LOUDNESS + 1
 _BAND_COLUMNS = slice(_BEARING + 1, _BEARING + 1 + BANDS)
 # What eight seconds are kept of: the level, both sides and the visible; the first three have a dip.

@@ -384,9 +384,8 @@ class EnsembleModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        return window_classes.window_evidence(
-            self.predict_proba(np.atleast_2d(feature)), self.classes, self.class_prior
-        )
+        posteriors = self.predict_proba(np.atleast_2d(feature))
+        return window_classes.window_evidence(posteriors, self.classes, self.class_prior)
 
 
 AnySignature = SignatureModel | EnsembleModel

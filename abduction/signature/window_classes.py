@@ -92,10 +92,9 @@ def explained(shares: FloatArray, classes: tuple[str, ...], prior: FloatArray) -
     array([[0.  , 0.75, 0.  , 0.25],
            [0.2 , 0.3 , 0.2 , 0.3 ]])
     """
-    filled, (usual,) = (
-        four + 0.5 * both * _IS_SIDE for four, both, _ in (_six(shares, classes), _six(prior[None], classes))
-    )
-    return np.asarray(filled + _six(shares, classes)[2] * (usual / usual.sum()))
+    (four, both, direct), (known, known_both, _) = _six(shares, classes), _six(prior[None], classes)
+    usual = (known + 0.5 * known_both * _IS_SIDE)[0]
+    return np.asarray(four + 0.5 * both * _IS_SIDE + direct * (usual / usual.sum()))
 
 
 def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> FloatArray:
@@ -114,9 +113,8 @@ def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatAr
     >>> side_ratios(window, WINDOW_CLASSES, np.full(6, 1 / 6)).round(2)
     array([[1.45, 1.45]])
     """
-    (four, both, direct), (known, known_both, known_direct) = (
-        _six(one, classes) for one in (posteriors, prior[None])
-    )
+    (four, both, direct), of_prior = _six(posteriors, classes), _six(prior[None], classes)
+    known, known_both, known_direct = of_prior
     told = 1.0 - known_direct
     sides = (four[:, [LEFT, RIGHT]] + both) / (known[:, [LEFT, RIGHT]] + known_both)
     rest = four[:, [FRONT, NONE]] / known[:, [FRONT, NONE]] * told + direct

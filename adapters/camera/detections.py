@@ -443,15 +443,9 @@ def _ovad_log(name: Path, text: str, frame_rate_hz: float | None) -> DetectionLo
     frames, stamps = list[DetectionFrame](), list[int | None]()
 
     def take(row: object) -> None:
-        if (
-            not frames
-            and isinstance(row, dict)
-            and "stamp_ns" not in row
-            and (times := sorted(_TIMES & {*row}))
-        ):
-            raise InvalidArgumentError(
-                f'frame 0: expected times as "stamp_ns", whole nanoseconds, got {times}'
-            )
+        if not frames and isinstance(row, dict) and "stamp_ns" not in row and _TIMES & {*row}:
+            expected = 'expected times as "stamp_ns", whole nanoseconds'
+            raise InvalidArgumentError(f"frame 0: {expected}, got {sorted(_TIMES & {*row})}")
         read = decode(_OvadFrame, row, f"frame {len(frames)}")
         frames.append(read.frame())
         stamps.append(read.stamp_ns)
@@ -629,7 +623,9 @@ def coco_log(
     with refused_as_file(path):
         held = {"annotations": document} if isinstance(document, list) else document
         read = held if isinstance(held, _CocoFile) else decode(_CocoFile, held, "COCO")
-        listed, images = read.images is not None, read.images or _unlisted(read)
+        listed, images = read.images is not None, read.images
+        if images is None:
+            images = tuple(map(_CocoId, {one.image_id: 0 for one in read.annotations}))
         for one in images:
             if size_px is not None and (one.width or size_px[0], one.height or size_px[1]) != size_px:
                 expected = f"expected images of the camera's {size_px[0]} x {size_px[1]} px"
@@ -651,13 +647,6 @@ def coco_log(
     if listed and n_images is not None:
         raise InputFileError(path, "expected no number of images (--images): the file lists its images")
     return _log(path, rows, frame_rate_hz, sorted(rows) if listed else n_images)
-
-
-def _unlisted(read: _CocoFile) -> tuple[_CocoId, ...]:
-    """Return the images that results name, once each, where none are listed."""
-    return (
-        () if read.images is not None else tuple(map(_CocoId, {one.image_id: 0 for one in read.annotations}))
-    )
 
 
 def _category_names(read: _CocoFile) -> dict[str, str]:
@@ -729,8 +718,10 @@ def read_yolo_text(
     """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image."""
     folder = Path(path)
     files = sorted(file for file in folder.glob("*.txt") if file.name not in _NO_LABELS)
-    names = _listed_names(folder / "classes.txt")
-    numbers = image_numbers([file.name for file in files[: MAX_FRAMES + 1]])
+    # The classes that the text counts through: those that are listed beside it, else COCO's.
+    listed = folder / "classes.txt"
+    known = read_text(listed, "a text file", MAX_TEXT_BYTES).split("\n") if listed.exists() else YOLO_NAMES
+    names, numbers = dict(enumerate(known)), image_numbers([file.name for file in files[: MAX_FRAMES + 1]])
     if numbers is None or len(files) > MAX_FRAMES:
         some = ", ".join(file.name for file in files[:2]) or "none"
         expected = f"1 to {MAX_FRAMES} files of one name with the number of their image behind it"
@@ -747,12 +738,6 @@ def read_yolo_text(
         rows = {number - first: found for number, found in rows.items()}
         return _log(folder, rows, frame_rate_hz, sorted(rows))
     return _log(folder, rows, frame_rate_hz, n_images)
-
-
-def _listed_names(path: Path) -> dict[int, str]:
-    """Return the classes that YOLO text counts through: those that are listed beside it, else COCO's."""
-    listed = read_text(path, "a text file", MAX_TEXT_BYTES).split("\n") if path.exists() else YOLO_NAMES
-    return dict(enumerate(listed))
 
 
 def _yolo_row(line: str, size_px: tuple[int, int], names: Mapping[int, str]) -> Row:

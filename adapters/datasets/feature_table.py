@@ -99,9 +99,8 @@ class FeatureTable:
 
     def joined(self, other: "FeatureTable") -> "FeatureTable":
         """Return these windows and those of another table below them; the domain is this table's."""
-        rows: dict[str, Any] = {
-            name: np.concatenate([getattr(one, name) for one in (self, other)]) for name in _ROWS
-        }
+        both = self, other
+        rows: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in both]) for name in _ROWS}
         return replace(self, t0_frames=self.t0_frames + other.t0_frames, **rows)
 
     def only(self, ids: Collection[str]) -> "FeatureTable":

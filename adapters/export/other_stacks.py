@@ -167,9 +167,8 @@ def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[
     ego = state.ego
     if ego is None or not ego.localised:
         got = "none" if ego is None else "a speed without a pose"
-        raise InvalidArgumentError(
-            f"Autoware's objects stand in the map: expected odometry with x_m, y_m and yaw_rad, got {got}"
-        )
+        expected = "expected odometry with x_m, y_m and yaw_rad"
+        raise InvalidArgumentError(f"Autoware's objects stand in the map: {expected}, got {got}")
     sec, nanosec = divmod(state.stamp_ns, 1_000_000_000)
     header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "map"}
     objects = [_object(_in_map(one, ego)) for one in lane_objects(state, crossing_m)]
@@ -211,6 +210,7 @@ def likeliest_label(one: LaneObject) -> int:
 def _object(one: LaneObject) -> dict[str, Any]:
     speed = float(np.hypot(*one.velocity_mps))
     length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
+    kinds = [{"label": LABELS.get(kind, 0), "probability": share} for kind, share in _kinds(one.entity)]
     poses = [_pose(point, 0.5 * height, one.yaw_rad) for point in one.path_m()]
     pose = {"pose": poses[0], "covariance": _covariance(one.covariance)}
     twist = {"linear": _xyz(speed, 0.0), "angular": _xyz(0.0, 0.0)}  # in the axes of the object
@@ -225,9 +225,7 @@ def _object(one: LaneObject) -> dict[str, Any]:
         "object_id": {"uuid": list(uuid.UUID(one.entity.id).bytes)},
         "existence_probability": one.entity.existence_probability,
         # Planners take the first one, and fail where there is none.
-        "classification": [
-            {"label": LABELS.get(kind, 0), "probability": share} for kind, share in _kinds(one.entity)
-        ],
+        "classification": kinds,
         "kinematics": {
             "initial_pose_with_covariance": pose,
             "initial_twist_with_covariance": {"twist": twist, "covariance": unknown},
@@ -295,8 +293,7 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
     available = "AVAILABLE_REDUCED" if impaired else "AVAILABLE"
     header.data_qualifier = getattr(header, f"DATA_QUALIFIER_{available}")
     for one in lane_objects(state, crossing_m):
-        relative_mps = one.velocity_mps - _of_axes(one.position_m, _twist(state))
-        _fill(data.moving_object.add(), one, relative_mps)
+        _fill(data.moving_object.add(), one, one.velocity_mps - _of_axes(one.position_m, _twist(state)))
     return data
 
 
@@ -401,8 +398,7 @@ def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
         known = kinds.TYPE_VEHICLE if number else kinds.TYPE_UNKNOWN
         candidate.type = kinds.TYPE_PEDESTRIAN if number == _PERSON else known
         if number in _VEHICLES:
-            vehicle = getattr(kinds.VehicleClassification, _VEHICLES[number])
-            candidate.vehicle_classification.type = vehicle
+            candidate.vehicle_classification.type = getattr(kinds.VehicleClassification, _VEHICLES[number])
 
 
 class _Numbers:

@@ -315,9 +315,8 @@ def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]
     counts = [i for i, found in zip((0, 3), counted, strict=True) if len(found) == len(cells)]
     if len(counts) == 1:
         return [i for i in range(4) if i != counts[0]], counts[0], None
-    problem = (
-        f"expected x, y and z, got {len(cells[0])} numbers a line: a header x,y,z,gain states what they are"
-    )
+    way_on = "a header x,y,z,gain states what they are"
+    problem = f"expected x, y and z, got {len(cells[0])} numbers a line: {way_on}"
     raise InputFileError(path, f"{problem}; {_TRANSPOSED}" if len(cells) == 3 else problem)
 
 
@@ -328,9 +327,8 @@ def _odas_rows(path: Path, text: str, begin: int) -> _Rows:
     if block is None or block[0].count("{") != len(rows) or any(len(row) != 3 for row in rows):
         raise InputFileError(path, "expected mics = ( { mu = ( x, y, z ); ... }, ... ) as in ODAS")
     numbers = [one.strip() for one in used[1].split(",")] if used else []
-    return _Rows(
-        rows, channels=tuple(int(one) if one.isdecimal() and len(one) < 10 else one for one in numbers)
-    )
+    channels = tuple(int(one) if one.isdecimal() and len(one) < 10 else one for one in numbers)
+    return _Rows(rows, channels=channels)
 
 
 def _json_rows(path: Path, data: bytes) -> _Rows:

@@ -111,9 +111,8 @@ def read_odometry(path: Path | str) -> OdometryLog:
 
 def _other_units(log: OdometryLog, turned_rad: float) -> Iterator[tuple[str, str]]:
     """Yield columns whose numbers no vehicle has, and the unit in which it may have them."""
-    speeds, rates = (
-        np.array([getattr(one, name) for one in log.told]) for name in ("speed_mps", "yaw_rate_rad_s")
-    )
+    speeds = np.array([one.speed_mps for one in log.told])
+    rates = np.array([one.yaw_rate_rad_s for one in log.told])
     if turned_rad > MOST_TURNED_RAD:
         yield "yaw_rad", "degrees"
     if np.mean(np.abs(speeds * rates) > MOST_ACROSS_MPS2) > 0.1:

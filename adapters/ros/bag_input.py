@@ -354,9 +354,8 @@ def _bytes_of(pcm: sound_file.RawPcm, message: Any) -> bytes:
     """Return samples as bytes, channels interleaved."""
     data, layout = getattr(message, "audio", message).data, getattr(message, "layout", "interleaved")
     if hasattr(message, "layout") and len(data) % pcm.channels:
-        raise InputFileError(
-            pcm.name, f"expected samples of {pcm.channels} channels, got {len(data)} numbers"
-        )
+        problem = f"expected samples of {pcm.channels} channels, got {len(data)} numbers"
+        raise InputFileError(pcm.name, problem)
     if layout not in ("interleaved", "planar"):
         raise InputFileError(pcm.name, f"layout: expected interleaved or planar, got {layout!r:.40}")
     frames = getattr(message, "frame_sample_count", None)
@@ -434,9 +433,8 @@ def _in_base_link(bag: BagReader, sound: BagSound, points_m: FloatArray) -> Floa
     transforms, passed = _static_transforms(bag), set[str]()
     while frame != "base_link" and frame in transforms:
         if frame in passed:
-            raise InputFileError(
-                bag.path, f"{STATIC_TOPIC}: expected no loop, got one of {len(passed)} frames"
-            )
+            problem = f"{STATIC_TOPIC}: expected no loop, got one of {len(passed)} frames"
+            raise InputFileError(bag.path, problem)
         passed.add(frame)
         frame, said = transforms[frame]
         points_m = _in_parent(bag.path, said, points_m)

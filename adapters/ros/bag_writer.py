@@ -118,9 +118,8 @@ def write_bag(
         write(STATIC_TOPIC, types.TRANSFORMS, start_ns, {"transforms": _frames(array, camera, start_ns)})
         write(ARRAY_TOPIC, types.ARRAY, start_ns, _array(array, start_ns))
         rate_hz, taken = audio.sample_rate_hz, 0
-        events = heapq.merge(
-            _seen(detections, start_ns), _driven(ego, start_ns), _heard(audio, start_ns), key=itemgetter(0)
-        )
+        every = _seen(detections, start_ns), _driven(ego, start_ns), _heard(audio, start_ns)
+        events = heapq.merge(*every, key=itemgetter(0))
         for stamp_ns, topic, kind, values in events:
             write(topic, kind, stamp_ns, values)
             if topic == AUDIO_TOPIC:

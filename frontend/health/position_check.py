@@ -326,9 +326,8 @@ class Comparison:
     def _by_chance(self, hypothesis: Hypothesis, explained: FloatArray) -> bool:
         rng = np.random.default_rng(0)
         orders = (rng.permutation(len(self._positions)) for _ in range(_RANDOM_ORDERS))
-        return any(
-            self._gain(explained, hypothesis.best(self._in_order(one))) < _ORDER_GAIN for one in orders
-        )
+        gains = (self._gain(explained, hypothesis.best(self._in_order(one))) for one in orders)
+        return any(gain < _ORDER_GAIN for gain in gains)
 
     def _mounting(self, heard_from_rad: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the mountings in which a sound from there is heard where it is, or why none is named."""
