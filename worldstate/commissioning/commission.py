@@ -278,9 +278,8 @@ def commission(
     def learned(stage: str) -> None:
         on_step(stage, learning_minutes(settings) / LEARNING_STEPS)
 
-    open_field = open_field_windows(
-        open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs, settings.moving_ego)
-    )
+    number = N_OPEN // 10 if settings.quick else N_OPEN
+    open_field = open_field_windows(open_field_features(array, number, rng, jobs, settings.moving_ego))
     fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same in every fold
 
     def fit(some: Sequence[HeardStream]) -> EnsembleModel:
@@ -303,9 +302,8 @@ def commission(
         learned("sounds near by")
         model = _with_ears(model, array, streams, recorded, settings, jobs, learned)
     named = [STREETS] if real is None else [STREETS, DataSource(source, "coefficients", licence)]
-    named += (
-        [] if recorded is None else [DataSource(recorded.told, "coefficients", "; ".join(recorded.licences))]
-    )
+    if recorded is not None:
+        named.append(DataSource(recorded.told, "coefficients", "; ".join(recorded.licences)))
     named += CHOSEN_ON if model.guard is not None else ()
     named += [DataSource(path.name, "thresholds") for path in quiet] or [replace(STREETS, use="thresholds")]
     named.append(replace(STREETS, use="exam"))

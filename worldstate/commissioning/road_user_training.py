@@ -104,9 +104,8 @@ def _rows_at(position_m: FloatArray, sample_rate_hz: float, drawn: tuple[str, in
     name, seed = drawn
     settings = StreamSettings(junction_named(name), minutes=1.0, sample_rate_hz=sample_rate_hz)
     draws = np.random.default_rng(seed).spawn(len(CLASS_OF))
-    return RoadUserRows.joined(
-        [_pass(settings, kind, position_m, rng) for kind, rng in zip(CLASS_OF, draws, strict=True)]
-    )
+    drawn_by_kind = zip(CLASS_OF, draws, strict=True)
+    return RoadUserRows.joined([_pass(settings, kind, position_m, rng) for kind, rng in drawn_by_kind])
 
 
 def _pass(

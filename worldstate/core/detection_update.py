@@ -128,9 +128,8 @@ def detection_update(
     if in_sight:
         # A detection that may be of a known entity is a new one the less.
         detections = replace(detections, existence=detections.existence * whose.unclaimed)
-    memory.tracks = tracks = known.joined(
-        [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
-    )
+    born = [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
+    memory.tracks = tracks = known.joined(born)
     chances, detection = np.append(whose.chances, np.ones(len(whose.new))), np.full(len(tracks), -1)
     detection[list(whose.found)], detection[n:] = list(whose.found.values()), whose.new
     rows, missed, was_seen = np.flatnonzero(detection >= 0), np.flatnonzero(detection < 0), tracks.seen.copy()

@@ -134,9 +134,8 @@ class WorldFilter:
         InvalidArgumentError
             If the step is negative or not finite.
         """
-        return self.predict_to(
-            self.stamp_ns + nanoseconds(in_range("dt_s", dt_s, 0.0, math.inf, open_high=True))
-        )
+        step_s = in_range("dt_s", dt_s, 0.0, math.inf, open_high=True)
+        return self.predict_to(self.stamp_ns + nanoseconds(step_s))
 
     def predict_to(self, stamp_ns: int) -> "WorldFilter":
         """Return the filter at a later time, ns.
@@ -148,9 +147,8 @@ class WorldFilter:
         """
         stamp_ns = integer_ns("stamp_ns", stamp_ns)
         if stamp_ns < self.stamp_ns - SLACK_NS:
-            raise InvalidArgumentError(
-                f"stamp_ns: expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
-            )
+            problem = f"expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
+            raise InvalidArgumentError(f"stamp_ns: {problem}")
         if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
             return self
         # From the last measurement on, so that many small steps are one step to the bit.

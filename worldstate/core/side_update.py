@@ -31,9 +31,8 @@ def heard_beside(memory: Memory, measurement: Measurement, street: StreetModel) 
         in_view = max(in_view, memory.belief.in_view)
     # P(a vehicle that comes into view within three seconds adds a decibel or more to 300 Hz to 2 kHz); with
     # none in view it is 0.8 from 3 dB on.
-    share = 1.0 - in_view * (
-        1.0 - 0.5 * falling(heard.excess_db, (street.excess_low_db, street.excess_high_db))
-    )
+    quiet = falling(heard.excess_db, (street.excess_low_db, street.excess_high_db))
+    share = 1.0 - in_view * (1.0 - 0.5 * quiet)
     # A vehicle that is hardly in view is no reason.
     if in_view < 0.5 or share >= heard.share:
         return heard

@@ -107,18 +107,16 @@ class StreetBelief:
     def check(self, directions: int) -> None:
         """Refuse what a file cannot have been written with, for so many approach sides."""
         name, groups = "memory.belief", BINS + len(OTHERS)
-        every = {"weights": self.joint.weights, "share": self.share} | {
-            f"alone.{key}": one for key, one in self.joint.alone.items()
-        }
+        every = {"weights": self.joint.weights, "share": self.share}
+        every |= {f"alone.{key}": one for key, one in self.joint.alone.items()}
         every |= {f"trust.{key}": one.works for key, one in self.joint.trust.items()}
         for key in ("usual", "groups"):
             finite_array(f"{name}.{key}", getattr(self, key), (directions, groups))
         for key, array in every.items():
             if array is None:
                 continue
-            finite_array(
-                f"{name}.{key}", array, (groups,) if key == "share" else (*[2 * PARTS] * directions, 2)
-            )
+            shape = (groups,) if key == "share" else (*[2 * PARTS] * directions, 2)
+            finite_array(f"{name}.{key}", array, shape)
             total = float(array.sum())
             if (array < 0.0).any() or not (key.startswith("trust") or np.isclose(total, 1.0)):
                 raise InvalidArgumentError(f"{name}.{key}: expected probabilities")
@@ -179,9 +177,8 @@ class StreetBelief:
         # The last digits depend on the order of sums, and must not decide at a threshold.
         in_view = np.maximum(self.joint.emerged_from, self.shown)
         told, emerged = (tuple(one.round(12).tolist()) for one in (self.comes, in_view))
-        return SideBelief(
-            told, emerged, told, 1.0 - self.joint.none_comes, self.joint.explanations, self.both_come
-        )
+        any_comes = 1.0 - self.joint.none_comes
+        return SideBelief(told, emerged, told, any_comes, self.joint.explanations, self.both_come)
 
     def emerged_since(self, stamp_ns: int, time_s: float) -> list[bool]:
         """Return from which sides a vehicle has come into view within so long before a time."""
@@ -236,9 +233,8 @@ class StreetBelief:
         """Return the belief without the alarms of some sides that are only held."""
         least = self.threshold_nats(policy, street)
         pairs = enumerate(zip(self.over_ns, self.decided, strict=True))
-        return replace(
-            self, over_ns=tuple(None if k in sides and one < least else ns for k, (ns, one) in pairs)
-        )
+        over_ns = tuple(None if k in sides and one < least else ns for k, (ns, one) in pairs)
+        return replace(self, over_ns=over_ns)
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
         """Return for each side when its alarm ends: a second after it was last above the threshold."""

@@ -78,9 +78,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         check_extent(array, front_end.settings.srp_band_hz[1])
         health, check = examine(audio, front_end, arguments.heard_from)
         if arguments.duration is not None:
-            rate = channel_report.rate_from_duration(
-                audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
-            )
+            lasted, rate_hz = (arguments.duration, arguments.duration_error), float(audio.sample_rate_hz)
+            rate = channel_report.rate_from_duration(audio.frames, *lasted, rate_hz)
             health = replace(health, sample_rate=rate)
         heard = health, audio, array, inputs.stance(array)
         report, lines = channel_report.as_json(*heard), list(channel_report.as_text(*heard))

@@ -40,9 +40,8 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
     grounded = "weigh windows with bearing and approach, eq. (5), not the sequence (default: off)"
     add("--grounded", action="store_true", help=grounded)
     usual = "default: a usual blind junction, and states say so"
-    add(
-        "--context", type=Path, metavar="FILE", help=f"corners, lanes and rates of this place, JSON ({usual})"
-    )
+    told = f"corners, lanes and rates of this place, JSON ({usual})"
+    add("--context", type=Path, metavar="FILE", help=told)
     street = "edges, pace and sides of this place as `street learn` wrote them, in place of --context"
     add("--street", type=Path, metavar="JSON", help=street)
 

@@ -253,9 +253,8 @@ def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
         if not counts["frames"]:
             say(f"{name}no image was looked at, so that the camera counts as not asked (--images N)")
         elif not counts["empty"] and not counts["parked"]:
-            say(
-                f"{name}no image is without a box: are those missing in which nothing was found (--images N)?"
-            )
+            question = "are those missing in which nothing was found (--images N)?"
+            say(f"{name}no image is without a box: {question}")
     if source.co_evidence is not None:
         named = {name.removesuffix(": "): counts for name, counts in each.items()}
         return named if as_json else [name + told_counts(counts) for name, counts in each.items()]

@@ -220,9 +220,8 @@ def _observations(one: BoxTrack, camera_ahead_m: float) -> dict[int, list[Observ
     first = round(float(one.time_s[0]) / HOP_S)
     found: dict[int, list[Observation]] = {at: [] for at in range(first - round(HIDDEN_S / HOP_S), first)}
     for time_s, azimuth, height in zip(one.time_s, one.leading_rad, one.height_rad, strict=True):
-        found.setdefault(round(float(time_s) / HOP_S), []).extend(
-            _seen(float(azimuth), float(height), one.label, camera_ahead_m)
-        )
+        seen = _seen(float(azimuth), float(height), one.label, camera_ahead_m)
+        found.setdefault(round(float(time_s) / HOP_S), []).extend(seen)
     return found
 
 
