@@ -71,8 +71,7 @@ class Car:
         x = self.lane_x_m + (HALF_M + SHADOW_REACH_M) * np.array([-1.0, 1.0])
         rear = self.front_y_m - self.heading * LENGTH_M
         y = np.sort([self.front_y_m, rear]) + SHADOW_REACH_M * np.array([-1.0, 1.0])
-        z = ROAD_Z_M + np.array([0.0, HEIGHT_M])
-        return np.array(np.meshgrid(x, y, z)).reshape(3, -1).T
+        return np.array(np.meshgrid(x, y, ROAD_Z_M + np.array([0.0, HEIGHT_M]))).reshape(3, -1).T
 
 
 def add_car(street: StreetView, car: Car, image: Float32Array) -> None:
@@ -104,8 +103,7 @@ def _painted(street: StreetView, car: Car, patch: Patch) -> Float32Array:
     _cast_shadow(colours, depth, rays, eye)
     for faces, paint in ((_BODY, _paint_body), (_CABIN, _paint_cabin)):
         normals = np.array([normal for normal, _ in faces.values()])
-        offsets = np.array([offset for _, offset in faces.values()])
-        reach, face = cast_solid(rays, eye, normals, offsets)
+        reach, face = cast_solid(rays, eye, normals, np.array([offset for _, offset in faces.values()]))
         nearer = reach < depth
         places = eye.astype(np.float32) + reach[nearer][:, None] * rays[nearer]
         colours[nearer] = paint(car, places, np.array(list(faces))[face[nearer]])

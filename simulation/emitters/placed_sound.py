@@ -96,8 +96,7 @@ def add_sound(street: StreetSound, sound: SoundSettings, rng: np.random.Generato
     level = np.float32(10.0 ** (sound.level_offset_db / 20.0))
     signal[before : before + samples] = level * emitted(sound.what, samples, rate, rng, folder)
     time = sound.start_s + (np.arange(blocks + 1) - SILENT_BLOCKS) * KNOT_SAMPLES / rate
-    track = SoundTrack(time, *sound.at(time), sound.facing(time))
-    _add_from(street, signal, track, sound.what, rng)
+    _add_from(street, signal, SoundTrack(time, *sound.at(time), sound.facing(time)), sound.what, rng)
 
 
 def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.random.Generator) -> None:

@@ -143,8 +143,7 @@ def _fricatives(samples: int, rate_hz: float, syllables: Spans, rng: np.random.G
     """Noise of the teeth before some of the syllables, shape (samples,)."""
     starts = (start for start, _ in syllables if rng.random() < FRICATIVE_SHARE)
     spans = [(start - rng.uniform(*FRICATIVE_S), start) for start in starts]
-    noise = octave_noise(FRICATIVE_DB, samples, rate_hz, rng)
-    return noise * gate(samples, rate_hz, spans, 0.02)
+    return octave_noise(FRICATIVE_DB, samples, rate_hz, rng) * gate(samples, rate_hz, spans, 0.02)
 
 
 # People walk at 1.5 to 2.3 steps a second, 1.9 in the mean (Bachmann and Ammann, "Vibrations in structures
@@ -266,7 +265,8 @@ def tune(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
             pitch = tonic * 2.0 ** (rng.choice(SCALE) / 12.0)
             vibrato = 1.0 + VIBRATO * np.sin(2.0 * np.pi * VIBRATO_HZ * time)
             wave = rng.uniform(0.5, 1.0) * harmonics(pitch * vibrato, overtones, rate_hz)
-            _add(out, at, rate_hz, wave * np.exp(-time / decay_s) * _edges(time, 0.01))
+            edges = np.minimum(np.minimum(time, time[::-1]) / 0.01, 1.0)
+            _add(out, at, rate_hz, wave * np.exp(-time / decay_s) * edges)
             at += length_s
     return out
 
@@ -332,10 +332,6 @@ def _falling(slope: float, count: int) -> list[float]:
 def _times(out: FloatArray, at_s: float, length_s: float, rate_hz: float) -> FloatArray:
     """Return times since `at_s` of so long a note, of which the end of the sound may cut some."""
     return np.arange(max(min(int(length_s * rate_hz), len(out) - int(at_s * rate_hz)), 0)) / rate_hz
-
-
-def _edges(time: FloatArray, ramp_s: float) -> FloatArray:
-    return np.minimum(np.minimum(time, time[::-1]) / ramp_s, 1.0)
 
 
 def _add(out: FloatArray, at_s: float, rate_hz: float, wave: FloatArray) -> None:
@@ -521,8 +517,7 @@ def drill(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 def jackhammer(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     """Draw a breaker that breaks up a road, shape (samples,)."""
-    runs = bursts(samples / rate_hz, BROKEN_S, REST_S, rng)
-    return hammered(samples, rate_hz, runs, BREAKER_BLOWS_HZ, rng)
+    return hammered(samples, rate_hz, bursts(samples / rate_hz, BROKEN_S, REST_S, rng), BREAKER_BLOWS_HZ, rng)
 
 
 def hammered(

@@ -393,8 +393,7 @@ def bridge_pier() -> Place:
     """Return two piers beside a ramp; a vehicle on a road that the ramp joins stays behind one for long."""
     left = ((60.0, 21.0), (24.0, 8.0), (12.0, 5.6), (-10.0, 5.6))
     piers = box(7.0, 9.0, 1.0, 3.0), box(7.0, 9.0, -3.0, -1.0)
-    ways = Way("left", left), Way("right", _mirrored(left)), CROSSES_BEHIND
-    return _open("SP1", ways, *piers)
+    return _open("SP1", (Way("left", left), Way("right", _mirrored(left)), CROSSES_BEHIND), *piers)
 
 
 def merge() -> Place:

@@ -68,8 +68,7 @@ def resample_whole(signal: Float32Array, oversampling: int) -> Float32Array:
     >>> bool(np.allclose(resample_whole(x, 4)[::4], x, atol=1e-5))
     True
     """
-    n = len(signal)
-    return np.asarray(irfft(rfft(signal) * np.float32(oversampling), n * oversampling), np.float32)
+    return np.asarray(irfft(rfft(signal) * np.float32(oversampling), len(signal) * oversampling), np.float32)
 
 
 def level_curve(octave_levels_db: FloatArray, frequencies_hz: FloatArray) -> FloatArray:

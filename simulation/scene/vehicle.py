@@ -220,8 +220,7 @@ def drive(
     clock = np.r_[time_s[0] - earlier, time_s, time_s[-1] + later]
     slowed = braking_mps2 * np.clip(clock - (entry_s - 2.0), 0.0, 2.0)
     speed = np.maximum(speed_mps - slowed, 0.25 * speed_mps)
-    mean = np.r_[0.0, 0.5 * (speed[1:] + speed[:-1])]
-    driven = np.cumsum(mean) * step
+    driven = np.cumsum(np.r_[0.0, 0.5 * (speed[1:] + speed[:-1])]) * step
     front = entry_y_m + heading * (driven - np.interp(entry_s, clock, driven))
     asked = slice(before, before + len(time_s))
     return Trajectory(time_s, front[asked], speed[asked], lane_x_m, heading, kind)
@@ -237,8 +236,7 @@ def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = n
             if i:
                 speed[i] = min(speed[i], _turn_speed(driven[i - 1], end_m))
                 driven[i] = min(driven[i - 1] + speed[i] * step, end_m)
-    y = route.at(driven)[1]
-    return replace(passing, front_y_m=y, speed_mps=speed, route=route, driven_m=driven)
+    return replace(passing, front_y_m=route.at(driven)[1], speed_mps=speed, route=route, driven_m=driven)
 
 
 def _turn_speed(driven_m: float, end_m: float) -> float:

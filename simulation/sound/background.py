@@ -298,8 +298,7 @@ def noise_frequencies(samples: int, sample_rate_hz: float) -> FloatArray:
 def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> FloatArray:
     """Draw when distant vehicles are loudest, a Poisson process that knows nothing of a recording's ends."""
     expected = preset.far_rate * (duration_s + 2.0 * FAR_AUDIBLE_S) / FAR_SPAN_S
-    number = min(int(rng.poisson(expected)), MAX_FAR)
-    return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, number)
+    return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, min(int(rng.poisson(expected)), MAX_FAR))
 
 
 def wind_density(

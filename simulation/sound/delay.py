@@ -53,8 +53,7 @@ def add_delayed(out: Float32Array, table: SampledSignal, emit_s: FloatArray, gai
     low, high = at[:-1][span], at[1:][span]
     base = np.floor(low)
     lines = _Lines(low - base, high - base), _Lines(gain[:-1][span], gain[1:][span])
-    rows = out.reshape(len(at) - 1, -1)[span]
-    _add_between_knots(rows, table, base.astype(np.intp)[:, None], *lines)
+    _add_between_knots(out.reshape(len(at) - 1, -1)[span], table, base.astype(np.intp)[:, None], *lines)
 
 
 def _inside(at: FloatArray, end: int) -> slice | None:

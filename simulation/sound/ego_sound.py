@@ -273,8 +273,7 @@ def _paths_m(source: FloatArray, positions: FloatArray, roof: FloatArray) -> tup
 
 def _add_wind(out: Float32Array, speed: FloatArray, rate: float, rng: np.random.Generator) -> None:
     """Add turbulence at every microphone by itself, its level following the speed."""
-    frequencies = noise_frequencies(len(speed), rate)
-    shape = wind_density(WIND_AT_10_DB, frequencies) * rate
+    shape = wind_density(WIND_AT_10_DB, noise_frequencies(len(speed), rate)) * rate
     gain = (np.maximum(speed, 0.1) / 10.0) ** (WIND_EXPONENT / 20.0)
     for channel in out:
         channel += shaped_noise(shape, len(speed), rng) * gain.astype(np.float32)

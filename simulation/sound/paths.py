@@ -139,8 +139,7 @@ def trace_paths(
     facades, sides = (np.ones(len(OCTAVES_HZ)),) * 2 if specular is None else specular
     paths = []
     for source, receiver in product(source_images(site, lane_x_m), receiver_images(site)):
-        end_m = receiver_x_m, receiver.offset_m
-        passage = through_mouth(site, (source.x_m, source_y_m), end_m, height_m)
+        passage = through_mouth(site, (source.x_m, source_y_m), (receiver_x_m, receiver.offset_m), height_m)
         walls = source.gain * receiver.gain * near_facade(site, source, source_y_m, passage.aim_y_m)
         walls = walls * side_walls(site, receiver, receiver_x_m, (site.corner_ahead_m, passage.aim_y_m))
         gain = walls[:, None] * facades**source.order * sides**receiver.order * passage.screen_gain(cap_db)

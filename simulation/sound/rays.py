@@ -288,8 +288,7 @@ def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generat
             table, span = made
             if way.early < 1.0:
                 table = _smeared(table, way.early, way.decay_s, rng)
-            later = length[span] + way.later_m
-            add_along(wave, table, emission.knots_s[span], later, receiver.knots_s)
+            add_along(wave, table, emission.knots_s[span], length[span] + way.later_m, receiver.knots_s)
     directions = unit_vectors(*np.array([(way.azimuth_rad, way.elevation_rad) for way in ways]).T)
     delays = plane_wave_delays(directions, receiver.positions_m - receiver.centre_m)
     static.add(waves, delays + receiver.skew_s)

@@ -199,8 +199,7 @@ def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Gener
         tails = rfft(responses, n)
         tails *= spectrum
         waves[some] = irfft(tails, n)[:, len(dry) - samples : len(dry)]
-    offsets = positions_m - positions_m.mean(axis=0)
-    static.add(waves, plane_wave_delays(directions, offsets))
+    static.add(waves, plane_wave_delays(directions, positions_m - positions_m.mean(axis=0)))
 
 
 def add_late_sound(
@@ -230,8 +229,7 @@ def _late_gain(street: StreetSound, x_m: FloatArray, y_m: FloatArray, time_s: Fl
     level = 10.0 ** (late_level_db(street.site, street.preset) / 20.0)
     gain = level * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
     knots = np.arange(len(gain)) * KNOT_SAMPLES
-    samples = np.arange((len(gain) - 1) * KNOT_SAMPLES)
-    return np.asarray(np.interp(samples, knots, gain), np.float32)
+    return np.asarray(np.interp(np.arange((len(gain) - 1) * KNOT_SAMPLES), knots, gain), np.float32)
 
 
 def _until_the_end(signal: Float32Array, start_s: float, receiver: Receiver) -> Float32Array:

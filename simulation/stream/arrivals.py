@@ -108,8 +108,9 @@ def _arrival(
     arms = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
     if flow == "queue":
         arms[flow] = ((LEFT,), (RIGHT,))[rng.integers(2)]
+    names, shares = zip(*traffic.kinds.items(), strict=True)
     for arm in arms.get(flow, (None,)):
-        kind = _kind(traffic, rng)
+        kind = vehicle_kind(str(rng.choice(names, p=np.array(shares) / sum(shares))))
         # A bicycle two streets away is not heard.
         heard = vehicle_kind("light") if flow in FAR and kind.name == "bicycle" else kind
         driver = draw_driver(settings.site, heard, preset, rng, arm)
@@ -174,8 +175,3 @@ def _signal(traffic: Traffic, kind: VehicleKind, rng: np.random.Generator) -> st
         if (signal == "bicycle-bell") == (kind.ridden_mps is not None) and rng.random() < share:
             return signal
     return ""
-
-
-def _kind(traffic: Traffic, rng: np.random.Generator) -> VehicleKind:
-    names, shares = zip(*traffic.kinds.items(), strict=True)
-    return vehicle_kind(str(rng.choice(names, p=np.array(shares) / sum(shares))))

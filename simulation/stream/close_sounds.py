@@ -67,8 +67,7 @@ def close_vehicle(
     kind: VehicleKind, preset: Preset, site: Site, seconds: float, rate_hz: float, rng: np.random.Generator
 ) -> FloatArray:
     """Draw a vehicle that passes close by in the open, shape (samples,), of any level."""
-    speeds = kind.ridden_mps or SPEEDS_MPS
-    passes_s, speed = rng.uniform(0.1, 0.9) * seconds, rng.uniform(*speeds)
+    passes_s, speed = rng.uniform(0.1, 0.9) * seconds, rng.uniform(*(kind.ridden_mps or SPEEDS_MPS))
     time = np.arange(0.0, seconds, 0.1) - passes_s
     harder = RIDDEN_MPS2 if kind.turns_hz else ACCELERATIONS_MPS2
     moves = np.maximum(speed + rng.choice(harder) * time, 1.0)
@@ -81,8 +80,7 @@ def idling_vehicle(
     kind: VehicleKind, preset: Preset, site: Site, seconds: float, rate_hz: float, rng: np.random.Generator
 ) -> FloatArray:
     """Draw a vehicle that stands close by with its engine on, shape (samples,), of any level."""
-    still = np.zeros(len(np.arange(0.0, seconds, 0.1)))
-    sound = _in_the_open(kind, still, 0.0, preset, site, rate_hz, rng)
+    sound = _in_the_open(kind, np.zeros(len(np.arange(0.0, seconds, 0.1))), 0.0, preset, site, rate_hz, rng)
     if kind.turns_hz:  # Its pulses are in its sound
         return _fluctuating(sound, rate_hz, rng, _STEADIER)
     firing_hz = rng.uniform(*_FIRING_HZ) * (1.0 + 0.02 * drift(len(sound), rate_hz, 0.3, rng))

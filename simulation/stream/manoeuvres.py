@@ -68,10 +68,6 @@ class Motion:
         return Trajectory(time_s, y, speed, lane, self.heading, self.kind, route, driven)
 
 
-def _grid(low_m: float, high_m: float) -> FloatArray:
-    return np.linspace(low_m, high_m, max(round((high_m - low_m) / STEP_M), 1) + 1)
-
-
 def confined(route: Route, near_m: float, far_m: float) -> Route:
     """Return the route with its way ahead kept between two limits.
 
@@ -144,8 +140,8 @@ class Driver:
         stops = sorted((one for one in limits if one.stands_s > 0.0), key=lambda one: one.at_m)
         edges = [span_m[0], *(one.at_m for one in stops), span_m[1]]
         # A stop is in the grid twice: between both nothing is driven and time goes by.
-        pieces = [_grid(low, high) for low, high in pairwise(edges)]
-        driven = np.concatenate(pieces)
+        counts = [max(round((high - low) / STEP_M), 1) + 1 for low, high in pairwise(edges)]
+        driven = np.concatenate(list(map(np.linspace, edges, edges[1:], counts)))
         speed = np.full_like(driven, self.speed_mps)
         for one in limits:
             before = one.at_m - driven
@@ -154,7 +150,7 @@ class Driver:
         # At constant acceleration a step takes its length over the mean of both speeds, exactly.
         step, twice = np.diff(driven), speed[1:] + speed[:-1]
         took = 2.0 * step / np.maximum(twice, 1e-6)
-        ends = np.cumsum([len(piece) for piece in pieces[:-1]], dtype=int)
+        ends = np.cumsum(counts[:-1], dtype=int)
         took[ends - 1] = [one.stands_s for one in stops]
         heading = int(self.side) if into else -int(self.side)
         return Motion(route, np.r_[0.0, np.cumsum(took)], driven, speed, self.kind, heading)
@@ -233,8 +229,7 @@ def joins(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
 
 def _hidden_y_m(driver: Driver, before_m: float) -> float:
     """Return y in the arm, so far before the line of sight of the lane that leads into it."""
-    entry = entry_y_m(driver.site, driver.lane_m(into=True), driver.arm)
-    return entry + driver.side * before_m
+    return entry_y_m(driver.site, driver.lane_m(into=True), driver.arm) + driver.side * before_m
 
 
 def parks(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
@@ -261,8 +256,7 @@ def passes_far(
 def from_behind(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     """Overtake the standing ego in its own street and turn into the arm."""
     own = min(OWN_LANE_M, driver.site.side_wall_left_m - KERB_M)
-    turn = (driver.lane_m(into=True) - TURN_RADIUS_M, own)
-    return _turn_into(driver, turn, (1.0, 0.0))
+    return _turn_into(driver, (driver.lane_m(into=True) - TURN_RADIUS_M, own), (1.0, 0.0))
 
 
 def from_ahead(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
@@ -308,8 +302,7 @@ def _turn_into(driver: Driver, turn_m: tuple[float, float], towards: tuple[float
     """Come straight to a point in view or beside the ego, turn there into the arm and leave by it."""
     corner = _arc(turn_m, towards, (0.0, driver.side))
     before = np.array(turn_m) - towards
-    after = corner[-1:] + np.array([0.0, driver.side])
-    points = np.concatenate([[before], corner, after])
+    points = np.concatenate([[before], corner, corner[-1:] + np.array([0.0, driver.side])])
     length = 0.5 * np.pi * TURN_RADIUS_M
     limits = [SpeedLimit(0.0, TURN_MPS), SpeedLimit(length, TURN_MPS)]
     motion = driver.motion(along(points, 1.0), (-driver.reach_m, length + driver.reach_m), limits, into=True)

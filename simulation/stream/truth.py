@@ -184,8 +184,7 @@ def stream_hazards(folder: Path) -> int:
     if not path.is_file():
         return 0
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        return sum(bool(one["hazard"]) for one in told["vehicles"])
+        return sum(bool(one["hazard"]) for one in json.loads(path.read_text(encoding="utf-8"))["vehicles"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputFileError(path, f"expected the events of a simulated stream: {error!r}") from error
 
