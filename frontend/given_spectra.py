@@ -118,7 +118,9 @@ class SpectrumFrontEnd:
         with one_blas_thread():
             self._least_prominence = self._noise_prominence()
         self._rows = spectra.values
-        self._published = _at_published_azimuths(spectra)
+        # The spectra at the thirty azimuths of the published feature, shape (hops, 30).
+        rows = [np.interp(FEATURE_AZIMUTHS_RAD, spectra.azimuths_rad, row) for row in spectra.values]
+        self._published = np.array(rows)
         self._scatter = BearingScatter(uniform_std_rad(spectra.azimuths_rad))
         self._cutter = HopCutter(1, sample_rate_hz)
         self._meter = LevelMeter(1, sample_rate_hz, settings)
@@ -160,15 +162,13 @@ class SpectrumFrontEnd:
 
     def _hop(self, hop: Hop) -> AcousticFrame | None:
         levels = self._meter.push(hop.samples)
-        self._energies.append(self._energy(hop.samples))
+        # The mean square in the looming band of the frames that end in the hop.
+        powers = power(self._stft.push(hop.samples))
+        self._energies.append(float(mean_square_per_bin(powers, self.settings.nfft).sum()))
         self._floor.push(self._energies[-1])
         if self._character is not None:
             self._character.push(hop.samples[:, 0])
         return self._frame(hop, levels) if WINDOW_HOPS <= hop.index <= len(self._rows) else None
-
-    def _energy(self, samples: Float32Array) -> float:
-        """Return the mean square in the looming band of the frames that end in a hop."""
-        return float(mean_square_per_bin(power(self._stft.push(samples)), self.settings.nfft).sum())
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
         each, window = self.spectra.hops, slice(hop.index - WINDOW_HOPS, hop.index)
@@ -204,9 +204,3 @@ class SpectrumFrontEnd:
         low, high = LOOMING_BAND_HZ
         scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
         return looming(times_s, np.log(energies), scatter, *self._floor.read(float(energies.min()), scatter))
-
-
-def _at_published_azimuths(spectra: GivenSpectra) -> FloatArray:
-    """Return the spectra at the thirty azimuths of the published feature, shape (hops, 30)."""
-    wanted = FEATURE_AZIMUTHS_RAD
-    return np.array([np.interp(wanted, spectra.azimuths_rad, row) for row in spectra.values])

@@ -113,8 +113,7 @@ class HopSpectra:
         nfft = settings.nfft
         self.srp_bins = band_bins(settings.srp_band_hz, sample_rate_hz, nfft)
         self.feature_bins = band_bins(FEATURE_BAND_HZ, sample_rate_hz, nfft)
-        looming_bins = band_bins(LOOMING_BAND_HZ, sample_rate_hz, nfft)
-        bands = (self.srp_bins, self.feature_bins, looming_bins)
+        bands = (self.srp_bins, self.feature_bins, band_bins(LOOMING_BAND_HZ, sample_rate_hz, nfft))
         bins = range(min(b.start for b in bands), max(b.stop for b in bands))
         inside = (slice(b.start - bins.start, b.stop - bins.start) for b in bands)
         self._srp, self._feature, self._looming = inside
@@ -143,7 +142,8 @@ class HopSpectra:
         centre, spectra = self._centre(heard), spectra if heard.all() else spectra[heard]
         powers = power(spectra)
         whitened = whiten(spectra, powers)
-        energies = self._frame_energies(powers)
+        # Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`.
+        energies = powers[:, self._looming].sum(axis=1, dtype=np.float64) * (2.0 / (0.375 * self._nfft**2))
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
         health = self._unmonitored
         if self.monitor is not None:
@@ -167,11 +167,6 @@ class HopSpectra:
         self._lost_tail = flags[n_new * half :]
         halves = np.asarray(flags[: (n_new + 1) * half].reshape(-1, half).any(axis=1))
         return np.asarray(~(halves[1:] | halves[:-1]))
-
-    def _frame_energies(self, powers: Float32Array) -> FloatArray:
-        """Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`."""
-        total = powers[:, self._looming].sum(axis=1, dtype=np.float64)
-        return np.asarray(total * (2.0 / (0.375 * self._nfft**2)))
 
     def _centre(self, heard: BoolArray) -> float:
         """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""
@@ -229,8 +224,7 @@ def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> Flo
     >>> log_band_energy(np.array([1.0, 1.0, 0.0]), np.array([1, 3, 4]), first=1).round(2)
     array([  0.69, -46.05])
     """
-    sums = np.add.reduceat(mean_square, edges[:-1] - first)
-    return np.asarray(np.log(np.maximum(sums, SILENCE)))
+    return np.asarray(np.log(np.maximum(np.add.reduceat(mean_square, edges[:-1] - first), SILENCE)))
 
 
 BANDS = 16
@@ -272,8 +266,7 @@ class LevelMeter:
         kept = None if keep is None else keep[self._channels]
         if kept is not None and kept.any() and not kept.all():
             powers = powers[:, :, kept]
-        mean_square = mean_square_per_bin(powers, self._nfft)
-        return log_band_energy(mean_square, self._edges, self._bins.start)
+        return log_band_energy(mean_square_per_bin(powers, self._nfft), self._edges, self._bins.start)
 
 
 _DB = 10.0 / float(np.log(10.0))

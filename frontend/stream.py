@@ -347,8 +347,7 @@ class FrontEnd:
         if not newest.n_frames:
             noise.skip()
             return self._levels
-        coherence = float(self._segment([newest], [newest]).mean())
-        share, reason = noise.push(levels, coherence, newest.common)
+        share, reason = noise.push(levels, float(self._segment([newest], [newest]).mean()), newest.common)
         self._hops[-1] = newest = newest.masked(share, reason)
         if newest.n_frames:
             self._levels = levels

@@ -76,8 +76,7 @@ def best_path(ratio: FloatArray, bin_hz: float) -> FloatArray:
     """
     # Half a resolution at the highest partial, so that no partial falls between two candidates.
     step = 0.5 / (WINDOW_S * BAND_HIGH_HZ)
-    count = int(np.log(HIGH_HZ / LOW_HZ) / step) + 2
-    grid = np.geomspace(LOW_HZ, HIGH_HZ, count)
+    grid = np.geomspace(LOW_HZ, HIGH_HZ, int(np.log(HIGH_HZ / LOW_HZ) / step) + 2)
     evidence = _harmonic_evidence(ratio, grid, bin_hz)
     reach = max(1, int(np.ceil(_MOST_RATE_HZ * STEP_S / step)))
     return np.asarray(grid[_viterbi(evidence, reach)])
@@ -179,8 +178,7 @@ def measure_fundamental(
 
     Shapes: fundamental_hz, slope_hz_s (K,).
     """
-    most = min(MOST_HARMONICS, int(BAND_HIGH_HZ / fundamental_hz.min()))
-    partials = np.arange(1, most + 1)
+    partials = np.arange(1, min(MOST_HARMONICS, int(BAND_HIGH_HZ / fundamental_hz.min())) + 1)
     n, rate = windows.n, windows.rate_hz
     turn = np.outer(fundamental_hz, n / rate) + 0.5 * np.outer(slope_hz_s, (n / rate) ** 2)
     back = np.exp(-2j * np.pi * turn)

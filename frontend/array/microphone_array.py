@@ -351,9 +351,7 @@ class ChannelMask:
 
     def cross(self, matrices: Complex64Array) -> Complex64Array:
         """Return cross-spectra ``R'_ij = k_i k_j R_ij``, (..., M, M); the same array if all are kept."""
-        if self.is_whole:
-            return matrices
-        return np.asarray(matrices * (self.keep[:, None] & self.keep))
+        return matrices if self.is_whole else np.asarray(matrices * (self.keep[:, None] & self.keep))
 
 
 # (y, z) in metres, in the order of OVAD's channels; x is zero. Facts released with Schulz et al. 2021, there

@@ -60,8 +60,7 @@ class Steering:
         azimuths = np.asarray(azimuths_rad, np.float64)
         elevations = np.broadcast_to(np.asarray(elevations_rad, np.float64), azimuths.shape)
         frequencies = np.asarray(frequencies_hz, np.float64)
-        values = (one.tobytes() for one in (array.centred_m, frequencies, azimuths, elevations))
-        return _beams(*values)
+        return _beams(*(one.tobytes() for one in (array.centred_m, frequencies, azimuths, elevations)))
 
     def covariance(self, spectra: Complex64Array) -> Complex64Array:
         r"""Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).

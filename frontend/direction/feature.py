@@ -90,8 +90,7 @@ def feature_steering(
     >>> feature_steering(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), range(1, 16), 47_998).weights.shape
     (15, 2, 30)
     """
-    frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)
-    return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD)
+    return Steering.towards(array, bin_frequencies_hz(bins, sample_rate_hz, nfft), FEATURE_AZIMUTHS_RAD)
 
 
 def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:

@@ -100,8 +100,7 @@ def music_spectrum(subspace: Subspace, steering: ArrayLike) -> FloatArray:
     outside = norm - power(E.conj().transpose(0, 2, 1) @ A).sum(axis=1)
     # Round-off may leave a tiny or negative remainder where the steering vector lies in the subspace.
     floor = np.finfo(outside.dtype).eps * norm
-    score = 1.0 / np.maximum(outside, floor).astype(np.float64)
-    return np.asarray(score.mean(axis=0))
+    return np.asarray((1.0 / np.maximum(outside, floor).astype(np.float64)).mean(axis=0))
 
 
 def _leading(R: ComplexArray, count: int) -> Subspace:

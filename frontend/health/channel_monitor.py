@@ -82,8 +82,7 @@ class ClippingCounter:
 
         .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]
         """
-        clipped = np.where(self._is_clipped, self._at, 0)
-        return np.asarray(clipped.sum(axis=0) / max(self._n_samples, 1))
+        return np.asarray(np.where(self._is_clipped, self._at, 0).sum(axis=0) / max(self._n_samples, 1))
 
 
 # Ten seconds; gusts last half a second to three, with lulls of as much between them.

@@ -63,8 +63,7 @@ class CommonSound:
     """Compare the coherence of the microphones with that of far sources; memory does not grow."""
 
     def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
-        n = array.n_microphones
-        self._picked = slice(None, None, -(-n // _MOST_CHANNELS))
+        self._picked = slice(None, None, -(-array.n_microphones // _MOST_CHANNELS))
         self._places, self._frequencies_hz = array.positions_m[self._picked], frequencies_hz
         self._field = diffuse_coherence(self._places, frequencies_hz)
         self._used = (np.abs(self._field) > _LEAST_COHERENCE) & ~np.eye(len(self._places), dtype=bool)

@@ -371,8 +371,7 @@ def position_weights(array: MicrophoneArray, frequencies_hz: FloatArray, usable:
     """
     field = diffuse_coherence(array.positions_m, frequencies_hz)
     inverse = np.linalg.inv(field + np.diag(np.where(usable, _NOISE, _UNUSABLE)))
-    own = np.einsum("kmm->km", inverse)
-    weights = -inverse / own[:, :, None]
+    weights = -inverse / np.einsum("kmm->km", inverse)[:, :, None]
     np.einsum("kmm->km", weights)[...] = 0.0
     return np.asarray(weights, np.float32)
 
@@ -390,8 +389,7 @@ def position_scores(coherence: Float32Array, weights: Float32Array) -> FloatArra
     # A channel that took part in the prediction would agree with itself.
     predicted -= np.einsum("kmm->km", coherence)[:, None, :] * weights
     agreement = predicted.sum(axis=0, dtype=np.float64).T
-    floor = np.finfo(np.float32).tiny
-    return np.asarray(agreement / np.sqrt(np.maximum(power, floor) * len(coherence)))
+    return np.asarray(agreement / np.sqrt(np.maximum(power, np.finfo(np.float32).tiny) * len(coherence)))
 
 
 # A mean over the last two seconds.
@@ -463,8 +461,7 @@ class PositionFit:
         """Look for faults among the active channels, (M,)."""
         self._use(active & ~self._suspects)
         scores = position_scores(self._sum / np.float32(self._n_frames), self._weights)
-        own = scores.diagonal()
-        typical = float(np.median(own[self._usable])) if self._usable.any() else 0.0
+        typical = float(np.median(scores.diagonal()[self._usable])) if self._usable.any() else 0.0
         heard = typical >= _MIN_COHERENCE
         self.coherence = typical if heard else NotUsable(f"no coherent sound ({typical:.2f})")
         found = self._find(scores, typical, active) if heard else []

@@ -227,13 +227,11 @@ class Comparison:
 
     def explained(self, positions_m: FloatArray) -> FloatArray:
         """Share of the coherent energy of all parts that positions (m, 3) explain in each, (S,)."""
-        best = Hypothesis(positions_m, self._frequencies).best(self._coherence)
-        return np.asarray(best / self._power)
+        return np.asarray(Hypothesis(positions_m, self._frequencies).best(self._coherence) / self._power)
 
     def is_better(self, new_m: FloatArray, old_m: FloatArray) -> bool:
         """Whether positions (m, 3) explain more than others by the gain that decides on a size."""
-        shares = (self._power * self.explained(one) for one in (new_m, old_m))
-        return self._gain(*shares) > SIZE_GAIN
+        return self._gain(*(self._power * self.explained(one) for one in (new_m, old_m))) > SIZE_GAIN
 
     def verdict(self, heard_from_rad: float | None) -> PositionVerdict:
         """Compare orders first, then sizes in the best order, then the mounting of what fits."""

@@ -52,8 +52,7 @@ class Decimator:
 
 
 def _low_pass(rate: float, high: float, low_rate: float) -> FloatArray:
-    width = (low_rate - 2.0 * high) / (0.5 * rate)
-    n_taps, beta = scipy.signal.kaiserord(_ATTENUATION_DB, width)
+    n_taps, beta = scipy.signal.kaiserord(_ATTENUATION_DB, (low_rate - 2.0 * high) / (0.5 * rate))
     taps = scipy.signal.firwin(n_taps | 1, 0.5 * low_rate, window=("kaiser", beta), fs=rate)
     return np.asarray(taps, dtype=np.float64)
 
