@@ -280,8 +280,7 @@ def posterior_of(prior: Sequence[float], evidence: SignatureEvidence, co_evidenc
     if log_evidence == -math.inf:
         raise InvalidArgumentError("log_prior: expected mass on an explanation that the co-evidence allows")
     log_probabilities = tuple(one - log_evidence for one in joint)
-    ratio = _log_ratio(prior, log_likelihood)
-    return Posterior(evidence.directions, log_probabilities, ratio, log_evidence)
+    return Posterior(evidence.directions, log_probabilities, _log_ratio(prior, log_likelihood), log_evidence)
 
 
 def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence) -> float:

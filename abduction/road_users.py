@@ -142,8 +142,7 @@ class RoadUserModel:
         measures : ndarray, shape (measures,)
             `AcousticFrame.character`.
         """
-        shares = self.probabilities(measures[None])[0].tolist()
-        return tuple(sorted(zip(self.classes, shares, strict=True)))
+        return tuple(sorted(zip(self.classes, self.probabilities(measures[None])[0].tolist(), strict=True)))
 
 
 def with_siren(shares: ClassShares, log_odds: float) -> ClassShares:

@@ -321,8 +321,7 @@ def beside_foreign(foreign: Foreign, heard: Heard) -> Heard:
     As likely as the sound is not foreign: a model that was not made for it reads neither a vehicle nor
     silence in it, and what was believed before is carried on.
     """
-    share = heard.share / (1.0 + math.exp(min(foreign.log_odds, 700.0)))
-    return replace(heard, share=share, reason=FOREIGN)
+    return replace(heard, share=heard.share / (1.0 + math.exp(min(foreign.log_odds, 700.0))), reason=FOREIGN)
 
 
 def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:

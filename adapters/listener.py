@@ -466,8 +466,7 @@ def listen(path: SoundInput | str | Sequence[str], **parts: Unpack[SourceParts])
     ...     [(state.stamp_ns / 1e9, len(state.entities)) for state in listen(path)]
     [(1.0, 0), (1.1, 0), (1.2, 0)]
     """
-    for step in listen_steps(open_source(path, **parts)):
-        yield step.state
+    yield from (step.state for step in listen_steps(open_source(path, **parts)))
 
 
 def listen_steps(source: Source) -> Iterator[Step]:

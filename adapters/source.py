@@ -212,8 +212,7 @@ class Source:
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
         if self.before is None:
-            settings = FilterSettings(street=self.street or StreetModel())
-            return WorldFilter(self.context, self.policy, settings)
+            return WorldFilter(self.context, self.policy, FilterSettings(street=self.street or StreetModel()))
         return replace(self.before.world, policy=self.policy)
 
     @property

@@ -308,8 +308,7 @@ class AlarmCurve:
         """
         too_few = (1.0 - 2.0 * TINY) * self.least_onsets / self.hours
         known = self.alpha[_last(self.onsets_per_hour, too_few) + 1 :]
-        least = float(known.min(initial=self.alpha[-1]))
-        self._check("alpha", alpha, self.alpha, least, "of the hops")
+        self._check("alpha", alpha, self.alpha, float(known.min(initial=self.alpha[-1])), "of the hops")
         point = _last(self.alpha, alpha)
         promise = self._promise(point)
         return SequenceAlarm(float(self.threshold_nats[point]), promise.onsets_per_hour, alpha, promise)

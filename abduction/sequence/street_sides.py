@@ -240,8 +240,7 @@ class StreetListener:
         known, recent, since = self.hearing.known, self.hearing.recent, self.hearing.since
         own = SIDES.index(arm)
         if since[1 - own] >= HEARD_HOPS and len(recent):
-            sound = PassSound(recent[:, :SECTORS], recent[:, SECTORS], known.heard_by)
-            known = known.with_pass(arm, sound)
+            known = known.with_pass(arm, PassSound(recent[:, :SECTORS], recent[:, SECTORS], known.heard_by))
         left, right = (0 if k == own else hops for k, hops in enumerate(since))
         self.hearing = StreetHearing(known, recent, (left, right))
         self._sides = self.hearing.known.sides()

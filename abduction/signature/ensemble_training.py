@@ -68,8 +68,7 @@ class SimulatedWindows:
 
         Left with the names of drawn junctions, none would be learned beside a table of real ones.
         """
-        own = np.isin(self.sites, np.unique(sites))
-        return replace(self, sites=np.where(own, self.sites, OPEN_FIELD))
+        return replace(self, sites=np.where(np.isin(self.sites, np.unique(sites)), self.sites, OPEN_FIELD))
 
     @classmethod
     def joined(cls, parts: Sequence["SimulatedWindows"]) -> "SimulatedWindows":

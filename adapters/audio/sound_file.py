@@ -303,8 +303,7 @@ def _open_plain(path: Path) -> PlainSamples | None:
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:
     """Return the channels, from 1, that hold one constant value."""
-    constant = (first == first[:1]).all(axis=0)
-    return tuple(int(channel) + 1 for channel in np.flatnonzero(constant))
+    return tuple(int(channel) + 1 for channel in np.flatnonzero((first == first[:1]).all(axis=0)))
 
 
 def _cut_short(path: Path, frames: int) -> InputFileError:
@@ -451,8 +450,7 @@ class PcmAudio(Audio):
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the samples up to the end of the stream in blocks of `frames`; the last may be shorter."""
-        for start in range(0, len(self._first), frames):
-            yield self._first[start : start + frames]
+        yield from (self._first[start : start + frames] for start in range(0, len(self._first), frames))
         while data := self._read_bytes(frames):
             yield self._block(data)
 
@@ -525,8 +523,7 @@ class MonoFiles(Audio):
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
-        for parts in zip(*(source.blocks(frames) for source in self._sources), strict=True):
-            yield np.hstack(parts)
+        yield from map(np.hstack, zip(*(source.blocks(frames) for source in self._sources), strict=True))
 
     def close(self) -> None:
         """Close the files."""

@@ -73,8 +73,7 @@ def linked_boxes(
         closed += [one for one in tracks if time_s - one[-1].time_s > longest_gap_s]
         tracks = [one for one in tracks if time_s - one[-1].time_s <= longest_gap_s]
         expected = np.array([_predicted_rad(one, time_s) for one in tracks])
-        found = np.array([box.middle_rad for box in boxes])
-        apart = np.abs(expected[:, None] - found[None, :])
+        apart = np.abs(expected[:, None] - np.array([box.middle_rad for box in boxes])[None, :])
         pairs = gated_pairs(apart, apart < gate_rad, np.pi).tolist()
         for row, column in pairs:
             tracks[row].append(boxes[column])

@@ -175,9 +175,7 @@ def _central_grey(frame: ImageArray) -> Float32Array:
 def _sharpness(grey: Float32Array, noise: float) -> float | None:
     fine, fine_noise = _gradient_energy(grey, FINE_PX, noise)
     coarse, coarse_noise = _gradient_energy(grey, COARSE_PX, noise)
-    if coarse <= coarse_noise or fine < fine_noise:
-        return None
-    return max(fine, 0.0) / coarse
+    return None if coarse <= coarse_noise or fine < fine_noise else max(fine, 0.0) / coarse
 
 
 def _gradient_energy(grey: Float32Array, scale_px: float, noise: float) -> tuple[float, float]:
@@ -282,8 +280,7 @@ class HealthMonitor:
         self.reference = replace(held, brightness=min(brightness, 255.0), sharpness=curve)
 
     def _moved(self, held: float, seen: float, learned: float, weight: float) -> float:
-        value = held + weight * (seen - held)
-        return min(max(value, learned / _MOST_DRIFT), learned * _MOST_DRIFT)
+        return min(max(held + weight * (seen - held), learned / _MOST_DRIFT), learned * _MOST_DRIFT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

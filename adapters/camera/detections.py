@@ -298,9 +298,7 @@ class DetectionLog:
     def latest(self, stamp_ns: int, max_age_ns: int) -> int | None:
         """Return the number of the last frame taken at or before `stamp_ns`, None if too old or not there."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns + STAMP_SLACK_NS, side="right")) - 1
-        if index < 0 or stamp_ns - int(self.stamps_ns[index]) > max_age_ns:
-            return None
-        return index
+        return None if index < 0 or stamp_ns - int(self.stamps_ns[index]) > max_age_ns else index
 
     def left_out(self, frame: int, keep: DetectionFilter) -> IntArray:
         """Return the indices of the moving boxes of an image that do not count; a score of 0 is no box.
@@ -328,8 +326,7 @@ def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, scale: float = 1
     images in that of OVAD's.
     """
     since_ns = int(log.stamps_ns[frame]) - nanoseconds(PARKED_S)
-    first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
-    past = log.frames[first:frame]
+    past = log.frames[int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS)) : frame]
     # Most images of a hidden approach are empty, and this is asked several times a hop.
     if not past or not len(boxes_px) or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
         return np.zeros(len(boxes_px), dtype=bool)

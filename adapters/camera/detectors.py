@@ -134,8 +134,7 @@ class MotionDetector:
         """Return which regions are objects and not changes of the light."""
         apart = _difference(frame, self._background.getBackgroundImage())
         width_px = max(EDGE_WIDTH * frame.shape[1], NARROWEST_EDGE_PX)
-        shares = [outlined_share(apart, labels == number, width_px) for number in numbers]
-        return np.array(shares) >= OUTLINED
+        return np.array([outlined_share(apart, labels == number, width_px) for number in numbers]) >= OUTLINED
 
 
 def reduced_to(frame: ImageArray, width_px: int) -> ImageArray:
@@ -280,8 +279,7 @@ class OnnxDetector:
         # Boxes of different classes never suppress each other: each class lies in a plane of its own.
         planes = boxes[kept] + 1e5 * classes[kept, None]
         kept = kept[suppress(planes, scores[kept], MOST_OVERLAP)][:MAX_BOXES_A_FRAME]
-        names = tuple(self._labels[c] for c in classes[kept])
-        return DetectionFrame(boxes[kept], scores[kept], names)
+        return DetectionFrame(boxes[kept], scores[kept], tuple(self._labels[c] for c in classes[kept]))
 
 
 def open_onnx(path: str | Path, labels: tuple[str, ...]) -> OnnxDetector:
@@ -356,8 +354,7 @@ def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, 
 def _from_centres(centres: FloatArray, per_class: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     half = centres[:, 2:] / 2
     boxes = np.concatenate([centres[:, :2] - half, centres[:, :2] + half], axis=1)
-    best = per_class.argmax(axis=1)
-    return boxes, np.clip(per_class.max(axis=1), 0.0, 1.0), best.astype(np.int64)
+    return boxes, np.clip(per_class.max(axis=1), 0.0, 1.0), per_class.argmax(axis=1).astype(np.int64)
 
 
 def _from_corners(rows: FloatArray, classes: int) -> tuple[FloatArray, FloatArray, IntArray]:

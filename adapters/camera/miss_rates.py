@@ -162,8 +162,7 @@ class MissRates:
 
     def clutter_rate(self, degradation: float) -> float:
         """Return P(false detection in a query sector) at d, the largest over the families."""
-        families = self.families.values()
-        return max(float(np.interp(degradation, LEVELS, one.clutter_rates)) for one in families)
+        return max(float(np.interp(degradation, LEVELS, one.clutter_rates)) for one in self.families.values())
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values with the schema's name and version."""
@@ -171,8 +170,7 @@ class MissRates:
 
     def _table(self, beta: FloatArray) -> MissRateTable:
         edges = np.array(self.azimuth_deg)
-        middles = (edges[1:] + edges[:-1]) / 2.0
-        knots = [0.0, *middles.tolist(), float(edges[-1])]
+        knots = [0.0, *((edges[1:] + edges[:-1]) / 2.0).tolist(), float(edges[-1])]
         rows = [beta[0], *beta, beta[-1]]
         return MissRateTable(tuple(knots), LEVELS, tuple(tuple(row.tolist()) for row in rows))
 

@@ -128,8 +128,7 @@ class PinholeCamera:
         ndarray
             Radians in (-pi, pi], left positive, same shape.
         """
-        column = np.asarray(column_px, dtype=np.float64)
-        seen = np.arctan(self._tangent(column)) + self.yaw_rad
+        seen = np.arctan(self._tangent(np.asarray(column_px, dtype=np.float64))) + self.yaw_rad
         x = self.position_m[0] + self.nominal_range_m * np.cos(seen)
         y = self.position_m[1] + self.nominal_range_m * np.sin(seen)
         return np.asarray(wrap_angle(np.arctan2(y, x)))

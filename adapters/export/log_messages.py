@@ -89,8 +89,7 @@ def state_messages(state: WorldState) -> Iterator[LogMessage]:
     if state.ego is not None:
         stamp, half_rad = scene.SceneTime.of_ns(state.stamp_ns), 0.5 * state.ego.yaw_rad
         turned = scene.Rotation(z=math.sin(half_rad), w=math.cos(half_rad))
-        place = scene.Xyz(*state.ego.position_m)
-        frame = scene.FrameTransform(stamp, "map", state.frame_id, place, turned)
+        frame = scene.FrameTransform(stamp, "map", state.frame_id, scene.Xyz(*state.ego.position_m), turned)
         yield LogMessage(FRAME_TOPIC, state.stamp_ns, frame)
 
 
@@ -196,8 +195,7 @@ def _drawn(rr: ModuleType, topic: str, value: Told) -> Iterator[tuple[str, objec
         yield topic, rr.Clear(recursive=True)
         for item in value.entities:
             place = f"{topic}/{item.id.replace(' ', '/')}"
-            for part, shape in _shapes(rr, item):
-                yield f"{place}/{part}", shape
+            yield from ((f"{place}/{part}", shape) for part, shape in _shapes(rr, item))
             if item.metadata:
                 yield place, rr.AnyValues(**{pair.key: pair.value for pair in item.metadata})
 

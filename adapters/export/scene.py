@@ -247,7 +247,7 @@ def scene_update(state: WorldState) -> SceneUpdate:
     ['ego', 'occluder corner_left', 'occluder corner_right']
     """
     items = [
-        _item(state, "ego", arrows=(_ego(),)),
+        _item(state, "ego", arrows=(SceneArrow(Placed(), 2.0, 0.6, 0.9, 1.2, Rgba(0.2, 0.2, 0.2, 1.0)),)),
         *(_occluder(state, one) for one in state.context.occluders),
         *(_searched(state, one) for one in state.searched),
         *(_cue(state, one) for one in state.cues),
@@ -263,8 +263,7 @@ def srp_scene(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> S
     """
     level = srp / max(float(np.median(srp)), np.finfo(np.float64).tiny)
     radii = SRP_M * np.clip(level, 0.0, 2.0)
-    points = tuple(map(_at, azimuths_rad.tolist(), radii.tolist()))
-    line = SceneLine(0, points, Rgba(*_HEARD, 1.0))
+    line = SceneLine(0, tuple(map(_at, azimuths_rad.tolist(), radii.tolist())), Rgba(*_HEARD, 1.0))
     removal = SceneRemoval(SceneTime.of_ns(state.stamp_ns))
     return SceneUpdate((removal,), (_item(state, "srp", lines=(line,)),))
 
@@ -303,10 +302,6 @@ def label_of(entity: Entity) -> str:
     kind = likeliest.label if likeliest is not None and likeliest.label != "unknown" else None
     told = entity.status, kind, _short(entity.existence_probability)
     return " ".join(one for one in told if one is not None)
-
-
-def _ego() -> SceneArrow:
-    return SceneArrow(Placed(), 2.0, 0.6, 0.9, 1.2, Rgba(0.2, 0.2, 0.2, 1.0))
 
 
 def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:

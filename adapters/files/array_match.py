@@ -45,9 +45,7 @@ def microphone_order(expected_m: FloatArray, array: MicrophoneArray) -> IndexArr
     >>> microphone_order(there, MicrophoneArray(there[[2, 0, 1]] + [2.0, 0.0, 1.5]))
     array([1, 2, 0])
     """
-    if array.n_microphones != len(expected_m):
-        return None
-    return _order(_centred(expected_m), array.centred_m)
+    return None if array.n_microphones != len(expected_m) else _order(_centred(expected_m), array.centred_m)
 
 
 def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:

@@ -55,8 +55,7 @@ def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[
         listener.refuse(sound.refused - told)
         told = sound.refused
         for step in listener.steps(block):
-            latency_s = sound.age_s(step.frame.sample_index)
-            yield LiveStep(step, latency_s, sound.overruns, sound.lost_s)
+            yield LiveStep(step, sound.age_s(step.frame.sample_index), sound.overruns, sound.lost_s)
 
 
 class LatencyMeter:

@@ -243,8 +243,7 @@ class BagAudio(sound_file.Audio):
         held = np.empty((0, self.channels), np.float32)
         for part in self._parts():
             held = np.concatenate([held, part])
-            for start in range(0, len(held) - frames + 1, frames):
-                yield held[start : start + frames]
+            yield from (held[start : start + frames] for start in range(0, len(held) - frames + 1, frames))
             held = held[len(held) // frames * frames :]
         if len(held):
             yield held

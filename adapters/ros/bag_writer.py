@@ -237,8 +237,7 @@ def bag_snapshot_lines(path: Path) -> Iterator[str]:
     """Yield the snapshots of a bag as the text that was written."""
     with open_bag(path) as bag:
         if bag.count(SNAPSHOT_TOPIC) and bag.kind_of(SNAPSHOT_TOPIC) == types.TEXT:
-            for _, message in bag.messages(SNAPSHOT_TOPIC):
-                yield message.data
+            yield from (message.data for _, message in bag.messages(SNAPSHOT_TOPIC))
 
 
 def risk_advisories(state: WorldState) -> dict[str, Any]:
@@ -306,14 +305,10 @@ def _shapes(item: SceneItem) -> Iterator[dict[str, Any]]:
     for arrow in item.arrows:
         length = arrow.shaft_length + arrow.head_length
         yield _shape(ARROW, arrow, (length, arrow.shaft_diameter, arrow.shaft_diameter))
-    for cube in item.cubes:
-        yield _shape(CUBE, cube, (cube.size.x, cube.size.y, cube.size.z))
-    for line in item.lines:
-        yield _shape(LINE_STRIP, line, (line.thickness, 0.0, 0.0)) | _points(line)
-    for area in item.triangles:
-        yield _shape(TRIANGLE_LIST, area, (1.0, 1.0, 1.0)) | _points(area)
-    for text in item.texts:
-        yield _shape(LABEL, text, (0.0, 0.0, text.font_size)) | {"text": text.text}
+    yield from (_shape(CUBE, cube, (cube.size.x, cube.size.y, cube.size.z)) for cube in item.cubes)
+    yield from (_shape(LINE_STRIP, line, (line.thickness, 0.0, 0.0)) | _points(line) for line in item.lines)
+    yield from (_shape(TRIANGLE_LIST, area, (1.0, 1.0, 1.0)) | _points(area) for area in item.triangles)
+    yield from (_shape(LABEL, text, (0.0, 0.0, text.font_size)) | {"text": text.text} for text in item.texts)
 
 
 def _points(drawn: SceneLine | SceneTriangles) -> dict[str, Any]:

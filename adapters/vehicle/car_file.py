@@ -68,8 +68,7 @@ class Mounting:
 
     def applied(self, points_m: ArrayLike) -> FloatArray:
         """Return points of the sensor, shape (n, 3), in `base_link`."""
-        points = finite_array("points_m", points_m, (None, 3))
-        return np.asarray(points @ self.rotation.T + self.position_m)
+        return np.asarray(finite_array("points_m", points_m, (None, 3)) @ self.rotation.T + self.position_m)
 
 
 MOST_CAMERAS = 32
