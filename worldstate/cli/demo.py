@@ -42,8 +42,7 @@ def simulate_approach(root: Path, seed: int) -> Path:
     settings = replace(drawn, speed_mps=rng.uniform(5.5, 8.0), braking_mps2=0.0, preset=louder)
     root.mkdir(parents=True, exist_ok=True)
     with progress.progress_bar(f"simulating {settings.duration_s:g} s at {settings.site.name}", None):
-        recording = simulation.simulate_recording(settings, rng)
-        row = simulation.write_recording(root, recording)
+        row = simulation.write_recording(root, simulation.simulate_recording(settings, rng))
     write_log(root, [row])
     return root / row.folder
 

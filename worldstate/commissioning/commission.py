@@ -347,8 +347,7 @@ def _sounds(
 ) -> tuple[SoundRows, RoadUserRows]:
     """Render sounds near by and passes of road users, once for all arrays of one call."""
     rng = np.random.default_rng([seed, SOUNDS])
-    close = close_rows(rate_hz, rng, clips_each, jobs)
-    return close, road_user_rows(MIDDLE, sites, rate_hz, rng, jobs=jobs)
+    return close_rows(rate_hz, rng, clips_each, jobs), road_user_rows(MIDDLE, sites, rate_hz, rng, jobs=jobs)
 
 
 def quiet_streams(quiet: Sequence[Path], array: MicrophoneArray, onsets_per_hour: float) -> list[HeardStream]:

@@ -103,8 +103,7 @@ def road_user_rows(
 def _rows_at(position_m: FloatArray, sample_rate_hz: float, drawn: tuple[str, int]) -> RoadUserRows:
     name, seed = drawn
     settings = StreamSettings(junction_named(name), minutes=1.0, sample_rate_hz=sample_rate_hz)
-    draws = np.random.default_rng(seed).spawn(len(CLASS_OF))
-    drawn_by_kind = zip(CLASS_OF, draws, strict=True)
+    drawn_by_kind = zip(CLASS_OF, np.random.default_rng(seed).spawn(len(CLASS_OF)), strict=True)
     return RoadUserRows.joined([_pass(settings, kind, position_m, rng) for kind, rng in drawn_by_kind])
 
 

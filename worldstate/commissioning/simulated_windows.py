@@ -90,8 +90,7 @@ def stream_windows(streams: Sequence[HeardStream]) -> SimulatedWindows:
         references[sites == site] = site_reference(log_levels(features[sites == site]))
     weights = WEIGHT * _balance(labels)
     # All of a hazard says its own side: see `WEIGHT`.
-    own = np.zeros(len(labels))
-    return SimulatedWindows(np.hstack([features, references]), labels, sites, weights, own)
+    return SimulatedWindows(np.hstack([features, references]), labels, sites, weights, np.zeros(len(labels)))
 
 
 def _cut(stream: HeardStream) -> tuple[HeardStream, IndexArray, TextArray]:
@@ -220,8 +219,7 @@ def open_field_features(
 
 
 def _drawn_feature(array: MicrophoneArray, moving_ego: bool, rng: np.random.Generator) -> FloatArray:
-    source = drawn_source(rng)
-    return open_feature(array, source, rng, rng.uniform(*EGO_SPEEDS_MPS) if moving_ego else 0.0)
+    return open_feature(array, drawn_source(rng), rng, rng.uniform(*EGO_SPEEDS_MPS) if moving_ego else 0.0)
 
 
 def open_field_windows(features: FloatArray) -> SimulatedWindows:

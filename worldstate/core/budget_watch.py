@@ -165,8 +165,7 @@ class BudgetWatch:
             self.tally.arrivals + len(new),
             self.tally.warned + sum(ns is not None and ns >= known_ns for ns in warned_ns),
         )
-        factors = onset_factors(false, seconds(step_ns), onsets_per_hour)
-        onsets = self.onsets.after(factors, seconds(step_ns))
+        onsets = self.onsets.after(onset_factors(false, seconds(step_ns), onsets_per_hour), seconds(step_ns))
         pending_ns = tuple(ns for ns in pending_ns if ns > known_ns)
         return replace(self, tally=tally, onsets=onsets, pending_ns=pending_ns)
 

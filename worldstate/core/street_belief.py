@@ -193,8 +193,7 @@ class StreetBelief:
         read_ns = {name: ns for name, ns in self.read_ns.items() if ns >= since_ns}
         alone = {name: one for name, one in self.joint.alone.items() if name in read_ns}
         trust = {name: one for name, one in self.joint.trust.items() if one.stamp_ns >= since_ns}
-        joint = replace(self.joint, alone=alone, trust=trust)
-        return replace(self, joint=joint, read_ns=read_ns)
+        return replace(self, joint=replace(self.joint, alone=alone, trust=trust), read_ns=read_ns)
 
     def handed_over(
         self, kept: Mapping[int, float], apart: Collection[int], stamp_ns: int, street: StreetModel
@@ -388,8 +387,7 @@ def _read(
         found = dict(zip(signature.directions, signature.hidden, strict=True))
         hidden = [found.get(side) for side in context.directions]
         usual = kept.prior(street).by_part
-        in_view = float(usual[..., 1].sum())
-        told = window_likelihoods(hidden, signature.visible, signature.none, in_view)
+        told = window_likelihoods(hidden, signature.visible, signature.none, float(usual[..., 1].sum()))
         if settings.windows == "likelihood":
             weight = min(step_s / settings.window_s, 1.0) * measurement.heard.share
             read_ns = kept.read_ns | {source: stamp_ns}

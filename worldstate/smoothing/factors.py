@@ -105,8 +105,7 @@ def noise_of(std: float, huber_k: float) -> NoiseModel:
 def _robust(plain: NoiseModel, huber_k: float) -> NoiseModel:
     import gtsam
 
-    loss = gtsam.noiseModel.mEstimator.Huber.Create(huber_k)
-    return gtsam.noiseModel.Robust.Create(loss, plain)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(huber_k), plain)
 
 
 @lru_cache(maxsize=64)
@@ -226,5 +225,4 @@ def prior_factor(key: int, mean: FloatArray, covariance: FloatArray) -> Factor:
     """Return a Gaussian prior of a variable."""
     import gtsam
 
-    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-    return gtsam.PriorFactorVector(key, mean, noise)
+    return gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(covariance))

@@ -302,8 +302,7 @@ class FixedLagSmoother:
         state = np.array([toward, 0.0, 0.0, log_m])
         prior = np.array([state[0], 0.0, 0.0, math.log(_START_M)])
         key = self._add_state(one, stamp_ns, state)
-        spread = np.diag(np.square([*_START_STD]))
-        self._graph.factors.append(f.prior_factor(key, prior, spread))
+        self._graph.factors.append(f.prior_factor(key, prior, np.diag(np.square([*_START_STD]))))
         return one
 
     def _go_on(self, one: _Entity, stamp_ns: int) -> None:

@@ -288,8 +288,7 @@ def context_of(street: LearnedStreet) -> Context:
     [(0.45, False), (-0.56, True)]
     """
     usual = Context()
-    occluders = tuple(map(_occluder, street.arms, usual.occluders))
-    return replace(usual, occluders=occluders, site=street.site)
+    return replace(usual, occluders=tuple(map(_occluder, street.arms, usual.occluders)), site=street.site)
 
 
 def _occluder(arm: LearnedArm, usual: Occluder) -> Occluder:

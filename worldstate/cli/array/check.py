@@ -37,7 +37,6 @@ from worldstate.ground.serialisation import encode
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import Audio
-    from worldstate.frontend.health.fitted_positions import FittedPositions
     from worldstate.frontend.health.position_check import PositionCheck
     from worldstate.operations.recordings.channel_report import RecordingHealth
 
@@ -87,7 +86,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         checks = [check, *(_heard(path, array) for path in arguments.also)]
         fit = fit_positions(checks, health.hears_waves(array.n_microphones))
         write_array_xml(arguments.fit, replace(array, positions_m=fit.positions_m.round(4)))
-        report, lines = report | {"fit": encode(fit)}, [*lines, *fit_lines(fit)]
+        better = f"explain {fit.explained:.3f} of the coherent sound, those given {fit.explained_before:.3f}"
+        lines += [f"fit: these positions {better}", *(f"not fitted: {one}" for one in fit.unjudged)]
+        report = report | {"fit": encode(fit)}
     if arguments.figure is not None:
         channel_report.write_array_figure(array, health, arguments.figure)
     return output.CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
@@ -134,9 +135,3 @@ def _heard(path: Path, array: "frontend.MicrophoneArray") -> "PositionCheck":
         for block in audio.blocks(audio.sample_rate_hz):
             check.push(block)
     return check
-
-
-def fit_lines(fit: "FittedPositions") -> list[str]:
-    """Lines of what fitted positions explain, and what the sound does not show."""
-    better = f"explain {fit.explained:.3f} of the coherent sound, those given {fit.explained_before:.3f}"
-    return [f"fit: these positions {better}", *(f"not fitted: {one}" for one in fit.unjudged)]

@@ -77,9 +77,7 @@ def _readable(value: object) -> str:
     if isinstance(value, float):
         # Times since 1970 are told to the tenth of a second, as hops come.
         return f"{value:.4g}" if abs(value) < _SINCE_1970_S else f"{value:.1f}"
-    if isinstance(value, tuple | list):
-        return ", ".join(_readable(item) for item in value)
-    return str(value)
+    return ", ".join(_readable(item) for item in value) if isinstance(value, tuple | list) else str(value)
 
 
 def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[str, ...] = ()) -> None:

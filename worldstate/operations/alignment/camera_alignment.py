@@ -37,6 +37,9 @@ _OFFSETS_S, _YAWS_DEG = (
 _STD_RAD = np.radians(4.0)
 # Share of bearings that are of something else: at busy junctions every second one.
 _OTHER = 0.5
+# Error at which a bearing is as likely of the vehicle as of something else.
+_OWN_RATIO = (1.0 - _OTHER) * np.pi / (_OTHER * _STD_RAD * np.sqrt(2.0 * np.pi))
+_OWN_RAD = _STD_RAD * np.sqrt(2.0 * np.log(_OWN_RATIO))
 # An interval over fewer passes would be that of one or two vehicles.
 FEWEST_PASSES = 5
 _FEWEST_A_SIDE = 2
@@ -77,8 +80,7 @@ def heard_passes(source: Source, margin_s: float) -> list[HeardPass]:
     found = []
     for time_s, heard_rad in _whole(box_tracks(source.detections, source.camera, source.settings.boxes)):
         near = usable & (emitted_s > time_s[0] - margin_s) & (emitted_s < time_s[-1] + margin_s)
-        sound_rad = np.radians(bearings.azimuth_deg[near])
-        found.append(HeardPass(time_s, heard_rad, emitted_s[near], sound_rad))
+        found.append(HeardPass(time_s, heard_rad, emitted_s[near], np.radians(bearings.azimuth_deg[near])))
     return found
 
 
@@ -143,7 +145,7 @@ def align(passes: Sequence[HeardPass]) -> Alignment:
     low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
     seen = (_errors(one, offset_s, yaw_deg)[_weights(one, offset_s) > 0.0] for one in passes)
     errors = np.concatenate(list(seen))
-    own = np.abs(errors) < _own_within()
+    own = np.abs(errors) < _OWN_RAD
     return Alignment(
         offset_s=offset_s,
         offset_interval_s=(float(low[0]), float(high[0])),
@@ -198,12 +200,6 @@ def _weights(one: HeardPass, offset_s: float) -> FloatArray:
 def _gain(errors_rad: FloatArray) -> FloatArray:
     density = np.exp(-0.5 * (errors_rad / _STD_RAD) ** 2) / (_STD_RAD * np.sqrt(2.0 * np.pi))
     return np.asarray(np.log(_OTHER + (1.0 - _OTHER) * np.pi * density))
-
-
-def _own_within() -> float:
-    """Return the error at which a bearing is as likely of the vehicle as of something else."""
-    ratio = (1.0 - _OTHER) * np.pi / (_OTHER * _STD_RAD * np.sqrt(2.0 * np.pi))
-    return float(_STD_RAD * np.sqrt(2.0 * np.log(ratio)))
 
 
 def _best(total: FloatArray) -> tuple[float, float]:

@@ -186,8 +186,7 @@ def calibrate_cueing(
         raise InvalidArgumentError("recordings: expected at least one without a hazard")
     approaches = [stream for stream in streams if stream.before_sight().any()]
     budgets, policies = _by_miss_rate(free, approaches, reference_prior, kept, chosen)
-    calm = [statistic_at(stream, reference_prior, 0.0) for stream in free]
-    tau = correlation_time_hops(calm)
+    tau = correlation_time_hops([statistic_at(stream, reference_prior, 0.0) for stream in free])
     fitted = "isotonic" if isinstance(policies[0].risk_map, IsotonicMap) else "platt"
     return CueingCalibration(
         policies=CueingPolicies(tuple(policies)),
@@ -217,8 +216,7 @@ def _by_miss_rate(
         risk = _risk_map(calm, hazards) if hazards else nearest.risk_map
         for alpha in settings.alphas:
             gamma, held_out = settings.threshold(calm, alpha), _held_out(calm, alpha, settings)
-            counted = _counted(calm, gamma, settings)
-            budgets.append(BudgetReport(alpha, beta, gamma, counted, *held_out))
+            budgets.append(BudgetReport(alpha, beta, gamma, _counted(calm, gamma, settings), *held_out))
             policies.append(CueingPolicy(gamma, settings.sustain_hops, alpha, prior, risk, beta))
     return budgets, policies
 

@@ -173,8 +173,7 @@ def measure_absence(
             on_frame()
     if not tally.looks:
         raise InputFileError(scenes[0].reference.source, "expected moving objects in view, found none")
-    health = _health(scenes, rng)
-    return MissRates(tally.edges_deg, tally.counts(), provenance or {}, health, REPEATS)
+    return MissRates(tally.edges_deg, tally.counts(), provenance or {}, _health(scenes, rng), REPEATS)
 
 
 class AbsenceTally:

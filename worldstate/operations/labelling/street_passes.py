@@ -82,8 +82,7 @@ def watched_recording(
     log: DetectionLog, camera: PinholeCamera, keep: DetectionFilter, duration_s: float
 ) -> WatchedRecording:
     """Return the passes of a recording, smoothed."""
-    passes = label_passes(box_tracks(log, camera, keep), camera.position_m[0])
-    return WatchedRecording(passes, duration_s)
+    return WatchedRecording(label_passes(box_tracks(log, camera, keep), camera.position_m[0]), duration_s)
 
 
 def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterator[LearnedStreet]:
@@ -92,8 +91,7 @@ def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterato
     for one in sorted(recording.passes, key=lambda one: one.t0.time_s):
         now_s = min(max(one.t0.time_s, before_s), recording.duration_s)
         sound = None if recording.heard is None else recording.heard.before(one, recording.passes)
-        told = street_pass(one, sound)
-        street = with_pass(watched(street, now_s - before_s), told)
+        street = with_pass(watched(street, now_s - before_s), street_pass(one, sound))
         before_s = now_s
         yield street
     yield watched(street, recording.duration_s - before_s)

@@ -105,8 +105,7 @@ class RateEstimate:
     @property
     def is_wrong(self) -> bool:
         """Whether the nominal rate is off by more than 10 ppm and four standard deviations."""
-        limit = max(_SIGNIFICANT * self.std_hz / self.nominal_hz, _TOLERATED)
-        return abs(self.error) > limit
+        return abs(self.error) > max(_SIGNIFICANT * self.std_hz / self.nominal_hz, _TOLERATED)
 
 
 def rate_from_duration(
@@ -296,8 +295,7 @@ def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stanc
 
 def _fault_json(verdict: ChannelVerdict) -> dict[str, object]:
     other = None if verdict.looks_like is None else verdict.looks_like + 1
-    counted = {"channel": verdict.channel + 1, "looks_like": other, "masked": verdict.masked}
-    return encode(verdict) | counted
+    return encode(verdict) | {"channel": verdict.channel + 1, "looks_like": other, "masked": verdict.masked}
 
 
 def _positions_json(positions: PositionVerdict) -> dict[str, object]:

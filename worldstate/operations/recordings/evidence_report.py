@@ -141,8 +141,7 @@ class SideEvidenceReport:
         yield f"  log-odds that {_OF[evidence.hypothesis]}, nats:"
         yield f"    {'at, s':16s}{''.join(f'{time_s:14.2f}' for time_s in times_s)}"
         names = dict.fromkeys(name for one in both for name in one.terms_nats)
-        for name in names:
-            yield _row(name, *(one.terms_nats.get(name, 0.0) for one in both))
+        yield from (_row(name, *(one.terms_nats.get(name, 0.0) for one in both)) for name in names)
         yield _row("together", *(sum(one.terms_nats.values()) for one in both))
         if evidence.hypothesis == "coming":
             yield _row("mean of .3 s", *(one.compared_nats for one in both))
@@ -191,8 +190,7 @@ def common_lines(state: WorldState) -> Iterator[str]:
         right, left = (f"{math.degrees(end_rad):.0f}" for end_rad in view.sector_rad)
         found = f"{'something' if view.found else 'nothing'} from {right} to {left} deg"
         yield f"look of {view.sensor} at {seconds(view.stamp_ns):.2f} s: {found}, misses {view.miss_rate:.2f}"
-    for event in state.events:
-        yield f"event: {event.entity_id[:8]} {event.kind.replace('_', ' ')}"
+    yield from (f"event: {event.entity_id[:8]} {event.kind.replace('_', ' ')}" for event in state.events)
 
 
 def _promised(budget: Budget) -> str:

@@ -111,8 +111,7 @@ class HopTable:
     def before_sight(self, horizon_s: float = float("inf")) -> BoolArray:
         """Hops of an approach that end within `horizon_s` before T0, T0 included, shape (n,)."""
         left_s = self.t0_s - self.time_s
-        inside = (left_s >= -SLACK_S) & (left_s <= horizon_s + SLACK_S)
-        return np.asarray(inside & (not self.hazard_free))
+        return np.asarray((left_s >= -SLACK_S) & (left_s <= horizon_s + SLACK_S) & (not self.hazard_free))
 
     def after_sight(self) -> BoolArray:
         """Hops of an approach after T0 with the vehicle in view, which column `there` says, shape (n,)."""
@@ -157,8 +156,7 @@ def load_named(path: str | Path, what: str) -> dict[str, HopTable]:
     ...     [(name, len(table)) for name, table in load_named(f"{folder}/a.npz", "tables").items()]
     [('boxes', 2), ('hops', 5)]
     """
-    tables = load_npz(path, what, MAX_BYTES, _tables)
-    return {name: only for name, (only,) in tables.items()}
+    return {name: only for name, (only,) in load_npz(path, what, MAX_BYTES, _tables).items()}
 
 
 def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]]) -> None:

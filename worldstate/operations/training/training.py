@@ -304,8 +304,7 @@ def train_model(
         figures=_figures(table, levels[-1], settings.repeats),
         sources=(DataSource(dataset, "coefficients"), DataSource(dataset, "thresholds")),
     )
-    policies = _policies(table, signature, levels, settings)
-    return Model(signature, policies, provenance, street=StreetModel())
+    return Model(signature, _policies(table, signature, levels, settings), provenance, street=StreetModel())
 
 
 def fit_ensemble(inputs: FeatureTable, simulated: SimulatedWindows | None = None) -> EnsembleModel:
@@ -329,8 +328,7 @@ def trained_ensemble(
 
 
 def _recipes(table: FeatureTable) -> tuple[Recipe, ...]:
-    moves = ego_motion_of(np.unique(table.environments).tolist()) == "moving"
-    return MOVING_RECIPES if moves else RECIPES
+    return MOVING_RECIPES if ego_motion_of(np.unique(table.environments).tolist()) == "moving" else RECIPES
 
 
 def _classifier(table: FeatureTable, simulated: SimulatedWindows | None) -> str:

@@ -22,7 +22,7 @@ from worldstate.ground import LEAST_HEARD, InputFileError, seconds
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.operations import figure_style as style
 from worldstate.operations.recordings.recording_report import calibration_words
-from worldstate.state import Entity, Occluder, RiskCue, WorldState
+from worldstate.state import Entity, RiskCue, WorldState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -305,7 +305,9 @@ def check_gif(path: Path) -> Path:
 def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     axes = figure.subplots()
     for occluder in state.context.occluders:
-        _draw_occluder(axes, occluder)
+        _wedge(axes, hidden_sector(occluder), SECTOR_M, "0.5", 0.13)
+        ends = (_at(occluder.edge_azimuth_rad, distance_m) for distance_m in (4.0, SECTOR_M))
+        axes.plot(*zip(*ends, strict=True), color="0.3", lw=2)
     for view in state.searched:
         _wedge(axes, view.sector_rad, SEARCHED_M, style.SEARCHED, _FOUND if view.found else _NOTHING)
     for cue in state.cues:
@@ -321,12 +323,6 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     _draw_legend(axes)
 
 
-def _draw_occluder(axes: "Axes", occluder: Occluder) -> None:
-    edge = occluder.edge_azimuth_rad
-    _wedge(axes, hidden_sector(occluder), SECTOR_M, "0.5", 0.13)
-    axes.plot(*zip(_at(edge, 4.0), _at(edge, SECTOR_M), strict=True), color="0.3", lw=2)
-
-
 def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
     """Draw the risk, and say it on the cue's own side below the ego, where no sector lies."""
     raised = cue.advisory is not None
@@ -339,8 +335,7 @@ def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
     said += "" if cue.risk is None else f"\nrisk {cue.risk:.2f}"
     said += "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
     said += "".join(f"\nnot usable: {reason}" for reason in cue.why_not)
-    left = cue.azimuth_rad > 0.0
-    x, side = (-37, "left") if left else (37, "right")
+    x, side = (-37, "left") if cue.azimuth_rad > 0.0 else (37, "right")
     color, weight = (style.DECISION, "bold") if raised else ("0.2", "normal")
     axes.text(x, -2.5, said, color=color, ha=side, va="top", weight=weight)
 
