@@ -1,13 +1,14 @@
 """Ways on the ground and what drives there: routes, the ego, vehicles, and how loud each is by itself."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import check_ranges
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import Float32Array, FloatArray, IntArray
 
 from .kinds import LIGHT, SILENT_DB, TYRE_M, VehicleKind
 from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
@@ -330,27 +331,15 @@ class _Drawing:
             return self.noise(octave_pressure, exhaust_pulses(self.trajectory, self.time, self.rng))
         share = self.trajectory.kind.harmonic_share
         firing = firing_frequency_hz(self.trajectory, self.time, self.rng)
-        orders = np.arange(1, HARMONICS + 1)
-        octave = np.clip(np.round(np.log2(orders * firing.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
-        crowd = np.bincount(octave, minlength=8)
+        octave, crowd = octaves_of_lines(firing)
         lines = np.where(crowd > 0, share, 0.0)[:, None]
         signal = self.noise(np.sqrt(1.0 - lines) * octave_pressure)
         if share > 0.0:
             shared = octave_pressure * np.sqrt(2.0 * lines / np.maximum(crowd, 1)[:, None])
-            signal += self._harmonics(shared, firing, octave)
-        return signal
-
-    def _harmonics(
-        self, octave_amplitude: FloatArray, firing_hz: FloatArray, octave: NDArray[np.int_]
-    ) -> Float32Array:
-        """Multiples 1, 2, ... of the firing frequency, each as loud as the octave it falls into."""
-        cycles = np.cumsum(firing_hz) / (len(self.time) / (self.time[-1] - self.time[0]))
-        levels = [self._at_samples(row) for row in octave_amplitude]
-        signal = np.zeros(len(self.time), np.float32)
-        for order, band in enumerate(octave.tolist(), start=1):
-            phase = 2.0 * np.pi * np.mod(order * cycles + self.rng.random(), 1.0)
-            heard = order * firing_hz < 0.5 * self.sample_rate_hz  # above, a line would come back folded
-            signal += levels[band] * np.cos(phase.astype(np.float32)) * heard
+            levels = [self._at_samples(row) for row in shared]
+            cycles = np.cumsum(firing) / (len(self.time) / (self.time[-1] - self.time[0]))
+            drawn = zip(octave, engine_lines(firing, cycles, self.sample_rate_hz, self.rng), strict=True)
+            signal += sum(levels[band] * line for band, line in drawn)
         return signal
 
     def _at_samples(self, knots: FloatArray) -> Float32Array:
@@ -367,6 +356,23 @@ def _band_shares(sample_rate_hz: float) -> FloatArray:
     """Power of white noise of unit variance in every octave band; bands beyond Nyquist stay empty."""
     masks = octave_masks(np.linspace(0.0, sample_rate_hz / 2.0, 4096))
     return np.asarray(np.maximum((masks**2).mean(axis=1), 1e-6))
+
+
+def octaves_of_lines(firing_hz: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return the octave of each multiple of a firing frequency, (24,), and how many fall into each, (8,)."""
+    orders = np.arange(1, HARMONICS + 1)
+    octave = np.clip(np.round(np.log2(orders * firing_hz.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
+    return octave, np.bincount(octave, minlength=8)
+
+
+def engine_lines(
+    firing_hz: FloatArray, cycles: FloatArray, sample_rate_hz: float, rng: np.random.Generator
+) -> Iterator[Float32Array]:
+    """Yield multiples 1, 2, ... of the firing frequency with an amplitude of 1; shapes (n,)."""
+    for order in range(1, HARMONICS + 1):
+        phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
+        heard = order * firing_hz < 0.5 * sample_rate_hz  # above, a line would come back folded
+        yield np.cos(phase.astype(np.float32)) * heard
 
 
 def firing_frequency_hz(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -25,6 +25,8 @@ from worldstate.simulation.scene.vehicle import (
     HARMONIC_SHARE,
     POWER_TO_1M_DB,
     SLOWEST_KMH,
+    engine_lines,
+    octaves_of_lines,
     propulsion_level_db,
     rolling_level_db,
 )
@@ -56,7 +58,6 @@ WIND_EXPONENT = 40.0  # dB per decade: pseudo-sound is dynamic pressure
 GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0, 3.2)
 IDLE_HZ, SHIFT_UP_HZ = 26.7, 45.0
 ENGINE_WANDER, WANDER_STEP_S = 0.01, 0.5
-HARMONICS = 24
 
 ECHO_WAVES, ECHO_ORDERS, ECHO_AT_MPS = 36, 4, 5.0
 # Images of a car in the walls beside it stand at its sides; reveals and parked cars ahead give back what goes
@@ -227,21 +228,12 @@ def _emission(firing: FloatArray, line_share: float, rate: float, rng: np.random
     shares = np.maximum((masks**2).mean(axis=1), 1e-6)
     shape = (masks / np.sqrt(shares)[:, None]).sum(axis=0)
     noise = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng)
-    return noise + _lines(firing, line_share, rate, rng) if line_share > 0.0 else noise
-
-
-def _lines(firing: FloatArray, share: float, rate: float, rng: np.random.Generator) -> Float32Array:
-    """Multiples of the firing frequency that share each octave's pressure, shape (n,)."""
-    cycles = np.cumsum(firing) / rate
-    orders = np.arange(1, HARMONICS + 1)
-    octave = np.clip(np.round(np.log2(orders * firing.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
-    crowd = np.bincount(octave, minlength=8)
-    lines = np.zeros(len(firing), np.float32)
-    for order, band in zip(orders, octave, strict=True):
-        phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
-        heard = order * firing < 0.5 * rate  # above, a line would come back folded
-        lines += np.float32(np.sqrt(2.0 * share / crowd[band])) * np.cos(phase.astype(np.float32)) * heard
-    return lines
+    if line_share == 0.0:
+        return noise
+    octave, crowd = octaves_of_lines(firing)
+    levels = np.sqrt(2.0 * line_share / crowd[octave]).astype(np.float32)
+    drawn = zip(levels, engine_lines(firing, np.cumsum(firing) / rate, rate, rng), strict=True)
+    return np.asarray(noise + sum(level * line for level, line in drawn))
 
 
 def _firing_hz(speed: FloatArray, rate: float, rng: np.random.Generator) -> FloatArray:

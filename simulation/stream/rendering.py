@@ -52,10 +52,8 @@ class Microphones:
     @property
     def arrays(self) -> list["Microphones"]:
         """The microphones of each array alone."""
-        rate = self.sample_rate_hz
-        return [
-            Microphones(self.positions_m[own], self.skew_s[own], self.gains[own], rate) for own in self.slices
-        ]
+        parts = ((self.positions_m[own], self.skew_s[own], self.gains[own]) for own in self.slices)
+        return [Microphones(*part, self.sample_rate_hz) for part in parts]
 
     @classmethod
     def joined(cls, arrays: Sequence["Microphones"]) -> "Microphones":
@@ -318,10 +316,8 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
         for number, event in piece.events.items():
             alone, rows_s = _event_alone(scene, number, event), row_times(event, settings)
             at = [EventSound(alone.first, alone.pressure_pa[own]) for own in scene.microphones.slices]
-            levels = [
-                [loudness_db(one, rows_s, rate, banded=banded) for banded in (False, True)] for one in at
-            ]
-            loudness[number] = np.array(levels)
+            both = ([loudness_db(one, rows_s, rate, banded=banded) for banded in (False, True)] for one in at)
+            loudness[number] = np.array(list(both))
             heard = alone.pressure_pa[:, max(-alone.first, 0) :]
             first = max(alone.first, 0) - begin
             sound[:, first : first + heard.shape[1]] += heard
