@@ -45,7 +45,8 @@ def _channel(
     source: Source, camera: PinholeCamera, setup: CameraSetup, reported: Path | DetectionLog
 ) -> VisionQuery:
     if isinstance(reported, Path):
-        reported = read_any_detections(reported, setup.image_rate_hz, (camera.width_px, camera.height_px))
+        size_px = (camera.width_px, camera.height_px)
+        reported = read_any_detections(reported, setup.image_rate_hz, size_px)
     rates = source.miss_rates if setup.miss_rates is None else load_miss_rates(setup.miss_rates)
     told = setup.boxes != DetectionFilter()
     settings = replace(source.settings, boxes=setup.boxes) if told else source.settings
