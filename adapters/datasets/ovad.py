@@ -306,8 +306,7 @@ def read_true_tracks(folder: Path) -> tuple[TrueTrack, ...]:
         return ()
     try:
         truth: Any = read_json(path, "the truth of a simulated recording")
-        vehicles = [rows for rows in (truth["frames"], *truth.get("others", ())) if rows]
-        return tuple(map(_track, vehicles))
+        return tuple(_track(rows) for rows in (truth["frames"], *truth.get("others", ())) if rows)
     except (ValueError, KeyError, TypeError) as error:
         raise InputFileError(path, f"expected the truth of a simulated recording: {error!r}") from error
 

@@ -180,8 +180,7 @@ def trace(fronts: Fronts, point_m: FloatArray, orders: int = ORDERS) -> Images:
                 apex, kept = mirror[:2] @ [*beam.apex_m, 1.0], beam.kept * fronts.kept[wall]
                 turned = float(np.arctan2(y, x)), width, wall, beam.order + 1
                 waiting.append(_Beam(mirror @ beam.mirror, kept, apex, *turned))
-    columns = [*zip(*images, strict=True), *zip(*found, strict=True)]
-    return Images(*(np.array(one) for one in columns))
+    return Images(*map(np.array, [*zip(*images, strict=True), *zip(*found, strict=True)]))
 
 
 def _key(mirror: FloatArray) -> tuple[float, ...]:

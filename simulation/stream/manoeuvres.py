@@ -150,8 +150,7 @@ class Driver:
         # At constant acceleration a step takes its length over the mean of both speeds, exactly.
         step, twice = np.diff(driven), speed[1:] + speed[:-1]
         took = 2.0 * step / np.maximum(twice, 1e-6)
-        ends = np.cumsum(counts[:-1], dtype=int)
-        took[ends - 1] = [one.stands_s for one in stops]
+        took[np.cumsum(counts[:-1], dtype=int) - 1] = [one.stands_s for one in stops]
         heading = int(self.side) if into else -int(self.side)
         return Motion(route, np.r_[0.0, np.cumsum(took)], driven, speed, self.kind, heading)
 

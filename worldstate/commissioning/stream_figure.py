@@ -33,8 +33,7 @@ def write_stream_figure(stream: WrittenStream, path: Path) -> None:
         below.sharex(middle)
         legend_beside(above)
         minutes, preset = stream.settings.minutes, stream.settings.preset.name
-        vehicles = len(stream.vehicles)
-        figure.suptitle(f"{stream.folder.name}: {minutes:g} min, {vehicles} vehicles, {preset}")
+        figure.suptitle(f"{stream.folder.name}: {minutes:g} min, {len(stream.vehicles)} vehicles, {preset}")
 
 
 def _draw_map(axes: "Axes", stream: WrittenStream) -> None:
