@@ -113,7 +113,7 @@ class Growth:
 
 
 # Scores of several sizes are averaged.
-STANDING = (Growth(100, 4, 0.1), Growth(200, 8, 0.1))
+STANDING = (Growth(100, 4, 0.1), Growth(150, 8, 0.1))
 MOVING = (Growth(120, 8, 0.2),)
 
 
