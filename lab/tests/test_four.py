@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from worldstate_lab.cli.four import BUFFER, BoardRecording, aligned, lost_buffers, read_board
+from worldstate_lab.cli.corner.four import BUFFER, BoardRecording, aligned, lost_buffers, read_board
 from worldstate_lab.cli.main import main
 
 from worldstate.frontend.array.microphone_array import ovad_array

@@ -32,14 +32,14 @@ STUDIES = {
         "reach",
         "clips",
         "foreign",
-        "four",
         "kinds",
         "place",
         "street",
     )
 }
 CORNER = {
-    name: f"worldstate_lab.cli.corner.{name}" for name in ("sequences", "junctions", "staged", "columns")
+    name: f"worldstate_lab.cli.corner.{name}"
+    for name in ("sequences", "junctions", "staged", "columns", "four")
 }
 BENCHES = {
     "bench": f"{BENCH}.cost",
