@@ -283,11 +283,11 @@ def commission(
     fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same in every fold
 
     def fit(some: Sequence[HeardStream]) -> EnsembleModel:
-        return fitted(*_table_and_beside(real, open_field, domain, some))
+        return fitted(*table_and_beside(real, open_field, domain, some))
 
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, jobs, learned)
     learned("window model")
-    windows, simulated = _table_and_beside(real, open_field, domain, streams)
+    windows, simulated = table_and_beside(real, open_field, domain, streams)
     model = train_model(
         windows,
         TrainingSettings(seed=settings.seed, repeats=1),
@@ -393,7 +393,7 @@ def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: 
     return kept
 
 
-def _table_and_beside(
+def table_and_beside(
     real: FeatureTable | None,
     open_field: SimulatedWindows,
     domain: ModelDomain,

@@ -18,12 +18,13 @@ from worldstate_lab.report.table import plain
 
 BENCH = "worldstate_lab.cli.bench"
 STUDIES = {
-    name: f"worldstate_lab.cli.{name}"
+    name: f"worldstate_lab.cli.{name.replace('-', '_')}"
     for name in (
         "table",
         "windows",
         "streams",
         "scenarios",
+        "left-out",
         "bearings",
         "corpora",
         "planner",

@@ -1,0 +1,255 @@
+"""`worldstate-lab left-out`: what a model is worth in streets of a renderer that it did not learn.
+
+Streams are those that `worldstate model make` learns from; those that lie in its folder --streams are not
+rendered again. Each renderer is left out once: a window and a sequence model are learned from the streams of
+the other two, as `model make` learns them, and judged on all streams of the one that is left out.
+
+Figures are compared at equal onsets: the threshold is the lowest with at most --onsets an hour in the
+left-out renderer's own hazard-free streams, those of misleading traffic apart. Printed for each renderer:
+approaches detected and their lead, those in advisory in the last second before T0 and in the last hop, onsets
+an hour, Brier skill of the chances at 1, 2 and 3 s, the share of detected approaches whose first advisory has
+the side of the first vehicle (both sides at once apart), and what is detected where no wall stands opposite.
+"learned alarm" is the threshold that the streams of the other two renderers set, as a user would have it.
+
+Examples
+--------
+  worldstate-lab left-out --streams streams --jobs 2
+  worldstate-lab left-out --streams streams --array uma-8 --moving-ego --junctions 4 --results left_out.json
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from worldstate import adapters, frontend
+from worldstate.abduction.sequence.sequence_model import SequenceModel
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.adapters.datasets.feature_table import FeatureTable, read_ids
+from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.cli.common.inputs import add_array_options
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.progress import progress_bar
+from worldstate.commissioning.alarm_curve import (
+    UNREACHED,
+    alarm_levels,
+    measured_curve,
+    raised_at,
+    stream_states,
+)
+from worldstate.commissioning.commission import (
+    FOLDS,
+    FitWindows,
+    heard_streams,
+    learn_sequence,
+    stream_evidence,
+    table_and_beside,
+    windows_of_array,
+)
+from worldstate.commissioning.heard_stream import (
+    CommissionSettings,
+    HeardStream,
+    junction_named,
+    learned_streams,
+)
+from worldstate.commissioning.sequence_training import stream_truth
+from worldstate.commissioning.simulated_windows import (
+    N_OPEN,
+    open_field_features,
+    open_field_windows,
+    window_model,
+)
+from worldstate.commissioning.stream_exam import ExaminedStream, alarm_outcomes, examine
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+from worldstate.operations.metrics.approach_table import ApproachTable, Figures, caution, mean_of
+from worldstate.simulation.parallel import in_processes
+from worldstate_lab.report.table import figure_lines
+
+NEEDS = ("sklearn",)
+ONSETS = {False: 30.0, True: 40.0}  # An hour, by whether the ego moves
+# Windows and trees of every fold, the alarm, the window model, and that judging begins.
+STEPS = 2 * FOLDS + 3
+MISLEADING = "misleading"  # How the names of such traffic begin
+OF_EXAM = (
+    *("approaches", "detected", "detected_low", "detected_high", "lead_s", "lead_missed_as_0_s"),
+    *("advised_last_second", "advised_at_t0", "skill_1s", "skill_2s", "skill_3s"),
+)
+OF_ALARM = ("hazard_free_hours", "onsets_per_hour", "onsets_low", "onsets_high")
+# A stream as a model reads it, and the levels of its alarm (n, 2): see `alarm_levels`.
+Judged = tuple[ExaminedStream, FloatArray]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add_array_options(parser, "OVAD's")
+    add("--streams", type=Path, required=True, metavar="D", help="folder of what is listened to")
+    add("--moving-ego", action="store_true", help="drives up to the corner, in place of an ego that stands")
+    add("--junctions", type=int, default=16, metavar="N", help="of each renderer (default: %(default)s)")
+    minutes = "of approaches at each; streams without hazards last in proportion (default: %(default)g)"
+    add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
+    onsets = "an hour at which shares are compared (default: 30, of a moving ego 40)"
+    add("--onsets", type=float, metavar="N", help=onsets)
+    add("--labelled", type=Path, metavar="CSV", help="labelled windows of this array, learned too")
+    ids = "CSV files with a column ID: leave out the recordings of these labelled windows"
+    add("--exclude", type=Path, nargs="+", default=[], metavar="IDS", help=ids)
+    add("--seed", type=int, default=1, help="of the streams and of the trees (default: %(default)s)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    settings, array = _settings(arguments), frontend.ovad_array()
+    if arguments.array is not None:
+        array = adapters.read_array(arguments.array, arguments.array_axes)
+    plan, streams = learned_streams(settings), list[HeardStream]()
+    if not any(one.traffic.hazard_free and not one.traffic.name.startswith(MISLEADING) for one in plan):
+        raise InvalidArgumentError("--junctions: expected 3 or more, of fewer no traffic sets the threshold")
+    fit = windows_from(array, settings, _labelled(arguments), arguments.jobs)
+    with progress_bar("listening", sum(one.minutes for one in plan)) as bar:
+        heard = heard_streams(plan, array, arguments.streams, arguments.jobs)
+        for planned, one in zip(plan, heard, strict=True):
+            streams.append(one)
+            bar.advance(planned.minutes)
+    renderers = dict.fromkeys(one.renderer for one in streams)
+    rows = {name: left_out_row(name, streams, fit, settings, arguments.jobs) for name in renderers}
+    few = {name: caution(int(row["approaches"] or 0), "approaches") for name, row in rows.items()}
+    lines = [f"{name}: {told}" for name, told in few.items() if told is not None]
+    return CommandResult({"left_out": rows}, table={}, lines=[*figure_lines(rows, ".3f"), *lines])
+
+
+def _settings(arguments: argparse.Namespace) -> CommissionSettings:
+    moves: bool = arguments.moving_ego
+    return CommissionSettings(
+        junctions=arguments.junctions,
+        approach_minutes=arguments.minutes,
+        hazard_free_minutes=arguments.minutes / 1.2,
+        onsets_per_hour=ONSETS[moves] if arguments.onsets is None else arguments.onsets,
+        seed=arguments.seed,
+        moving_ego=moves,
+    )
+
+
+def _labelled(arguments: argparse.Namespace) -> FeatureTable | None:
+    if arguments.labelled is None:
+        return None
+    table = adapters.read_features(arguments.labelled).group("dynamic" if arguments.moving_ego else "static")
+    return table.without([name for path in arguments.exclude for name in read_ids(path)])
+
+
+def windows_from(
+    array: MicrophoneArray, settings: CommissionSettings, table: FeatureTable | None, jobs: int
+) -> FitWindows:
+    """Return what makes a window model of some streams, as `commission` makes it."""
+    plan, rng = learned_streams(settings), np.random.default_rng(settings.seed)
+    domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
+    real = None if table is None else windows_of_array(table, settings, domain)
+    open_field = open_field_windows(open_field_features(array, N_OPEN, rng, jobs, settings.moving_ego))
+    fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same for all streams
+    return lambda some: fitted(*table_and_beside(real, open_field, domain, some))
+
+
+def left_out_row(
+    renderer: str, streams: Sequence[HeardStream], fit: FitWindows, settings: CommissionSettings, jobs: int
+) -> Figures:
+    """Return the row of a renderer whose streams are judged, and not learned."""
+    left, judged = [one for one in streams if one.renderer == renderer], list[Judged]()
+    with progress_bar(f"without {renderer}", STEPS + len(left)) as bar:
+        step = partial(bar.go_on, amount=1.0)
+        windows, sequence = learned_without(renderer, streams, fit, settings, jobs, step)
+        step("judging")
+        for one in in_processes(partial(judge, windows, sequence), left, jobs):
+            judged.append(one)
+            bar.advance()
+    assert sequence.alarm is not None  # `learn_sequence` sets one
+    return renderer_figures(judged, settings.onsets_per_hour, sequence.alarm.threshold_nats)
+
+
+def learned_without(
+    renderer: str,
+    streams: Sequence[HeardStream],
+    fit: FitWindows,
+    settings: CommissionSettings,
+    jobs: int = 1,
+    on_step: Callable[[str], None] = lambda stage: None,
+) -> tuple[EnsembleModel, SequenceModel]:
+    """Return a window and a sequence model that learned no stream of a renderer."""
+    others = [one for one in streams if one.renderer != renderer]
+    # Each renderer has a generator of its own: its row does not depend on the renderers before it.
+    rng = np.random.default_rng(settings.seed)
+    sequence = learn_sequence(others, fit, settings.onsets_per_hour, rng, jobs, on_step)
+    on_step("window model")
+    return fit(others), sequence
+
+
+def judge(windows: EnsembleModel, sequence: SequenceModel, heard: HeardStream) -> Judged:
+    """Return what models read of a stream, without advisories so far, and the levels of its alarm."""
+    evidence = stream_evidence(windows, heard)
+    levels = alarm_levels(stream_states(heard, windows, replace(sequence, alarm=UNREACHED), evidence))
+    none = np.zeros(levels.shape, bool)
+    return ExaminedStream(heard, stream_truth(heard), sequence.posterior(evidence), none), levels
+
+
+def renderer_figures(judged: Sequence[Judged], onsets_per_hour: float, learned_nats: float) -> Figures:
+    """Return the row of a renderer: at so many onsets an hour, and at the threshold that others set."""
+    quiet = dict[str, list[FloatArray]]()
+    for one, levels in judged:
+        if one.heard.hazard_free and not _misleads(one.heard):
+            quiet.setdefault(one.heard.site, []).append(levels)
+    threshold_nats = measured_curve(quiet).default(onsets_per_hour).threshold_nats
+    streams, learned = (_advised(judged, nats) for nats in (threshold_nats, learned_nats))
+    found, false = examine(streams), _false_alarms(streams)
+    sides = [
+        right for one, (_, levels) in zip(streams, judged, strict=True) for right in sides_right(one, levels)
+    ]
+    without_wall = examine([one for one in streams if junction_named(one.heard.site).opposite_wall_m is None])
+    return {
+        "threshold_nats": threshold_nats,
+        **{name: found[name] for name in OF_EXAM},
+        **{name: false[name] for name in OF_ALARM},
+        "misleading_onsets_per_hour": _false_alarms(streams, misleading=True)["onsets_per_hour"],
+        **{"side_approaches": len(sides), "side_right": mean_of(sides)},
+        **{f"no_wall_{name}": without_wall[name] for name in ("approaches", "detected")},
+        "learned_alarm_detected": examine(learned)["detected"],
+        "learned_alarm_onsets_per_hour": _false_alarms(learned)["onsets_per_hour"],
+    }
+
+
+def sides_right(one: ExaminedStream, levels: FloatArray) -> list[bool]:
+    """Return of each detected approach from one side whether the first advisory has the first vehicle's side.
+
+    If both sides have one at that hop, the side of the higher level counts.
+    """
+    found = []
+    for told in alarm_outcomes(one.heard, one.heard.hops.time_s, one.advised):
+        if not told.detected or told.approach.flow == "both" or told.approach.quiet:
+            continue
+        hop = np.abs(one.heard.hops.time_s - told.approach.entries_s[0] + told.lead_s).argmin()
+        own = told.approach.sides[0]
+        found.append(
+            bool(one.advised[hop, own])
+            and not (one.advised[hop, 1 - own] and levels[hop, 1 - own] > levels[hop, own])
+        )
+    return found
+
+
+def _misleads(heard: HeardStream) -> bool:
+    return str(heard.hops.about["traffic"]).startswith(MISLEADING)
+
+
+def _advised(judged: Sequence[Judged], threshold_nats: float) -> list[ExaminedStream]:
+    """Return the streams with the advisories of a threshold."""
+    return [
+        replace(one, advised=np.stack([raised_at(side, threshold_nats) for side in levels.T], axis=1))
+        for one, levels in judged
+    ]
+
+
+def _false_alarms(streams: Sequence[ExaminedStream], *, misleading: bool = False) -> Figures:
+    quiet = [one for one in streams if one.heard.hazard_free and _misleads(one.heard) == misleading]
+    return ApproachTable([], [one.advised for one in quiet]).false_alarms()
