@@ -33,9 +33,9 @@ def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: S
 
 
 def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
-    """Return what the ego did at environments S.. (standing) and D.. (moving)."""
-    kinds = {environment[:1] for environment in environments}
-    return "any" if len(kinds) > 1 else "moving" if kinds == {"D"} else "standing"
+    """Return what the ego did at environments D.. (moving) and any others (standing)."""
+    moved = {environment[:1] == "D" for environment in environments}
+    return "any" if len(moved) > 1 else "moving" if True in moved else "standing"
 
 
 def ovad_domain(environments: Sequence[str]) -> ModelDomain:

@@ -25,6 +25,7 @@ from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.listener import Listener, listen, measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
+from worldstate.commissioning.heard_stream import CommissionSettings, learned_streams
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError, OutOfDomainError
@@ -242,6 +243,15 @@ def test_a_model_of_a_file_without_a_speed_hears_every_drive() -> None:
     assert domain is not None and domain.fastest_mps == pytest.approx(30.0 / 3.6)
     assert outside_of(replace(domain, fastest_mps=None), 30.0) is None
     assert outside_of(replace(domain, ego_motion="any"), 30.0) == outside_of(domain, -30.0)
+
+
+@pytest.mark.parametrize(("moves", "motion"), [(False, "standing"), (True, "moving")])
+def test_a_model_of_simulated_streets_is_of_the_ego_in_them(moves: bool, motion: str) -> None:
+    """Junctions of three renderers are named S.., T.., M..: one that stood at all of them never drove."""
+    plan = learned_streams(CommissionSettings(junctions=2, moving_ego=moves))
+    assert domain_of(ovad_array(), [6000.0], [one.site.name for one in plan]).ego_motion == motion
+    both = domain_of(ovad_array(), [6000.0], ["DTA101", *(one.site.name for one in plan), "MB101"])
+    assert both.ego_motion == "any"
 
 
 def test_too_low_a_rate_other_frames_or_another_feature_are_refused() -> None:
