@@ -18,7 +18,7 @@ from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.belief.street_model import StoredStreet, StreetModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import ADDED, Layout, Via, encode
+from worldstate.ground.serialisation import ADDED, Count, Layout, Probability, Via, encode
 
 from .array_file import file_of_model
 from .file_io import read_record, refused_as_file, write_text
@@ -35,6 +35,64 @@ class DataSource:
     name: str
     use: Literal["coefficients", "thresholds", "exam"]
     licence: str = "none stated"
+
+
+@dataclass(frozen=True, slots=True)
+class KindShare:
+    """Share of the approaches of one kind of road user that raised an advisory in the simulated exam."""
+
+    kind: str
+    detected: Probability
+    approaches: Count
+
+
+@dataclass(frozen=True, slots=True)
+class RealFigure:
+    """A figure in a simulated exam, and the same figure on real recordings.
+
+    Parameters
+    ----------
+    figure : str
+        Its name in words.
+    simulated, real : float
+        In the exam of the model that heard the recordings, on simulated streets, and on the recordings.
+    low, high : float
+        95 % interval of the real one.
+    array : str
+        To which these microphones belong.
+    microphones, recordings : int
+        How many of each there are.
+    source : str
+        Command and version that measured it.
+    own : bool
+        Whether the model is for this array and for an ego that stands, as it did; else there is no real
+        recording for the model.
+
+    Examples
+    --------
+    >>> gap = RealFigure("AUROC", 0.98, 0.75, 0.61, 0.87, "a car's roof", 2, 45, "-")
+    >>> gap.sentence
+    "no real recording of such an array and motion; AUROC: 0.98 in simulation was 0.75 [0.61, 0.87] in 45..."
+    """
+
+    figure: str
+    simulated: float
+    real: float
+    low: float
+    high: float
+    array: str
+    microphones: Count
+    recordings: Count
+    source: str
+    own: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """The figure in one sentence."""
+        interval = f"{self.real:.2f} [{self.low:.2f}, {self.high:.2f}]"
+        made = f"{self.recordings} real recordings with {self.microphones} microphones of {self.array}"
+        was = f"{self.figure}: {self.simulated:.2f} in simulation was {interval} in {made}"
+        return was if self.own else f"no real recording of such an array and motion; {was}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +121,12 @@ class Provenance:
         False of a model that was made to try a command out: no budget is stated with it.
     sources : tuple of DataSource
         Each source by use, with its licence; empty in files of a version before 1.8.
+    exam : mapping of str to float
+        What the simulated exam found; empty without one and in files of a version before 1.9.
+    kinds : tuple of KindShare
+        Of each kind of road user, how many of its approaches the exam had and which share was detected.
+    real : tuple of RealFigure
+        What figures of a simulated exam are on real recordings: of this array if there are such, of others.
 
     Examples
     --------
@@ -80,6 +144,9 @@ class Provenance:
     figures: Mapping[str, float] = field(default_factory=dict)
     fit_for_use: bool = field(default=True, metadata=ADDED)
     sources: tuple[DataSource, ...] = field(default=(), metadata=ADDED)
+    exam: Mapping[str, float] = field(default_factory=dict, metadata=ADDED)
+    kinds: tuple[KindShare, ...] = field(default=(), metadata=ADDED)
+    real: tuple[RealFigure, ...] = field(default=(), metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +175,7 @@ class Model:
     """
 
     LAYOUT: ClassVar = Layout(
-        "worldstate.Model", "1.8.0", order="provenance signature policies sequence guard road_users street"
+        "worldstate.Model", "1.9.0", order="provenance signature policies sequence guard road_users street"
     )
 
     signature: AnySignature
@@ -168,8 +235,9 @@ def read_model(
         return model
     shipped = _shipped(file)
     # All else of it is read-only.
-    figures = dict(shipped.provenance.figures)
-    return replace(shipped, provenance=replace(shipped.provenance, figures=figures), street=StreetModel())
+    origin = shipped.provenance
+    own = replace(origin, figures=dict(origin.figures), exam=dict(origin.exam))
+    return replace(shipped, provenance=own, street=StreetModel())
 
 
 def _largest(value: Any) -> float:

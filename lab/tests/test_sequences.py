@@ -1,13 +1,18 @@
 """Scores of real recordings: figures of made-up ones that are known, and the command on a made-up corner."""
 
+import csv
 import json
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
+from pathlib import Path
 
 import numpy as np
 import pytest
 from made_up_corner import write_corner
 from made_up_trials import made_up
-from worldstate_lab.cli.main import main
+from worldstate_lab.cli.card import with_real
+from worldstate_lab.cli.main import main, read_results
 from worldstate_lab.methods.line_of_sight import OcSortRecovery
 from worldstate_lab.sequences.path_figures import exam_figures
 from worldstate_lab.sequences.path_tables import alarm_table
@@ -24,6 +29,10 @@ from worldstate_lab.sequences.scores import (
 from worldstate_lab.sequences.window_rows import FILTERS
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.model_file import read_model, save_model
+
+EVIDENCE = Path(__file__).resolve().parents[2] / "docs" / "evidence"
 
 
 def corner(approaches=4, calm=4, *, t0_s=5.0, hops=81, start_s=0.0):
@@ -280,3 +289,33 @@ def test_the_simulated_exam_stands_beside_what_it_has_a_figure_of(tmp_path) -> N
     last = alarm_table({"ours": row}, "alarm", "alarms", exam).lines()[-1]
     assert "0.79" in last
     assert "6.00" in last
+
+
+def test_the_card_of_the_model_that_ships_has_what_the_pages_print_and_a_board_has_the_gap_alone(
+    tmp_path, capsys
+) -> None:
+    model = read_model()
+    results = read_results(EVIDENCE / "results.json")
+    assert with_real(model, results).provenance.real == model.provenance.real
+    with (EVIDENCE / "figures.csv").open(encoding="utf-8") as file:
+        rows = {row["name"]: row for row in csv.DictReader(file)}
+
+    def printed(name: str) -> float:
+        return reduce(getitem, rows[name]["at"].split("/"), results[rows[name]["key"]]["figures"])
+
+    own, warned, gap, _ = model.provenance.real
+    assert own.real == printed("corner.on.alone.auroc.1") and warned.real == printed("corner.on.alone.warned")
+    assert gap.real == printed("corner.pair.alone.1") and gap.simulated == printed("corner.exam.1s")
+    assert [one.simulated for one in (own, warned)] == [
+        model.provenance.exam[name] for name in ("auroc_1s_before", "detected")
+    ]
+    board, array = tmp_path / "board.json.gz", read_array("uma-8")
+    domain = replace(model.domain, array=array.name, positions_m=array.positions_m)
+    save_model(board, replace(model, signature=replace(model.signature, domain=domain)))
+    words = ["card", str(board), "--real", str(EVIDENCE / "results.json"), "--out", str(board)]
+    assert main(words) == 0
+    assert read_model(board).provenance.real == model.provenance.real[2:]
+    assert capsys.readouterr().out.count("no real recording of such an array and motion") == 2
+    save_model(board, replace(model, provenance=replace(model.provenance, exam={})))
+    assert main(words) == 2
+    assert "expected those of an exam" in capsys.readouterr().err

@@ -17,7 +17,9 @@ from worldstate.adapters.files import array_file
 from worldstate.adapters.files.array_file import named_arrays, read_array
 from worldstate.adapters.files.file_io import MAX_BYTES, refused_as_file
 from worldstate.adapters.files.model_file import (
+    KindShare,
     Model,
+    RealFigure,
     read_model,
     save_model,
 )
@@ -111,9 +113,29 @@ def test_what_a_caller_writes_into_the_shipped_model_changes_no_other_caller():
     once, again = read_model(), read_model()
     with pytest.raises(ValueError, match="read-only"):
         once.signature.home[0] = 99.0
-    once.provenance.figures["accuracy"] = 2.0
+    once.provenance.figures["accuracy"] = once.provenance.exam["detected"] = 2.0
     assert read_model().provenance.figures["accuracy"] < 1.0
-    assert again.provenance.figures["accuracy"] < 1.0
+    assert again.provenance.figures["accuracy"] < 1.0 and again.provenance.exam["detected"] <= 1.0
+
+
+UNIT, NAME, COUNT = st.floats(0.0, 1.0), st.text(max_size=20), st.integers(0, 1000)
+KINDS = st.builds(KindShare, NAME, UNIT, COUNT)
+REAL = st.builds(RealFigure, NAME, UNIT, UNIT, UNIT, UNIT, NAME, COUNT, COUNT, NAME, st.booleans())
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20, deadline=None)
+@given(st.lists(KINDS).map(tuple), st.lists(REAL).map(tuple), st.dictionaries(NAME, UNIT))
+def test_what_the_exam_and_real_recordings_found_comes_back_and_files_of_1_8_have_none(
+    tmp_path, kinds, real, exam
+):
+    origin = replace(published().provenance, kinds=kinds, real=real, exam=exam)
+    save_model(tmp_path / "m.json.gz", replace(published(), provenance=origin))
+    assert read_model(tmp_path / "m.json.gz").provenance == origin
+    former = encode(replace(published(), provenance=origin))
+    former["schema"]["version"] = "1.8.0"
+    for name in ("kinds", "real", "exam"):
+        del former["provenance"][name]
+    assert read(former).provenance == replace(origin, kinds=(), real=(), exam={})
 
 
 def test_written_and_read_back_to_the_bit(tmp_path):
@@ -221,7 +243,7 @@ def test_a_checkpoint_holds_the_numbers_of_its_street(values):
 
 def test_unknown_keys_are_ignored_and_another_major_version_is_not():
     read({**DEFAULT, "later": 1})
-    newer = {**DEFAULT, "schema": {"name": "worldstate.Model", "version": "1.9.0"}}
+    newer = {**DEFAULT, "schema": {"name": "worldstate.Model", "version": "1.10.0"}}
     read(newer)
     with pytest.raises(SchemaVersionError, match=r"bad\.json: expected"):
         read({**DEFAULT, "schema": {"name": "worldstate.Model", "version": "2.0.0"}})

@@ -14,7 +14,7 @@ import pytest
 import soundfile
 
 from worldstate.adapters.files import array_file
-from worldstate.adapters.files.model_file import DataSource, read_model, save_model
+from worldstate.adapters.files.model_file import DataSource, KindShare, RealFigure, read_model, save_model
 from worldstate.cli.main import FORMER, FORMER_OPTIONS, PROGRAM, STUDIES, main
 from worldstate.state import snapshot_schema
 
@@ -156,6 +156,29 @@ def test_a_card_names_each_source_by_use_with_its_licence_none_stated_included(t
     card = capsys.readouterr().out
     assert re.search(r"source 1 +some windows: coefficients; licence: none stated\n", card)
     assert re.search(r"source 2 +some clips: thresholds; licence: CC0\n", card)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_card_states_reality_in_words_and_the_gap_of_others_only_without_recordings_of_its_own(
+    own, tmp_path, capsys
+):
+    gap = RealFigure("AUROC", 0.98, 0.75, 0.63, 0.87, "a car", 2, 45, "a command")
+    rows = (gap, replace(gap, simulated=0.97, real=0.82, microphones=7, own=True)) if own else (gap,)
+    kinds = (KindShare("bicycle", 0.0, 12), KindShare("car", 0.777, 49))
+    made = read_model()
+    provenance = replace(made.provenance, real=rows, kinds=kinds, exam={"detected": 0.5})
+    save_model(tmp_path / "m.json.gz", replace(made, provenance=provenance))
+    assert main(["model", "show", str(tmp_path / "m.json.gz")]) == 0
+    card = capsys.readouterr().out
+    (said,) = re.findall(r"real_figure \d+ +(.*)", card)
+    alone = (
+        "AUROC: 0.97 in simulation was 0.82 [0.63, 0.87] in 45 real recordings with 7 microphones of a car"
+    )
+    without = "no real recording of such an array and motion; AUROC: 0.98 in simulation was 0.75 [0.63, 0.87]"
+    assert said.startswith(alone if own else without)
+    assert re.search(r"kind 1 +bicycle: 0\.00 of 12 simulated approaches", card)
+    assert re.search(r"kind 2 +car: 0\.78 of 49 ", card)
+    assert re.search(r"simulated_exam +detected 0\.5\n", card)
 
 
 @pytest.mark.parametrize("word", ["array", "model"])

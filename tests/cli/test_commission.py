@@ -3,6 +3,7 @@
 import gzip
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import soundfile
 from worldstate_lab.cli.main import main as study
 
-from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.cli.main import main
 
 ARRAY = "x,y,z\n0,0.2,0\n0,0.05,0\n0.05,-0.1,0\n0,-0.25,0\n"
@@ -35,6 +36,13 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert "source 1        simulated streets: coefficients; licence: Apache-2.0" in card
     assert "simulated streets: exam" in card
     told = json.loads(report.read_text())
+    # Two renderings of the exam: the report, and the card that the model carries.
+    alone = sum(value for name, value in told.items() if name.startswith("approaches_"))
+    assert sum(one.approaches for one in model.provenance.kinds) == alone
+    assert model.provenance.exam["detected"] == told["detected"]
+    shipped = read_model().provenance.real
+    assert model.provenance.real == tuple(one for one in shipped if not one.own) != ()
+    assert card.count("no real recording of such an array and motion; ") == len(model.provenance.real)
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
     assert set(told["mounting"]) == {"as mounted", "2 deg of yaw", "5 mm of position"}
     assert told["mounting"]["as mounted"]["detected"] == told["detected"]
@@ -68,7 +76,9 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert main([*command[:2], *boards, "--out", str(tmp_path / "boards"), "--quick"]) == 0
     made = {path.name: path for path in (tmp_path / "boards").iterdir()}
     assert set(made) == {"respeaker-4.json.gz", "mics.json.gz"}
-    assert gzip.decompress(made["mics.json.gz"].read_bytes()) == before
+    # The same model, but for the card of an exam that it did not sit.
+    save_model(out, replace(model, provenance=replace(model.provenance, exam={}, kinds=())))
+    assert gzip.decompress(made["mics.json.gz"].read_bytes()) == out.read_bytes() != before
     other = read_model(made["respeaker-4.json.gz"])
     assert other.domain is not None and other.domain.array == "respeaker-4"
     quiet = tmp_path / "night.wav"

@@ -63,7 +63,7 @@ def test_what_is_rendered_for_one_array_is_kept_for_those_beside_it(tmp_path, mo
 def test_wrong_mountings_are_heard_in_as_many_processes_as_asked(tmp_path, monkeypatch) -> None:
     """Half an hour of streams an ear: with one process the command takes as long as its whole exam."""
     asked, heard = [], [passing(0.0), passing(2.0), passing(1.0)]
-    monkeypatch.setattr(commission, "_examined", lambda model, one: one)
+    monkeypatch.setattr(commission, "examine_stream", lambda model, one: one)
     monkeypatch.setattr(
         commission, "in_processes", lambda work, items, jobs: asked.append(jobs) or [heard] * len(items)
     )

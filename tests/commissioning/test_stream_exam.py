@@ -26,6 +26,7 @@ from worldstate.commissioning.alarm_curve import (
     measured_curve,
     raised_at,
 )
+from worldstate.commissioning.commission import real_figures
 from worldstate.commissioning.heard_stream import (
     CommissionSettings,
     HeardStream,
@@ -41,7 +42,9 @@ from worldstate.commissioning.stream_exam import (
     exam_figures,
     examine,
     warned_before,
+    with_exam,
 )
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, StreamApproach, hop_outcome
@@ -106,6 +109,42 @@ def test_approaches_are_put_together_by_who_came_with_whom() -> None:
         ("queue", (46.0, 48.5), (1, 1), False),
         ("single", (55.0,), (0,), True),
     ]
+
+
+KINDS = st.sampled_from(["light", "medium", "heavy", "electric", "bicycle", "scooter", "motorcycle"])
+
+
+@given(st.lists(st.tuples(KINDS, st.booleans()), min_size=1, max_size=8))
+@settings(max_examples=20, deadline=None)
+def test_the_card_has_the_share_of_each_kind_that_was_detected_by_the_name_that_users_know(
+    drawn: list[tuple[str, bool]],
+) -> None:
+    """An oracle that counts: vehicles 20 s apart, each with an alarm before T0 or without one."""
+    told = {"light": "car", "medium": "van", "heavy": "truck"}
+    every: list[Vehicle] = [("left", kind, "left", 20.0 * (i + 1)) for i, (kind, _) in enumerate(drawn)]
+    alarms = [(one[3] - 2.0, one[3], 0) for one, (_, found) in zip(every, drawn, strict=True) if found]
+    stream = examined(heard(every, 20.0 * (len(drawn) + 1)), alarms)
+    kinds = with_exam(read_model(), examine([stream])).provenance.kinds
+    expected = Counter(told.get(kind, kind) for kind, _ in drawn)
+    found = Counter(told.get(kind, kind) for kind, alarm in drawn if alarm)
+    assert {one.kind: (one.approaches, one.detected) for one in kinds} == {
+        kind: (count, found[kind] / count) for kind, count in expected.items()
+    }
+
+
+@given(st.integers(2, 60), st.integers(0, 2**32 - 1), st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_an_array_has_its_own_real_figures_or_the_gap_that_another_one_has(
+    microphones: int, seed: int, moving: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    known, roof = read_model().provenance.real, ovad_array().positions_m
+    shuffled = MicrophoneArray(rng.permutation(roof) + rng.normal(size=3))
+    other = MicrophoneArray(rng.uniform(-0.5, 0.5, (microphones, 3)))
+    gap = tuple(one for one in known if not one.own)
+    assert known != gap != ()
+    assert real_figures(shuffled, moving_ego=moving) == (gap if moving else known)
+    assert real_figures(other, moving_ego=moving) == gap
 
 
 def test_a_second_vehicle_belongs_to_the_first_however_near_the_next_approach_is() -> None:

@@ -18,7 +18,8 @@ from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES, side_ratios, visible_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of
-from worldstate.adapters.files.model_file import DataSource, Model
+from worldstate.adapters.files.array_match import microphone_order
+from worldstate.adapters.files.model_file import DataSource, Model, RealFigure, read_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
@@ -257,7 +258,8 @@ def commission(
     Streams are heard and kept in the folder for the arrays beside, too. `on_step` is called with what is done
     next and with what was done meanwhile, in minutes of streams (`learning_minutes` are all).
 
-    The card names every source by use, the labelled windows with their licence.
+    The card names every source by use, the labelled windows with their licence, and what a simulated exam is
+    worth on real recordings.
     Recordings without vehicles set the alarm in place of the simulated streets without hazards; guard and
     road users are learned from recorded clips as well. The model says where the labelled windows and the
     clips come from and which lists of windows were left out.
@@ -307,14 +309,26 @@ def commission(
     named += CHOSEN_ON if model.guard is not None else ()
     named += [DataSource(path.name, "thresholds") for path in quiet] or [replace(STREETS, use="thresholds")]
     named.append(replace(STREETS, use="exam"))
-    provenance = replace(model.provenance, fit_for_use=not settings.quick, sources=tuple(named))
-    made = replace(model, provenance=provenance, sequence=sequence)
+    gaps = real_figures(array, moving_ego=settings.moving_ego)
+    origin = replace(model.provenance, fit_for_use=not settings.quick, sources=tuple(named), real=gaps)
+    made = replace(model, provenance=origin, sequence=sequence)
     if not calm:
         return made
     quiet_levels = dict[str, list[FloatArray]]()
     for one in calm:
         quiet_levels.setdefault(one.site, []).append(levels_of(made, one))
     return with_curve(made, measured_curve(quiet_levels), settings.onsets_per_hour)
+
+
+def real_figures(array: MicrophoneArray, *, moving_ego: bool = False) -> tuple[RealFigure, ...]:
+    """Return what figures of an exam are on real recordings of an array, as the model that ships has them.
+
+    Those of the roof array and an ego that stands are its own; any other model has the gap of the pair alone.
+    """
+    known = read_model()
+    roof = known.domain is not None and microphone_order(known.domain.positions_m, array) is not None
+    own = roof and not moving_ego
+    return tuple(one for one in known.provenance.real if own or not one.own)
 
 
 def _with_ears(
@@ -447,10 +461,11 @@ def _heard_and_examined(
     model: Model, arrays: Sequence[MicrophoneArray], folder: Path, settings: StreamSettings
 ) -> ExaminedStream:
     (heard,) = _heard(arrays, [[one] for one in arrays], folder, settings)
-    return _examined(model, heard)
+    return examine_stream(model, heard)
 
 
-def _examined(model: Model, heard: HeardStream) -> ExaminedStream:
+def examine_stream(model: Model, heard: HeardStream) -> ExaminedStream:
+    """Let a model with an alarm examine a stream that was listened to."""
     windows, sequence = parts_of(model)
     if sequence.alarm is None:
         raise InvalidArgumentError("model: expected one with an alarm, as `commission` makes")
@@ -466,4 +481,4 @@ def exam_of_mountings(
     mounted = mountings(array, np.random.default_rng(settings.seed))
     hear = partial(_heard, [array], [list(mounted.values())], folder)
     for heard in in_processes(hear, mounting_streams(settings), jobs):
-        yield {name: _examined(model, one) for name, one in zip(mounted, heard, strict=True)}
+        yield {name: examine_stream(model, one) for name, one in zip(mounted, heard, strict=True)}

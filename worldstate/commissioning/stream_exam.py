@@ -6,7 +6,7 @@ lies farther away than an alarm is counted for, so that the first hop in alarm c
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from worldstate.abduction.sequence.sequence_model import (
     SMOOTHED_HOPS,
     SequencePosterior,
 )
+from worldstate.adapters.files.model_file import KindShare, Model
 from worldstate.ground import TINY, BoolArray, FloatArray, wrap_angle
 from worldstate.ground.checks import check_shape
 from worldstate.operations.figure_style import figure_file, legend_beside
@@ -37,6 +38,7 @@ from worldstate.operations.metrics.approach_table import (
 from worldstate.operations.recordings.hop_table import HOP_S
 
 from .heard_stream import ROW_S, HeardStream
+from .road_user_training import CLASS_OF
 from .sequence_training import QUIET_KINDS, StreamTruth
 
 # A second vehicle arrives up to six seconds after the first; drivers differ by half a second more.
@@ -289,22 +291,6 @@ def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
     return np.asarray(scores[at[(at >= 0)]])
 
 
-# What OVAD's 56 microphones reach with the model that ships, in 88 loud approaches and .67 hours without
-# hazards at the five junctions with a name (docs/evidence/commission.md), of which its window model knows
-# real windows.
-REFERENCE: Mapping[str, float] = {
-    "detected": 0.898,
-    "lead_s": 2.44,
-    "lead_missed_as_0_s": 2.19,
-    "other_side_too": 0.29,
-    "both_sides_found": 0.65,
-    "auroc_last_second": 0.991,
-    "auroc_1s_before": 0.989,
-    "auroc_2s_before": 0.985,
-    "auroc_3s_before": 0.958,
-    "onsets_per_hour": 13.5,
-    "bearing_error_deg": 6.1,
-}
 # Of wrong mountings only what they may cost, by heading.
 _COST_OF = {
     "AUROC last s": "auroc_last_second",
@@ -336,21 +322,34 @@ def exam_figures(streams: Sequence[ExaminedStream]) -> Figures:
     return found
 
 
-def beside_reference(report: Mapping[str, object]) -> dict[str, object]:
+def with_exam(model: Model, figures: Figures) -> Model:
+    """Return a model whose card states what its exam found, of each kind of road user, too."""
+    card = ("approaches", "auroc_1s_before", "both_sides_found", *_COST_OF.values())
+    exam = {name: float(value) for name in card if (value := figures.get(name)) is not None}
+    kinds = [name.removeprefix("approaches_") for name in figures if name.startswith("approaches_")]
+    shares = tuple(
+        # A quiet road user has a row of its own.
+        KindShare(one if one in QUIET_KINDS else CLASS_OF[one], figures[f"detected_{one}"] or 0.0, int(count))
+        for one in kinds
+        if (count := figures[f"approaches_{one}"])
+    )
+    return replace(model, provenance=replace(model.provenance, exam=exam, kinds=shares))
+
+
+def beside_reference(report: Mapping[str, object], reference: Mapping[str, float]) -> dict[str, object]:
     """Return a report for people, with the figures of the 56 microphones behind those that have one.
 
     Examples
     --------
-    >>> told = beside_reference({"approaches": 130, "onsets_per_hour": 25.0})
-    >>> told["approaches"], told["onsets_per_hour"].split()[0]
-    (130, '25')
+    >>> told = beside_reference({"approaches": 130, "onsets_per_hour": 25.0}, {"onsets_per_hour": 13.5})
+    >>> told["approaches"], told["onsets_per_hour"]
+    (130, '25       (56 microphones: 13.5)')
     """
-    return {
-        name: f"{value:<8.4g} (56 microphones: {REFERENCE[name]:g})"
-        if isinstance(value, float) and name in REFERENCE
-        else value
-        for name, value in report.items()
+    shown = "{:<8.4g} (56 microphones: {:.3g})"
+    both = {
+        name: (report[name], one) for name, one in reference.items() if isinstance(report.get(name), float)
     }
+    return {**report, **{name: shown.format(*pair) for name, pair in both.items()}}
 
 
 def mounting_lines(mounted: Mapping[str, Figures]) -> list[str]:

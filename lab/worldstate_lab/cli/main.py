@@ -31,6 +31,7 @@ STUDIES = {
         "ablations",
         "realism",
         "reach",
+        "card",
         "clips",
         "foreign",
         "kinds",

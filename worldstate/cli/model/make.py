@@ -26,6 +26,7 @@ Examples
 """
 
 import argparse
+from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,11 +95,12 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         array, *beside = arrays[number - 1 :] or [frontend.ovad_array()]
         reports[array.name] = _made(arguments, settings, array, beside, out, recorded, lines)
     report: dict[str, object] = {"models": reports} if len(arrays) > 1 else next(iter(reports.values()))
-    told = {"out": str(arguments.out)} if len(arrays) > 1 else report
+    told = {name: one for name, one in report.items() if name != "real_figures"}
+    told = {"out": str(arguments.out)} if len(arrays) > 1 else told
     # The figures of the 56 microphones are those of a standing ego.
     if not settings.moving_ego:
-        told = stream_exam.beside_reference(told)
-        report["reference"] = dict(stream_exam.REFERENCE)
+        reference = adapters.read_model().provenance.exam
+        told, report["reference"] = stream_exam.beside_reference(told, reference), dict(reference)
     if len(arrays) > 1 and arguments.exam:
         lines += ["", *stream_exam.exam_lines("array", reports)]
     if arguments.report is not None:
@@ -153,13 +155,16 @@ def _made(
         )
     adapters.save_model(out, model)
     report: dict[str, object] = {"out": str(out), "fit_for_use": model.provenance.fit_for_use}
+    report["real_figures"] = [asdict(one) for one in model.provenance.real]
+    lines += [one.sentence for one in model.provenance.real if one.sentence not in lines]
     if arguments.exam:
         exam = heard_stream.exam_streams(settings)
         with progress.progress_bar(f"exam of {out.name}", sum(one.minutes for one in exam)) as bar:
             examined = commission.exam_of(
                 array, model, settings, folder, beside=beside, jobs=arguments.jobs, on_step=bar.advance
             )
-        report |= stream_exam.exam_figures(examined)
+        report |= (figures := stream_exam.exam_figures(examined))
+        adapters.save_model(out, stream_exam.with_exam(model, figures))
         if arguments.figure is not None:
             first = [one for one in examined if one.heard.renderer == "paths"]
             stream_exam.write_exam_figure(first, arguments.figure)

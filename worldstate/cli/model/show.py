@@ -21,6 +21,13 @@ from worldstate.frontend.array.microphone_array import nearest_spacings_m
 LICENCE = "Apache-2.0 for the coefficients that ship; no row of the training data is in the file"
 SHOWN = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0)  # Onsets an hour that may be asked for
 UNNAMED = "names no array, sample rate or ego motion: no budget is stated with it"
+# How a row of these reads.
+_ROWS = {
+    "sources": "{name}: {use}; licence: {licence}",
+    "real_figures": "{sentence}",
+    "kinds": "{kind}: {detected:.2f} of {approaches} simulated approaches raised an advisory",
+    "street": "{name} {value:g} {unit} ({origin}: {why})",
+}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -35,29 +42,26 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if model.street is None:
         output.say(output.NO_STREET)
     card = model_card(model)
-    return output.CommandResult(card, table=_readable(card))
+    return output.CommandResult(card, table=readable(card))
 
 
-def _readable(card: dict[str, object]) -> dict[str, object]:
+def readable(card: dict[str, object]) -> dict[str, object]:
     """Return the card with one line a threshold and a limit."""
     lines: dict[str, object] = {}
     for key, value in card.items():
-        if isinstance(value, list) and key in ("sources", "budgets", "thresholds", "limits"):
-            lines |= {f"{key[:-1]} {number}": _words(one) for number, one in enumerate(value, start=1)}
-        elif isinstance(value, dict) and key == "street":
-            shown = "{name} {value:g} {unit} ({origin}: {why})"
-            rows = enumerate(value.items(), start=1)
-            lines |= {f"street {row}": shown.format(name=name, **one) for row, (name, one) in rows}
+        if isinstance(value, dict) and key == "street":
+            value = [{"name": name} | one for name, one in value.items()]
+        if isinstance(value, list) and key in (*_ROWS, "budgets", "thresholds", "limits"):
+            rows = [_ROWS[key].format(**one) if key in _ROWS else _words(one) for one in value]
+            lines |= {f"{key.removesuffix('s')} {number}": row for number, row in enumerate(rows, start=1)}
         else:
             lines[key] = _words(value)
     return lines
 
 
 def _words(value: object) -> object:
-    if isinstance(value, dict) and "use" in value:
-        return "{name}: {use}; licence: {licence}".format(**value)
     if isinstance(value, dict):
-        return "  ".join(f"{key} {part:.4g}" for key, part in value.items())
+        return "  ".join(f"{key} {part:.4g}" for key, part in value.items()) or None
     return value
 
 
@@ -72,6 +76,7 @@ def model_card(model: "adapters.Model") -> dict[str, object]:
     (56, 'standing')
     """
     origin = model.provenance
+    real = [one for one in origin.real if one.own] or origin.real
     return {
         "data": origin.dataset,
         "group": origin.group,
@@ -83,15 +88,13 @@ def model_card(model: "adapters.Model") -> dict[str, object]:
         **_made_for(model),
         **_budgets(model),
         "thresholds": [
-            {
-                "alpha": policy.alpha,
-                "beta": policy.miss_rate,
-                "gamma": policy.gamma,
-                "sustain_hops": policy.sustain_hops,
-            }
-            for policy in model.policies.policies
+            {"alpha": one.alpha, "beta": one.miss_rate, "gamma": one.gamma, "sustain_hops": one.sustain_hops}
+            for one in model.policies.policies
         ],
         "figures": dict(origin.figures),
+        "simulated_exam": dict(origin.exam),
+        "real_figures": [asdict(one) | {"sentence": one.sentence} for one in real],
+        "kinds": [asdict(one) for one in origin.kinds],
         "street": {} if model.street is None else {k: asdict(v) for k, v in model.street.described.items()},
         "limits": _limits(model),
         "licence": LICENCE,
