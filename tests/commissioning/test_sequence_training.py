@@ -30,7 +30,7 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("sizes", [(6,), (4, 9), (8, 3, 5)])
-def test_exported_trees_are_the_geometric_mean_of_their_classifiers(seed: int, sizes: tuple[int, ...]) -> None:
+def test_exported_trees_are_the_geometric_mean_of_classifiers(seed: int, sizes: tuple[int, ...]) -> None:
     rng = np.random.default_rng(seed)
     inputs, groups = rng.normal(size=(400, 7)), rng.choice([0, 3, 14], 400)
     machines = [
