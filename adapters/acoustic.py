@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from operator import itemgetter
 from typing import Protocol
@@ -103,6 +104,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     uncalibrated : bool
         Go on with another array, rate or band than the model was made for. Give the filter a policy of
         alpha 0 then, which states no budget.
+    kinds : mapping of str to float, optional
+        Of each kind of road user, the share that the exam of the model detected.
 
     Attributes
     ----------
@@ -147,6 +150,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         road_users: RoadUserModel | None = None,
         sequence: SequenceReader | NotUsable | None = None,
         uncalibrated: bool = False,
+        kinds: Mapping[str, float] | None = None,
     ) -> None:
         domain: ModelDomain | None = getattr(model, "domain", None)
         if front_end_settings is None:
@@ -175,6 +179,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self._guard = guard
         self._road_users = road_users
         self._sequence = sequence
+        self._kinds = kinds
         self._directions: tuple[str, ...] = SIDES
 
     def measure(self, block: Float32Array, /) -> list[Measurement]:
@@ -209,7 +214,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         half of the street the peak is in, not where the vehicle is: then the side is the signature's. Nothing
         is read of a hop that is `outside` of what the models learned, which is the reason why.
         """
-        self.last_frame, heard = frame, heard_of(frame) if outside is None else Heard(0.0, outside)
+        self.last_frame, heard = frame, Heard(0.0, outside) if outside else heard_of(frame, self._kinds)
         measured = self._unheard(frame, heard)
         if heard.usable:
             measured = self._read(frame, measured)
@@ -294,11 +299,11 @@ def read_hop(
     return reader.read(columns, frame.feature)
 
 
-def heard_of(frame: AcousticFrame) -> Heard:
+def heard_of(frame: AcousticFrame, kinds: Mapping[str, float] | None = None) -> Heard:
     """Return how likely a hidden vehicle would have been noticed in the sound of a hop.
 
     The least of what lost samples and noise, channels that are left out, clipping and a loud source in view
-    leave.
+    leave. Beside it stand the shares of kinds of road users in the exam of the model.
     """
     if frame.heard is None:
         return Heard(measured=False)
@@ -312,7 +317,7 @@ def heard_of(frame: AcousticFrame) -> Heard:
         dead = 1.0 - health.mask.n_kept / len(health.mask.keep)
         left += [(falling(dead, _DEAD), "dead channels"), (falling(health.clipped, _CLIPPED), "clipped")]
     share, reason = min(left, key=itemgetter(0))
-    return Heard(share, reason if share < _SAID else None, frame.excess_db)
+    return Heard(share, reason if share < _SAID else None, frame.excess_db, kinds=kinds)
 
 
 def beside_foreign(foreign: Foreign, heard: Heard) -> Heard:

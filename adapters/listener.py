@@ -186,6 +186,7 @@ class Listener:
             sequence=self._reader,
             front_end_settings=source.settings.front_end(source.array, sample_rate_hz),
             uncalibrated=source.settings.uncalibrated,
+            kinds=source.kinds,
         )
         if spectra is not None:
             self._adapter.take_spectra(spectra, source.start_ns)

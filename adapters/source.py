@@ -1,7 +1,7 @@
 """What is listened to: a recording with its array, model, camera, and what was believed before."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypedDict, TypeVar
@@ -171,6 +171,9 @@ class Source:
     others : tuple of callables
         What other sensors measured, odometry too, each returning it in the order of stamps on the clock of
         the sound.
+    kinds : mapping of str to float, or None
+        Of each kind of road user, the share that the exam of the model detected; None if its sequence model
+        is not used.
 
     Examples
     --------
@@ -208,6 +211,7 @@ class Source:
     sides: SidePatterns | None = None
     co_evidence: SeveralCameras | None = None
     others: tuple[OtherModality, ...] = ()
+    kinds: Mapping[str, float] | None = None
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
@@ -413,6 +417,7 @@ def open_source(
     first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
     start_ns = nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns
     t0_s = None if recording is None else recording.t0_s
+    shares = {one.kind: one.detected for one in known.provenance.kinds}
     source = Source(
         sound=sound if recording is None else recording.audio_path,
         array=heard_by,
@@ -433,6 +438,7 @@ def open_source(
         street=known.street,
         sides=sides,
         others=tuple(others) if ego is None else (*others, ego.told.__iter__),
+        kinds=shares if isinstance(sequence, SequenceModel) else None,
     )
     return _with_camera(source, recording, detections, detector)
 

@@ -23,7 +23,7 @@ from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
 from worldstate.adapters.acoustic import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
-from worldstate.adapters.files.model_file import Model, read_model, save_model
+from worldstate.adapters.files.model_file import KindShare, Model, read_model, save_model
 from worldstate.adapters.listener import Listener, Step, listen_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.commissioning.commission import stream_evidence
@@ -34,6 +34,7 @@ from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.odometry import Odometry
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.state import Hearing
 
 RATE_HZ = 6000
 ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
@@ -128,6 +129,21 @@ def test_a_recording_heard_in_parts_gives_the_states_of_the_whole(folder: Path, 
     save_checkpoint(folder / "half.json", cut.checkpoint)
     rest = steps(folder, resume=read_checkpoint(folder / "half.json"))
     assert [one.state.to_json() for one in rest] == [one.state.to_json() for one in whole[13:]]
+
+
+def test_the_snapshot_has_the_shares_of_the_card_where_its_exam_holds(folder: Path) -> None:
+    model = read_model(folder / "model.json")
+    card = replace(model.provenance, kinds=(KindShare("bicycle", 0.08, 12), KindShare("car", 0.78, 49)))
+    known = replace(model, provenance=card)
+
+    def heard(**more: object) -> Hearing:
+        (one,) = next(listen_steps(open_source(folder / "sound.wav", model=known, **more))).state.heard
+        return one
+
+    here = heard()
+    assert here.kinds == pytest.approx({"bicycle": 0.08 * here.share, "car": 0.78 * here.share}, abs=5e-4)
+    anywhere = ListenSettings(uncalibrated=True)
+    assert heard(settings=anywhere).kinds is heard(context=Context(ego_speed_mps=5.0)).kinds is None
 
 
 def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path) -> None:

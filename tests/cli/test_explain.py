@@ -16,7 +16,7 @@ from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import GROUPS, AlarmPromise, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.cli.main import main
-from worldstate.measurement import Look
+from worldstate.measurement import Heard, Look
 from worldstate.operations.recordings.evidence_report import common_lines
 
 SILENT, FLAT = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
@@ -76,6 +76,13 @@ def test_what_was_asked_of_the_alarm_stands_beside_what_its_curve_promises() -> 
         assert words in line
         stated = None if alarm.promise is None else 0.0094
         assert [cue.alpha for cue in state.cues] == [stated, stated]
+
+
+def test_a_reader_sees_at_a_glance_that_a_bicycle_would_not_be_heard() -> None:
+    kinds = {"bicycle": 0.0, "car": 0.8}
+    hop = Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, heard=Heard(0.5, "wind", kinds=kinds))
+    lines = list(common_lines(WorldFilter().update(hop).state))
+    assert "heard by acoustic, by kind (simulated exam): bicycle 0.00, car 0.40" in lines
 
 
 PRINTED = """\
@@ -181,7 +188,7 @@ def test_a_time_outside_and_a_side_that_is_none_are_named(words, said, states, c
 
 def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, tmp_path, capsys):
     file = tmp_path / "old.jsonl"
-    file.write_text(states.read_text().replace('"version":"4.0.0"', '"version":"2.1.0"'))
+    file.write_text(states.read_text().replace('"version":"4.1.0"', '"version":"2.1.0"'))
     assert main(["explain", str(file), "--time", "1"]) == 2
     assert "old.jsonl: expected schema worldstate.Snapshot 4.x, got" in (said := capsys.readouterr().err)
     assert "write it anew" in said

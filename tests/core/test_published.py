@@ -61,7 +61,8 @@ def street(
             seen.append(Sighting(-0.1, 0.02, str(rng.choice(["truck", "person"])), 0.8, 0.02, moving=False))
         answer = (Present if seen else Absent)(rng.uniform(0.02, 0.6), rng.uniform(0.01, 0.02))
         sector = None if hop % 5 else (-0.6, 0.6 + 0.01 * hop)
-        dull = Heard(rng.uniform(0.2, 1.0), str(rng.choice(["wind", "clipped"])))
+        kinds = {"bicycle": 0.1, "car": 0.8}
+        dull = Heard(rng.uniform(0.2, 1.0), str(rng.choice(["wind", "clipped"])), kinds=kinds)
         read = (
             reading(rng, comes, 1.0 * (phase == 2)) if phase != 6 or hop % 2 else NotUsable(f"refused {hop}")
         )

@@ -4,7 +4,7 @@ import copy
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import reduce
 from importlib.resources import files
@@ -23,7 +23,7 @@ from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.road_users import Familiar, Foreign
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
-from worldstate.ground import NotUsable
+from worldstate.ground import LEAST_HEARD, NotUsable
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
 from worldstate.measurement import Heard
 from worldstate.state import (
@@ -137,7 +137,8 @@ cues = st.builds(
         )
     ),
 )
-hearings = st.builds(Hearing, name, unit, stamp, st.sampled_from([None, "wind", MASKED]))
+shares = maybe(st.dictionaries(name, unit, max_size=3))
+hearings = st.builds(Hearing, name, unit, stamp, st.sampled_from([None, "wind", MASKED]), shares)
 verdicts = st.sampled_from(["kept", "in doubt", "broken", "unwatched"])
 budgets = st.builds(
     Budget, verdicts, maybe(name), st.dictionaries(name, number, max_size=2), number, st.just(Tally())
@@ -365,6 +366,31 @@ def test_what_moves_in_view_masks_until_two_seconds_after_it_was_seen(moving, la
     (hearing,) = reduce(WorldFilter.update, (*seen, *unseen), STREET).state.heard
     assert hearing.reason == (MASKED if masks else None)
     assert (hearing.share < 1.0) == masks
+
+
+@given(st.dictionaries(name, unit, min_size=1), unit, unit)
+def test_what_would_be_heard_of_each_kind_falls_with_what_is_heard_and_is_null_of_nothing(kinds, one, other):
+    """Nothing in the way leaves the card's own shares; a deaf ear, or a card without shares, states none."""
+
+    def stated(share: float) -> Mapping[str, float] | None:
+        world = STREET.update(replace(QUIET, heard=Heard(share, "wind", kinds=kinds)))
+        assert broken_laws(world.state) == []
+        assert WorldState.from_json(world.state.to_json()) == world.state
+        return world.state.heard[0].kinds
+
+    assert stated(1.0) == pytest.approx(kinds, abs=5e-4)
+    assert STREET.update(replace(QUIET, heard=Heard(one))).state.heard[0].kinds is None
+    little, much = map(stated, sorted((one, other)))
+    assert [little is None, much is None] == [one < LEAST_HEARD for one in sorted((one, other))]
+    if little is not None:
+        assert all(little[kind] <= much[kind] <= kinds[kind] + 5e-4 for kind in kinds)
+        assert all(little[kind] == pytest.approx(min(one, other) * kinds[kind], abs=5e-4) for kind in kinds)
+
+
+@pytest.mark.parametrize("kinds", [{"car": 1.01}, {"car": math.nan}, {"car": "0.5"}, 0.5])
+def test_shares_of_kinds_that_are_none_are_refused(kinds):
+    with pytest.raises(InvalidArgumentError, match="kinds"):
+        Heard(kinds=kinds)
 
 
 def hears(*pairs: tuple[float, str | None]) -> tuple[Hearing, ...]:

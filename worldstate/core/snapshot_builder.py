@@ -26,6 +26,7 @@ from worldstate.belief.kinematics.motion import (
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import Track, Tracks, acceleration_psd
 from worldstate.ground import seconds
+from worldstate.measurement.measurement import Heard
 from worldstate.state import Classification, Context, Entity, Hearing, SearchedView, SensorHealth, Visibility
 from worldstate.state.entity import AzimuthSource, SideShare
 from worldstate.state.sensor import Ego
@@ -217,8 +218,15 @@ def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
     """Return how well every source that listens could hear; of one that is silent nothing is known."""
     listening = [(name, one) for name, one in sorted(memory.sources.items()) if one.heard.measured]
     told = [pair for pair in listening if memory.stamp_ns <= pair[1].stamp_ns + NEWS_HOLDS_NS]
-    every = tuple(Hearing(name, one.heard.share, one.heard_ns, one.heard.reason) for name, one in told)
+    every = tuple(_hearing(name, one.heard, one.heard_ns) for name, one in told)
     return every if listening else None
+
+
+def _hearing(source: str, heard: Heard, since_ns: int) -> Hearing:
+    shares = heard.kinds if heard.kinds and heard.usable else {}
+    # Shares of some tens of approaches: to the thousandth.
+    kinds = {kind: round(heard.share * share, 3) for kind, share in shares.items()}
+    return Hearing(source, heard.share, since_ns, heard.reason, kinds or None)
 
 
 def _health(sensor: str, stamp_ns: int, fault: str | None, now_ns: int) -> SensorHealth:

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import ClassVar, Literal, Protocol, TypeVar
@@ -11,7 +11,7 @@ from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.road_users import ClassShares, DomainVerdict, class_shares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.ground.checks import all_of, check_fields, named, pair
+from worldstate.ground.checks import all_of, check_fields, in_range, named, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 from worldstate.ground.values import LEAST_HEARD, NotUsable, integer_ns
 
@@ -106,6 +106,9 @@ class Heard:
         How far the sound lies above what is usual at this place, dB.
     measured : bool
         False where nothing measures the share; the snapshot then states none.
+    kinds : mapping of str to float, or None
+        Of each kind of road user, the share that is noticed if all else is as in the exam of the model; None
+        if none was counted.
 
     Raises
     ------
@@ -122,6 +125,7 @@ class Heard:
     reason: str | None = None
     excess_db: float = field(default=0.0, metadata=ADDED)
     measured: bool = field(default=True, metadata=ADDED)
+    kinds: Mapping[str, Probability] | None = field(default=None, metadata=ADDED)
 
     @property
     def usable(self) -> bool:
@@ -130,6 +134,9 @@ class Heard:
 
     def __post_init__(self) -> None:
         check_fields(self, share=(0.0, 1.0), reason=str | None, excess_db=(-1e3, 1e3), measured=bool)
+        check_fields(self, kinds=Mapping | None)
+        for kind, share in (self.kinds or {}).items():
+            in_range(f"kinds[{kind!r:.40}]", share, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,6 @@
 """Sensors of a snapshot: health, last views, order of delivery, and the ego vehicle by its odometry."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -50,6 +51,10 @@ class Hearing:
         Since when it has been what it is, ns.
     reason : str or None
         What keeps it from hearing; None where nothing does.
+    kinds : mapping of str to float, or None
+        Of each kind of road user, the share of approaches that would be noticed now: what the simulated exam
+        of the model detected at the budget of its file, times `share`. None if the model's card has no such
+        shares, its sequence model is not used, or nothing can be heard.
 
     Examples
     --------
@@ -61,6 +66,7 @@ class Hearing:
     share: Probability
     since_ns: int
     reason: str | None = None
+    kinds: Mapping[str, Probability] | None = field(default=None, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)

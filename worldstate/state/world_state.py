@@ -81,7 +81,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "4.0.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "4.1.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int

@@ -184,6 +184,9 @@ def common_lines(state: WorldState) -> Iterator[str]:
         if hearing.reason is not None:
             since = f"{hearing.reason} since {seconds(hearing.since_ns):.2f} s"
             yield f"heard by {hearing.sensor}: {hearing.share:.2f} of hidden vehicles would be, {since}"
+        if hearing.kinds is not None:
+            kinds = ", ".join(f"{kind} {share:.2f}" for kind, share in hearing.kinds.items())
+            yield f"heard by {hearing.sensor}, by kind (simulated exam): {kinds}"
     for one in state.sensors:
         yield f"sensor {one.sensor}: {one.condition}{f' ({one.reason})' if one.reason else ''}"
     for view in state.searched:
