@@ -89,7 +89,7 @@ def with_real(model: Model, results: Mapping[str, Any]) -> Model:
     record = [*results.values()][whole.index(True)]
     domain, rows = model.domain, list[RealFigure]()
     roof = domain is not None and microphone_order(domain.positions_m, ovad_array()) is not None
-    source = f"{record['command']}, {record['commit'][:8]}"
+    source = f"{record['command']}, {(record['commit'] or 'no commit')[:9]}"
     for path, (microphones, own) in PATHS.items():
         if own and not (roof and domain is not None and domain.ego_motion == "standing"):
             continue
