@@ -33,6 +33,7 @@ from worldstate.ground.serialisation import encode
 from worldstate.measurement.measurement import Bearing
 from worldstate.measurement.odometry import Odometry
 from worldstate.state.context import Context
+from worldstate.state.world_state import why_not
 
 RATE = 47_998
 HERE = ovad_array().positions_m
@@ -98,6 +99,23 @@ def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(tmp_path, mo
     assert main(run) == 0
     with pytest.raises(OutOfDomainError, match="not the array of the model"):
         Listener("uma-8", 16_000)
+
+
+
+@pytest.mark.parametrize("name", list(arrays.named_arrays()))
+def test_a_model_ships_for_every_board_and_is_used_at_once(name: str) -> None:
+    """Its card has an exam and what simulation promises too much, and names no labelled windows."""
+    board = read_array(name)
+    model = read_model(array=board)
+    assert model.domain is not None and (model.domain.array, model.domain.ego_motion) == (name, "standing")
+    np.testing.assert_array_equal(model.domain.positions_m, board.positions_m)
+    card = model.provenance
+    assert card.fit_for_use and card.exam["approaches"] >= 20 and card.kinds and card.real
+    assert not any("OVAD" in source.name for source in card.sources)
+    rng = np.random.default_rng(0)
+    common, own = rng.standard_normal((32_000, 1)), rng.standard_normal((32_000, board.n_microphones))
+    *_, last = Listener(name, 16_000).push(0.01 * (common + 0.3 * own))
+    assert last.no_sequence is None and "uncalibrated" not in why_not(last)
 
 
 @pytest.fixture
