@@ -176,10 +176,14 @@ def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
     )
 
 
+# As many trees as a model of a standing ego has, all as large as its largest.
+_ROUNDS, _LEAVES = sum(one.rounds for one in STANDING), max(one.leaves for one in STANDING)
+
+
 def _sequence(rng: np.random.Generator) -> SequenceModel:
     """Grow trees leaf by leaf as boosting does: the deepest decides what a walk takes."""
     # A round is a tree for each group.
-    trees, nodes = STANDING.rounds * len(GROUPS), 2 * STANDING.leaves - 1
+    trees, nodes = _ROUNDS * len(GROUPS), 2 * _LEAVES - 1
     yes, no = np.tile(np.arange(nodes), (2, trees, 1))
     for tree in range(trees):
         leaves = [0]
@@ -198,8 +202,8 @@ def _peer_trees(rng: np.random.Generator) -> Any:
     from sklearn.ensemble import HistGradientBoostingClassifier
 
     machine = HistGradientBoostingClassifier(
-        max_iter=STANDING.rounds,
-        max_leaf_nodes=STANDING.leaves,
+        max_iter=_ROUNDS,
+        max_leaf_nodes=_LEAVES,
         min_samples_leaf=2,
         early_stopping=False,
         random_state=0,
