@@ -82,8 +82,8 @@ def test_the_model_that_ships_holds_on_the_official_test_recordings():
         table, [predict_held_out(read_model(), table, 0.02, "curated", np.random.default_rng(0))]
     )
     # The authors' own classifier has .928 there, retrained from this table .920: two more classes and the
-    # share of hazards in streams cost accuracy, not order; windows of a second renderer another .03, of a third
-    # .02, while the order gains (.984 before it).
+    # share of hazards in streams cost accuracy, not order; windows of a second renderer another .03,
+    # of a third .02, while the order gains (.984 before it).
     assert figures["accuracy"] == pytest.approx(0.83, abs=0.02)
     assert figures["auroc_pooled"] > 0.985
     assert figures["auroc_pooled_absent"] > 0.98

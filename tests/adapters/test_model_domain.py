@@ -101,7 +101,6 @@ def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(tmp_path, mo
         Listener("uma-8", 16_000)
 
 
-
 @pytest.mark.parametrize("name", list(arrays.named_arrays()))
 def test_a_model_ships_for_every_board_and_is_used_at_once(name: str) -> None:
     """Its card has an exam and what simulation promises too much, and names no labelled windows."""
