@@ -117,6 +117,20 @@ def test_a_model_ships_for_every_board_and_is_used_at_once(name: str) -> None:
     assert last.no_sequence is None and "uncalibrated" not in why_not(last)
 
 
+def test_a_model_for_the_roof_array_ships_that_learned_no_windows_of_a_data_set() -> None:
+    """Where the licence of OVAD's windows forbids the standing model, it takes its place."""
+    free, usual = read_model("simulated-56"), read_model()
+    assert free.domain is not None and usual.domain is not None
+    assert free.domain.ego_motion == "standing"
+    np.testing.assert_array_equal(free.domain.positions_m, usual.domain.positions_m)
+    learned = [[one.name for one in model.provenance.sources] for model in (free, usual)]
+    assert [any("OVAD" in name for name in names) for names in learned] == [False, True]
+    assert {one.own for one in free.provenance.real} == {True, False} and free.provenance.kinds
+    common = 0.01 * np.random.default_rng(0).standard_normal((96_000, 1))
+    *_, last = Listener(ovad_array(), 48_000, model="simulated-56").push(np.repeat(common, 56, axis=1))
+    assert "uncalibrated" not in why_not(last)
+
+
 @pytest.fixture
 def alone(approach: Approach, tmp_path: Path) -> Path:
     """The sound of the session's recording as a file that no data set stands around."""
