@@ -419,7 +419,13 @@ def test_a_board_is_told_to_be_turned_and_an_array_file_stays(tmp_path, caplog, 
         f"{bag}: respeaker-4 is turned and moved by /tf_static, its middle at (1, 0, 1.5) m"
     ]
     caplog.clear()
-    assert main(["run", str(bag), "--array", "respeaker-4"]) == 2
+    # A ring of four turned by a quarter is itself, by other channels; by an eighth it is another array.
+    assert main(["run", str(bag), "--array", "respeaker-4"]) == 0
+    assert "respeaker-4: the model's microphones in another order" in caplog.text
+    caplog.clear()
+    eighth = (0.0, 0.0, float(np.sin(np.pi / 8.0)), float(np.cos(np.pi / 8.0)))
+    skew = board_bag(tmp_path / "skew", [("base_link", "/mics", (1.0, 0.0, 1.5), eighth)])
+    assert main(["run", str(skew), "--array", "respeaker-4"]) == 2
     assert "respeaker-4 is turned" in caplog.text, "what is compared with the model is the board as it stands"
     assert "not the array of the model" in capsys.readouterr().err
     own = tmp_path / "respeaker.json"
