@@ -103,7 +103,7 @@ def test_the_command_judges_each_renderer_by_models_of_the_two_others(quick, mon
         (renderer,) = {one.heard.renderer for one, _ in streams}
         judged[renderer] = set().union(*fitted)
         fitted.clear()
-        assert len(streams) == 2 * FEW.junctions
+        assert len(streams) == 4 * FEW.junctions, "with weather and without, hazards and none"
         return figures(streams, *rest)
 
     monkeypatch.setattr(left_out, "heard_streams", lambda plan, *rest: iter(streets(1)))
@@ -115,7 +115,7 @@ def test_the_command_judges_each_renderer_by_models_of_the_two_others(quick, mon
     ((key, kept),) = json.loads(results.read_text()).items()
     assert key.startswith("left-out") and list(kept["figures"]["left_out"]) == sorted(FIRST_LETTERS)
     for found in kept["figures"]["left_out"].values():
-        assert found["approaches"] == 3 * len(HAZARDS) and found["onsets_per_hour"] <= 30.0
+        assert found["approaches"] == 2 * FEW.junctions * len(HAZARDS) and found["onsets_per_hour"] <= 30.0
 
 
 def alarms(levels, threshold):
