@@ -128,18 +128,18 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     As many of each renderer, none of which outweighs the others.
     """
     plans = {i: f"{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
-    minutes, found = (settings.approach_minutes, settings.hazard_free_minutes), list[StreamSettings]()
+    approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
+    found = list[StreamSettings]()
     for letter, (i, plan) in product(RENDERERS, plans.items()):
         name = _numbered(letter, {i: plan}, settings)
-        without = MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
-        # The noise of a moving ego was set beside the levels of the preset that is usual.
-        first = (APPROACHES, HAZARD_FREE) if settings.moving_ego else (TOWN, without)
-        streams = _streams(name, LEARNED_SEED, dict(zip(first, minutes, strict=True)), settings)
         if settings.moving_ego:
-            found += streams
+            # The noise of a moving ego was set beside the levels of the preset that is usual.
+            found += _streams(name, LEARNED_SEED, {APPROACHES: approaching, HAZARD_FREE: quiet}, settings)
             continue
-        found += [replace(one, preset=preset(LEARNED_PRESET)) for one in streams]
-        usual = {PAIRS: USUAL_SHARE * minutes[0], HAZARD_FREE: USUAL_SHARE * minutes[1]}
+        without = MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
+        varied = _streams(name, LEARNED_SEED, {TOWN: approaching, without: quiet}, settings)
+        found += [replace(one, preset=preset(LEARNED_PRESET)) for one in varied]
+        usual = {PAIRS: USUAL_SHARE * approaching, HAZARD_FREE: USUAL_SHARE * quiet}
         found += _streams(name, USUAL_SEED, usual, settings)
     return found
 
