@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_summed_scores import stream
 from worldstate_lab.cli import left_out
-from worldstate_lab.cli.left_out import learned_without, renderer_figures, windows_from
+from worldstate_lab.cli.left_out import learned_without, renderer_figures
 from worldstate_lab.cli.main import main
 
 from worldstate.abduction.sequence.sequence_model import GROUPS, HELD_HOPS, HORIZONS_S, SequencePosterior
 from worldstate.commissioning import commission
+from worldstate.commissioning.commission import fit_of, own_windows, windows_to_learn
 from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import ExaminedStream, smoothed_log_odds
@@ -60,7 +61,7 @@ def quick(monkeypatch):
     """Two folds, noise for windows in the open, and an alarm by the readings alone: no filter runs."""
     rng = np.random.default_rng(9)
     monkeypatch.setattr(commission, "FOLDS", 2)
-    monkeypatch.setattr(left_out, "open_field_features", lambda *given: rng.uniform(0.5, 1.5, (12, 60)))
+    monkeypatch.setattr(commission, "open_field_features", lambda *given: rng.uniform(0.5, 1.5, (12, 60)))
     levels = lambda model, found: smoothed_log_odds(model.posterior(found))  # noqa: E731
     monkeypatch.setattr(commission, "_quiet_levels", lambda calm: levels(calm[2], calm[3]))
     monkeypatch.setattr(left_out, "stream_states", lambda heard, windows, model, found: levels(model, found))
@@ -70,7 +71,8 @@ def quick(monkeypatch):
 @pytest.mark.long
 def test_what_is_learned_does_not_depend_on_the_streams_that_are_left_out(quick, renderer="rays"):
     every, others = streets(1), streets(2)
-    fit = windows_from(ovad_array(), FEW, None, 1)
+    own, rng = own_windows(ovad_array(), FEW, None), np.random.default_rng(FEW.seed)
+    fit = fit_of(windows_to_learn(ovad_array(), FEW, *own, rng))
 
     def learned(changed):
         mixed = [other if changed(one) else one for one, other in zip(every, others, strict=True)]
@@ -89,7 +91,7 @@ def test_what_is_learned_does_not_depend_on_the_streams_that_are_left_out(quick,
 @pytest.mark.long
 def test_the_command_judges_each_renderer_by_models_of_the_two_others(quick, monkeypatch, tmp_path):
     fitted, judged = list[set[str]](), dict[str, set[str]]()
-    fit_windows, figures, learn = left_out.window_model, left_out.renderer_figures, left_out.learn_sequence
+    fit_windows, figures, learn = commission.window_model, left_out.renderer_figures, left_out.learn_sequence
 
     def fit(table, beside):
         fitted.append({name[0] for name in table.environments})
@@ -107,7 +109,8 @@ def test_the_command_judges_each_renderer_by_models_of_the_two_others(quick, mon
         return figures(streams, *rest)
 
     monkeypatch.setattr(left_out, "heard_streams", lambda plan, *rest: iter(streets(1)))
-    for name, one in (("window_model", fit), ("learn_sequence", learned), ("renderer_figures", row)):
+    monkeypatch.setattr(commission, "window_model", fit)
+    for name, one in (("learn_sequence", learned), ("renderer_figures", row)):
         monkeypatch.setattr(left_out, name, one)
     results = tmp_path / "results.json"
     assert main(["left-out", "--streams", str(tmp_path), "--junctions", "3", "--results", str(results)]) == 0

@@ -95,6 +95,7 @@ def learning_minutes(settings: CommissionSettings) -> float:
     return LEARNING_SHARE * sum(one.minutes for one in learned_streams(settings))
 
 
+WindowsOf = Callable[[Sequence[HeardStream]], tuple[FeatureTable, SimulatedWindows | None]]
 FitWindows = Callable[[Sequence[HeardStream]], EnsembleModel]
 
 
@@ -268,9 +269,7 @@ def commission(
     streams, rng = list[HeardStream](), np.random.default_rng(settings.seed)
     plan = learned_streams(settings)
     # What is a user's own is read and checked before hours of streets are simulated.
-    domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
-    domain = replace(domain, fastest_mps=max(one.ego.speed_mps for one in plan) or None)
-    real = None if table is None else windows_of_array(table, settings, domain)
+    domain, real = own_windows(array, settings, table)
     calm = quiet_streams(quiet, array, settings.onsets_per_hour) if quiet else []
     on_step("streets", 0.0)
     for planned, one in zip(plan, heard_streams(plan, array, folder, jobs, beside), strict=True):
@@ -280,16 +279,11 @@ def commission(
     def learned(stage: str) -> None:
         on_step(stage, learning_minutes(settings) / LEARNING_STEPS)
 
-    number = N_OPEN // 10 if settings.quick else N_OPEN
-    open_field = open_field_windows(open_field_features(array, number, rng, jobs, settings.moving_ego))
-    fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same in every fold
-
-    def fit(some: Sequence[HeardStream]) -> EnsembleModel:
-        return fitted(*table_and_beside(real, open_field, domain, some))
-
+    windows_of = windows_to_learn(array, settings, domain, real, rng, jobs)
+    fit = fit_of(windows_of)
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, jobs, learned)
     learned("window model")
-    windows, simulated = table_and_beside(real, open_field, domain, streams)
+    windows, simulated = windows_of(streams)
     model = train_model(
         windows,
         TrainingSettings(seed=settings.seed, repeats=1),
@@ -396,6 +390,36 @@ def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
     if model.sequence is None or not isinstance(model.signature, EnsembleModel):
         raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
     return model.signature, model.sequence
+
+
+def own_windows(
+    array: MicrophoneArray, settings: CommissionSettings, table: FeatureTable | None
+) -> tuple[ModelDomain, FeatureTable | None]:
+    """Return what a model of an array is made for, and which labelled windows it may learn."""
+    plan = learned_streams(settings)
+    domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
+    domain = replace(domain, fastest_mps=max(one.ego.speed_mps for one in plan) or None)
+    return domain, None if table is None else windows_of_array(table, settings, domain)
+
+
+def windows_to_learn(
+    array: MicrophoneArray,
+    settings: CommissionSettings,
+    domain: ModelDomain,
+    real: FeatureTable | None,
+    rng: np.random.Generator,
+    jobs: int = 1,
+) -> WindowsOf:
+    """Return what names the windows that are learned of some streams, with sources in the open beside."""
+    number = N_OPEN // 10 if settings.quick else N_OPEN
+    open_field = open_field_windows(open_field_features(array, number, rng, jobs, settings.moving_ego))
+    return partial(table_and_beside, real, open_field, domain)
+
+
+def fit_of(windows_of: WindowsOf) -> FitWindows:
+    """Return what makes a window model of some streams."""
+    fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same for all streams
+    return lambda some: fitted(*windows_of(some))
 
 
 def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:

@@ -20,7 +20,7 @@ Examples
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,6 @@ from worldstate import adapters, frontend
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_ids
-from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.cli.common.inputs import add_array_options
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
@@ -43,11 +42,12 @@ from worldstate.commissioning.alarm_curve import (
 from worldstate.commissioning.commission import (
     FOLDS,
     FitWindows,
+    fit_of,
     heard_streams,
     learn_sequence,
+    own_windows,
     stream_evidence,
-    table_and_beside,
-    windows_of_array,
+    windows_to_learn,
 )
 from worldstate.commissioning.heard_stream import (
     CommissionSettings,
@@ -56,14 +56,7 @@ from worldstate.commissioning.heard_stream import (
     learned_streams,
 )
 from worldstate.commissioning.sequence_training import stream_truth
-from worldstate.commissioning.simulated_windows import (
-    N_OPEN,
-    open_field_features,
-    open_field_windows,
-    window_model,
-)
 from worldstate.commissioning.stream_exam import ExaminedStream, alarm_outcomes, examine
-from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, Figures, caution, mean_of
@@ -90,7 +83,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_array_options(parser, "OVAD's")
     add("--streams", type=Path, required=True, metavar="D", help="folder of what is listened to")
     add("--moving-ego", action="store_true", help="drives up to the corner, in place of an ego that stands")
-    add("--junctions", type=int, default=16, metavar="N", help="of each renderer (default: %(default)s)")
+    add("--junctions", type=int, default=12, metavar="N", help="of each renderer (default: %(default)s)")
     minutes = "of approaches at each; streams without hazards last in proportion (default: %(default)g)"
     add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
     onsets = "an hour at which shares are compared (default: 30, of a moving ego 40)"
@@ -110,7 +103,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     plan, streams = learned_streams(settings), list[HeardStream]()
     if not any(one.traffic.hazard_free and not one.traffic.name.startswith(MISLEADING) for one in plan):
         raise InvalidArgumentError("--junctions: expected 3 or more, of fewer no traffic sets the threshold")
-    fit = windows_from(array, settings, _labelled(arguments), arguments.jobs)
+    rng, own = np.random.default_rng(settings.seed), own_windows(array, settings, _labelled(arguments))
+    fit = fit_of(windows_to_learn(array, settings, *own, rng, arguments.jobs))
     with progress_bar("listening", sum(one.minutes for one in plan)) as bar:
         heard = heard_streams(plan, array, arguments.streams, arguments.jobs)
         for planned, one in zip(plan, heard, strict=True):
@@ -140,18 +134,6 @@ def _labelled(arguments: argparse.Namespace) -> FeatureTable | None:
         return None
     table = adapters.read_features(arguments.labelled).group("dynamic" if arguments.moving_ego else "static")
     return table.without([name for path in arguments.exclude for name in read_ids(path)])
-
-
-def windows_from(
-    array: MicrophoneArray, settings: CommissionSettings, table: FeatureTable | None, jobs: int
-) -> FitWindows:
-    """Return what makes a window model of some streams, as `commission` makes it."""
-    plan, rng = learned_streams(settings), np.random.default_rng(settings.seed)
-    domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
-    real = None if table is None else windows_of_array(table, settings, domain)
-    open_field = open_field_windows(open_field_features(array, N_OPEN, rng, jobs, settings.moving_ego))
-    fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same for all streams
-    return lambda some: fitted(*table_and_beside(real, open_field, domain, some))
 
 
 def left_out_row(

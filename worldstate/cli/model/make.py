@@ -68,7 +68,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     command.add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
     allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"
     add("--onsets", type=float, metavar="N", help=allowed)
-    add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
+    add(
+        "--junctions", type=int, default=12, metavar="N", help="to learn from, of each renderer (default: 12)"
+    )
     minutes = "of approaches at each; all other streams and the exam last in proportion (default: 7.2)"
     add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
     add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
