@@ -3,19 +3,15 @@
 import base64
 import io
 import json
-import os
 import re
-import shutil
-import subprocess
 import wave
-from contextlib import contextmanager
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from chromium import browser, needs_browser
 from scripted_states import scripted_states
 
 from worldstate import WorldState
@@ -28,7 +24,6 @@ from worldstate.operations import figure_style
 from worldstate.operations.viewing import log_page
 from worldstate.operations.viewing.log_page import page_data, write_log_page
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 TIME_S = 0.1 * np.arange(40)
 TRUE = TrueTrack(TIME_S, 0.02 * np.arange(40), TIME_S > 2.0, np.zeros((40, 2)))
 # Two images of a pixel, black and white.
@@ -326,73 +321,7 @@ def test_media_that_is_no_base64_is_refused_in_one_line(states, tmp_path, capsys
     assert "log.mcap: /camera/image.data: expected base64" in capsys.readouterr().err
 
 
-class Browser:
-    """A headless Chromium that is spoken to through a pipe: messages of JSON, each ended by a zero byte."""
-
-    def __init__(self, write: int, read: int) -> None:
-        self.write, self.read, self.buffer, self.session = write, read, b"", {}
-        self.events: list[dict] = []
-        pages = self.call("Target.getTargets")["targetInfos"]
-        page = next(one["targetId"] for one in pages if one["type"] == "page")
-        attached = self.call("Target.attachToTarget", targetId=page, flatten=True)
-        self.session = {"sessionId": attached["sessionId"]}
-
-    def message(self) -> dict:
-        while b"\0" not in self.buffer:
-            got = os.read(self.read, 1 << 20)
-            assert got, "the browser ended"
-            self.buffer += got
-        first, self.buffer = self.buffer.split(b"\0", 1)
-        return json.loads(first)
-
-    def call(self, method: str, **params) -> dict:
-        asked = {"id": 1, "method": method, "params": params, **self.session}
-        os.write(self.write, json.dumps(asked).encode() + b"\0")
-        while "id" not in (answer := self.message()):
-            self.events.append(answer)
-        return answer["result"]
-
-    def open(self, path: Path) -> None:
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.call(f"{domain}.enable")
-        self.call("Page.navigate", url=path.as_uri())
-        while not any(one["method"] == "Page.loadEventFired" for one in self.events):
-            self.events.append(self.message())
-
-    def value(self, expression: str):
-        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
-        return answer["result"].get("value")
-
-    def press(self, key: str) -> None:
-        event = f"new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}})"
-        self.value(f"document.body.dispatchEvent({event})")
-
-
-@contextmanager
-def browser(folder: Path):
-    """Lend a browser whose descriptors 3 and 4 are ours."""
-    (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe"]
-    shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
-    call = ["bash", "-c", shell, "-", CHROMIUM, *options, f"--user-data-dir={folder}", "about:blank"]
-    process = subprocess.Popen(call, pass_fds=(theirs_in, theirs_out), stderr=subprocess.DEVNULL)
-    try:
-        os.close(theirs_in)
-        os.close(theirs_out)
-        yield Browser(ours_out, ours_in)
-    finally:
-        process.terminate()
-        process.wait(20)
-        os.close(ours_in)
-        os.close(ours_out)
-
-
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None or shutil.which("bash") is None, reason="there is no Chromium here"
-)
-
-
-@pytest.mark.slow
+@pytest.mark.long
 @needs_browser
 def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states, tmp_path):
     heard = [replace(one, bearing=None if k == 2 else Bearing(0.3, 0.1, 2.0)) for k, one in enumerate(states)]
@@ -400,7 +329,7 @@ def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states
     shown = [replace(heard[0], cues=(low, *heard[0].cues[1:])), *heard[1:]]
     write_log_page(tmp_path / "log.html", page_data(shown))
     with browser(tmp_path / "profile") as page:
-        page.open(tmp_path / "log.html")
+        page.open((tmp_path / "log.html").as_uri())
         page.press("End")
         written_in = "document.querySelectorAll('h2, .legend, svg text')"
         texts = page.value(f"[...{written_in}].map(one => one.textContent)")
@@ -428,7 +357,7 @@ def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states
     assert advisory[0][1] == "0"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_browser
 @pytest.mark.parametrize("width", [1300, 420])
 def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_path, width):
@@ -447,7 +376,7 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
             path = tmp_path / f"{name}.html"
             write_log_page(path, page_data(shown, **parts))
             page.events.clear()
-            page.open(path)
+            page.open(path.as_uri())
             assert page.value(dashes) == (2 if name in ("whole", "since") else 0)
             assert page.value("innerWidth") == width
             assert page.value("document.documentElement.scrollWidth <= innerWidth")
@@ -456,13 +385,11 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
                 page.press(key)
                 assert page.value("+document.getElementById('slider').value") == min(max(at, 0), last)
             page.press(" ")
-            kinds = [one["method"] for one in page.events]
-            assert not {"Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"} & set(kinds)
-            asked = [one["params"] for one in page.events if one["method"] == "Network.requestWillBeSent"]
-            assert [one["request"]["url"] for one in asked] == [path.as_uri()]
+            assert not page.faults()
+            assert page.asked() == [path.as_uri()]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_browser
 def test_the_sound_plays_in_step_with_the_slider_and_the_image(states, log_with_media, tmp_path):
     log, _ = log_with_media
@@ -471,7 +398,7 @@ def test_the_sound_plays_in_step_with_the_slider_and_the_image(states, log_with_
     write_log_page(tmp_path / "plain.html", page_data(states))
     held = "[document.querySelector('audio').currentTime, +document.getElementById('slider').value]"
     with browser(tmp_path / "profile") as page:
-        page.open(path)
+        page.open(path.as_uri())
         assert "space: play or pause, with sound" in page.value("document.body.textContent")
         for key, at in (("Home", 0), ("ArrowRight", 1), ("End", 5)):
             page.press(key)
@@ -495,10 +422,8 @@ def test_the_sound_plays_in_step_with_the_slider_and_the_image(states, log_with_
         )
         page.call("Runtime.evaluate", expression=ended, awaitPromise=True)
         assert page.value(held) == [pytest.approx(0.5, abs=0.05), pytest.approx(5, abs=1)]
-        kinds = {one["method"] for one in page.events}
-        assert not {"Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"} & kinds
-        asked = [one["params"]["request"]["url"] for one in page.events if "requestWillBe" in one["method"]]
-        assert [url for url in asked if not url.startswith("data:")] == [path.as_uri()]
+        assert not page.faults()
+        assert [url for url in page.asked() if not url.startswith("data:")] == [path.as_uri()]
         page.events.clear()
-        page.open(tmp_path / "plain.html")
+        page.open((tmp_path / "plain.html").as_uri())
         assert page.value("document.querySelectorAll('img, audio').length") == 0

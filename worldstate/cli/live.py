@@ -33,6 +33,7 @@ Examples
   worldstate live --array mics.csv --model mine.json --camera-device 0 --camera camera.json
   worldstate live --array mics.csv --model mine.json --detections 127.0.0.1:9100
   worldstate live --play ovad_dataset/SA1/left/1_00_0002
+  worldstate live --array uma-8 --device 2 --web
   worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4
 """
 
@@ -68,10 +69,12 @@ SAID_EVERY_NS = 1_000_000_000
 SAVED_EVERY_NS = 60_000_000_000
 # Bytes of a secret: fewer are guessed.
 SHORTEST_KEY = 16
+WEB_PORT = 8766
 # What a first user needs.
 FIRST_OPTIONS = (
     *("--array", "--car", "--model", "--budget", "--alpha", "--uncalibrated", "--context", "--street"),
-    *("--device", "--play", "--camera-device", "--detections", "--camera", "--odometry", "--out", "--export"),
+    *("--device", "--play", "--camera-device", "--detections", "--camera", "--odometry"),
+    *("--out", "--export", "--web"),
 )
 
 
@@ -109,6 +112,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     told = "begin a new JSONL and MCAP at so many MiB, and keep the one before as NAME.N.SUFFIX"
     add("--rotate-mib", type=int, metavar="N", help=told)
     view = "show bearing, risk and entities (default: where standard error is a terminal)"
+    told = "serve a page that shows the run on this machine, http://127.0.0.1:PORT (default: %(const)s)"
+    add("--web", type=int, nargs="?", const=WEB_PORT, metavar="PORT", help=told)
     add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
 
 
@@ -312,6 +317,7 @@ def _listen(
         line_writer(arguments.out, partial(GrowingFile, most_bytes=exports.most_bytes(arguments))) as write,
         exports.exported_hops(arguments, source, given.car.crossing_m, live=True) as export,
         _view(arguments) as show,
+        _web(arguments) as show_page,
         command.stopped_by_signals(sound.close),
     ):
         for live in steps:
@@ -320,6 +326,7 @@ def _listen(
             warnings.update(live.step.state)
             latency.add(live.latency_s)
             show(live)
+            show_page(live)
             notice(live)
             keep(live.step)
             if ground.seconds(live.step.state.stamp_ns) - start_s >= longest_s:
@@ -379,6 +386,19 @@ def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]
 
     with live_view() as show:
         yield show
+
+
+@contextmanager
+def _web(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
+    """Lend a function that passes a hop on to the page of --web."""
+    if arguments.web is None:
+        yield lambda live: None
+        return
+    from worldstate.operations.viewing.live_page import LivePage
+
+    with LivePage(arguments.web) as page:
+        output.say(f"open {page.url}")
+        yield page.show
 
 
 def _loss_notices() -> "Callable[[LiveStep], None]":

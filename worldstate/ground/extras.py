@@ -23,6 +23,7 @@ EXTRAS = {
     "rosbags": ("rosbags", "ros"),
     "sklearn": ("scikit-learn", "train"),
     "sounddevice": ("sounddevice", "live"),
+    "websockets": ("websockets", "web"),
     "zstandard": ("zstandard", "ros"),
 }
 

@@ -70,8 +70,9 @@ def exported_files(arguments: argparse.Namespace) -> dict[str, Path]:
 
 
 def needed_extras(arguments: argparse.Namespace) -> list[str]:
-    """Return the optional modules that --export needs."""
-    found = (EXPORTERS.get(name) for name, _ in _asked(arguments))
+    """Return the optional modules that --export and --web need."""
+    served = ["websockets"] if getattr(arguments, "web", None) is not None else []
+    found = [*(EXPORTERS.get(name) for name, _ in _asked(arguments)), *served]
     return [module for module in found if module is not None]
 
 

@@ -14,14 +14,13 @@ from typing import NotRequired, TypeAlias, TypedDict
 import numpy as np
 import soundfile
 from numpy.typing import NDArray
-from scipy import signal
 
 from worldstate.abduction.road_users import Foreign
 from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.adapters.export.scene import CompressedImage, RawAudio, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.file_io import write_text
 from worldstate.ground import InputFileError, InvalidArgumentError, seconds
-from worldstate.operations.recordings.evidence_report import common_lines
+from worldstate.operations.recordings.evidence_report import common_lines, sentence
 from worldstate.state import Entity, RiskCue, WorldState
 
 # A snapshot with two entities is 1 kB: five to ten minutes are shown whole, and they take 6 MB at most.
@@ -59,10 +58,16 @@ def check_page(path: Path) -> Path:
 
 def write_log_page(path: Path, data: PageData) -> None:
     """Write what `page_data` returns as one page of HTML, to exactly this file."""
+    write_text(path, page_html(data))
+
+
+def page_html(data: PageData, live: str = "") -> str:
+    """Return the page; `live` is a script that may ask the server of the page for more, and nothing else."""
     template = (files("worldstate") / "data" / "log_view.html").read_text("utf-8")
     # Within a script element only "<" can end it or begin a comment.
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    write_text(path, template.replace("@data@", text))
+    page = template.replace("@connect@", "connect-src 'self'; " if live else "").replace("@live@", live)
+    return page.replace("@data@", text)
 
 
 def page_data(
@@ -108,7 +113,7 @@ def page_data(
     for count, state in enumerate(states, start=1):
         calibrated += state.calibrated
         if (count - 1) % every == 0:
-            kept.append((state.stamp_ns, _row(state)))
+            kept.append((state.stamp_ns, page_row(state)))
         if len(kept) > 2 * MOST_STATES:
             kept, every = kept[::2], 2 * every
     if not kept:
@@ -209,6 +214,8 @@ class _Sound:
             return
         samples, step = self.samples, -(-self.rate_hz // HIGHEST_RATE_HZ)
         if step > 1:
+            from scipy import signal  # a second of importing, which a page without sound does not need
+
             resampled = signal.resample_poly(samples.astype(float), 1, step)
             samples = np.clip(np.rint(resampled), -32768, 32767).astype(np.int16)
         file = io.BytesIO()
@@ -237,7 +244,7 @@ def _remarks(count: int, every: int, calibrated: int) -> list[str]:
     return said
 
 
-def _row(state: WorldState) -> Row:
+def page_row(state: WorldState) -> Row:
     """Return one snapshot as the page draws it, rounded to what can be seen there."""
     parts = (part for one in state.entities if one.moving for part in one.on_each_side())
     likeliest = sorted(parts, key=lambda one: -one.existence_probability)[:_MOST_ENTITIES]
@@ -245,17 +252,18 @@ def _row(state: WorldState) -> Row:
     stated = [(one.direction, one.evidence) for one in state.cues if one.direction and one.evidence]
     return {
         "t": round(seconds(state.stamp_ns), 3),
+        "sentence": sentence(state),
         "entities": list(map(_entity, likeliest)),
         "cues": [_cue(one) for one in state.cues if one.direction is not None],
         "thresholds": {side: round(one.threshold_nats, 2) for side, one in stated},
-        "bearing": None if bearing is None else _degrees(bearing.azimuth_rad),
+        "bearing": None if bearing is None else degrees(bearing.azimuth_rad),
         "prominence": None if bearing is None else round(bearing.prominence, 2),
         "corners": [
-            {"edge": _degrees(one.edge_azimuth_rad), "assumed": one.assumed, **_sector(hidden_sector(one))}
+            {"edge": degrees(one.edge_azimuth_rad), "assumed": one.assumed, **sector(hidden_sector(one))}
             for one in state.context.occluders
         ],
         "searched": [
-            {"sensor": one.sensor, "found": one.found, **_sector(one.sector_rad)} for one in state.searched
+            {"sensor": one.sensor, "found": one.found, **sector(one.sector_rad)} for one in state.searched
         ],
         "heard": {one.sensor: round(one.share, 2) for one in state.heard or ()},
         "foreign": isinstance(state.domain, Foreign),
@@ -269,8 +277,8 @@ def _entity(one: Entity) -> Row:
         "hidden": one.status == "hidden",
         "label": label_of(one),
         "existence": round(one.existence_probability, 3),
-        "azimuth": _degrees(one.azimuth_rad),
-        **_sector(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
+        "azimuth": degrees(one.azimuth_rad),
+        **sector(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
         "place": None if one.position_m is None else [round(value, 1) for value in one.position_m[:2]],
     }
 
@@ -280,13 +288,13 @@ def _cue(one: RiskCue) -> Row:
     held = one.held and f"held until {seconds(one.held.until_ns):.1f} s: now below the threshold"
     return {
         "side": one.direction,
-        "risk": None if one.risk is None else round(one.risk, 3),
-        "within": round(within["3"], 3) if "3" in within else None,
+        "risk": None if one.risk is None else round(one.risk, 5),
+        "within": round(within["3"], 5) if "3" in within else None,
         "since": None if one.advisory is None else round(seconds(one.advisory.since_ns), 3),
         "said": [text for text in (held, one.not_advised) if text],
         "usable": one.usable,
         "why_not": list(one.why_not),
-        **_sector(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
+        **sector(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
         "evidence": evidence
         and {
             "hypothesis": evidence.hypothesis,
@@ -303,10 +311,12 @@ def _track(true: TrueTrack) -> list[Row]:
     return [dict(zip(("t", "azimuth", "in_view", "place"), row, strict=True)) for row in rows]
 
 
-def _sector(sector_rad: tuple[float, float]) -> Row:
-    low, high = map(_degrees, sector_rad)
+def sector(sector_rad: tuple[float, float]) -> Row:
+    """Return the ends of a sector as the page draws them."""
+    low, high = map(degrees, sector_rad)
     return {"low": low, "high": high}
 
 
-def _degrees(azimuth_rad: float) -> float:
+def degrees(azimuth_rad: float) -> float:
+    """Return an azimuth as the page draws it."""
     return round(math.degrees(azimuth_rad), 1)

@@ -1,0 +1,177 @@
+"""A page on the loopback interface that shows a run while it goes on; a websocket brings it the hops."""
+
+import asyncio
+import json
+import logging
+import socket
+import threading
+from collections import deque
+from http import HTTPStatus
+from importlib.resources import files
+from typing import TYPE_CHECKING, Self
+
+from worldstate.adapters.live.live_listening import LiveStep
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import check_extra, optional
+from worldstate.measurement.measurement import Sighting
+
+from .log_page import PageData, Row, degrees, page_html, page_row, sector
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+HOST, STATES = "127.0.0.1", "/states"
+# A minute of hops: what a page that is opened later shows at once, and how far a slow one may fall behind.
+MOST_ROWS = 600
+MOST_VIEWERS = 8
+# A viewer has so long for each: to ask, to answer a ping, and to close.
+_PATIENCE_S = 3.0
+# No viewer sends more than pings: of longer messages its connection ends.
+_MOST_BYTES = 1024
+
+
+class LivePage:
+    """Serves the page of a run, and to each that is open the hops as they come.
+
+    Only pages that it served itself, and programs of this machine, are given states: a browser lets any page
+    of the web ask a port of its machine, and names the page in the request.
+
+    Parameters
+    ----------
+    port : int
+        On the loopback interface; 0 takes a free one.
+
+    Attributes
+    ----------
+    url : str
+        Address of the page.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the port is none, or taken.
+    MissingExtraError
+        Without the package websockets.
+
+    Examples
+    --------
+    >>> from urllib.request import urlopen
+    >>> with LivePage(0) as page:
+    ...     urlopen(page.url).headers["Content-Type"]
+    'text/html; charset=utf-8'
+    """
+
+    def __init__(self, port: int) -> None:
+        check_extra("websockets")
+        try:
+            self._listening = socket.create_server((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise InvalidArgumentError(f"--web: expected a free port, got {port} ({error})") from error
+        self._port = self._listening.getsockname()[1]
+        self.url = f"http://{HOST}:{self._port}/"
+        self._rows, self._count, self._ended = deque[str](maxlen=MOST_ROWS), 0, False
+        self._changed, self._feeds = asyncio.Condition(), set[asyncio.Task[None]]()
+        script = (files("worldstate") / "data" / "live_view.js").read_text("utf-8")
+        empty = PageData(title="worldstate live", remarks=[], t0_s=None, truth=[], states=[])
+        self._page = page_html(empty, script.replace("@states@", STATES))
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(
+            target=self._loop.run_until_complete, args=(self._serve(),), daemon=True
+        )
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        asyncio.run_coroutine_threadsafe(self._take(None), self._loop)
+        self._thread.join()
+        self._loop.close()
+
+    def show(self, live: LiveStep) -> None:
+        """Pass a hop on to every page that is open; no page holds it back."""
+        text = json.dumps(_live_row(live), allow_nan=False, separators=(",", ":"))
+        asyncio.run_coroutine_threadsafe(self._take(text), self._loop)
+
+    async def _take(self, row: str | None) -> None:
+        """Take a row, or None at the end of the run."""
+        async with self._changed:
+            if row is None:
+                self._ended = True
+            else:
+                self._rows.append(row)
+                self._count += 1
+            self._changed.notify_all()
+
+    async def _serve(self) -> None:
+        origins = [None, *(f"http://{name}:{self._port}" for name in (HOST, "localhost"))]
+        times = dict.fromkeys(("open_timeout", "ping_interval", "ping_timeout", "close_timeout"), _PATIENCE_S)
+        async with optional("websockets.asyncio.server").serve(
+            self._feed,
+            sock=self._listening,
+            origins=origins,
+            process_request=self._answer,
+            compression=None,
+            server_header=None,
+            max_size=_MOST_BYTES,
+            # A connection that is refused is no event of the run.
+            logger=logging.Logger("viewers", logging.CRITICAL),
+            **times,
+        ):
+            async with self._changed:
+                await self._changed.wait_for(lambda: self._ended)
+            if self._feeds:
+                await asyncio.wait(self._feeds, timeout=_PATIENCE_S)
+
+    def _answer(self, viewer: "ServerConnection", request: "Request") -> "Response | None":
+        """Answer a request for the page; that of the websocket goes on."""
+        if request.path == STATES:
+            return None
+        if request.path != "/":
+            return viewer.respond(HTTPStatus.NOT_FOUND, "expected /\n")
+        response = viewer.respond(HTTPStatus.OK, self._page)
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = "text/html; charset=utf-8"
+        return response
+
+    async def _feed(self, viewer: "ServerConnection") -> None:
+        """Send a viewer all rows that it has not got, several as one message, until one of both ends."""
+        task = asyncio.current_task()
+        if task is None or len(self._feeds) >= MOST_VIEWERS:
+            return
+        self._feeds.add(task)
+        try:
+            sent = 0
+            while True:
+                async with self._changed:
+                    while self._count == sent and not self._ended:
+                        await self._changed.wait()
+                if self._count == sent:
+                    return
+                rows, sent = list(self._rows)[sent - self._count :], self._count
+                async with asyncio.timeout(_PATIENCE_S):
+                    await viewer.send(f"[{','.join(rows)}]")
+        except TimeoutError:
+            viewer.transport.abort()  # a ping, and the handshake at the end, would wait for it as well
+        finally:
+            self._feeds.discard(task)
+
+
+def _live_row(live: LiveStep) -> Row:
+    """Return a hop as the page draws it: snapshot, boxes of each camera, health and delay."""
+    state = live.step.state
+    late = {"latency_s": round(live.latency_s, 3), "overruns": live.overruns, "lost_s": round(live.lost_s, 2)}
+    sensors = [[one.sensor, one.condition, one.reason] for one in state.sensors]
+    views = {one.sensor: sector(one.sector_rad) for one in state.searched}
+    cameras = {
+        seen.look.sensor: views[seen.look.sensor] | {"boxes": [_box(one) for one in seen.sightings]}
+        for seen in live.step.measurement.looks
+        if seen.look.sensor in views
+    }
+    return page_row(state) | {"live": late, "sensors": sensors, "cameras": cameras}
+
+
+def _box(one: Sighting) -> Row:
+    parts = {"label": one.label, "score": round(one.score, 2), "moving": one.moving}
+    return parts | {"azimuth": degrees(one.azimuth_rad), "width": degrees(one.width_rad)}
