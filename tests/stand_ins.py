@@ -1,0 +1,117 @@
+"""Stand-ins of a sound card, a camera and a detector, which give what a recording holds."""
+
+import sys
+import threading
+import time
+from importlib.machinery import ModuleSpec
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import soundfile
+
+from worldstate.adapters.camera.detections import read_detections
+
+
+class Tensor:
+    """A tensor of a graphics card: numbers only after `cpu` and `numpy`, as torch has it."""
+
+    def __init__(self, values):
+        self._values = values
+
+    def cpu(self):
+        return SimpleNamespace(numpy=lambda: self._values)
+
+
+class Results:
+    """What ultralytics returns of an image: `names`, and `boxes` that `cpu` and `numpy` make arrays."""
+
+    def __init__(self, frame, names):
+        self.names = dict(enumerate(names))
+        numbers = np.array([names.index(label) for label in frame.labels], dtype=np.float32)
+        arrays = SimpleNamespace(
+            xyxy=frame.boxes_px.astype(np.float32), conf=frame.scores.astype(np.float32), cls=numbers
+        )
+        self.boxes = Tensor(arrays)
+
+
+class Street:
+    """One recording that is played `speed` times as fast to who opens sound card and camera."""
+
+    def __init__(self, recording, speed):
+        self.samples, self.rate_hz = soundfile.read(recording / "out_multi.wav", dtype="float32")
+        self.images = read_detections(recording / "camera_baseline_results.json").frames
+        self.speed, self.begun_s = speed, None
+
+    def wait_until(self, time_s):
+        """Wait until so much sound has been played; return whether there is as much."""
+        while self.begun_s is None or self.speed * (time.monotonic() - self.begun_s) < time_s:
+            time.sleep(0.002)
+        return time_s < len(self.samples) / self.rate_hz
+
+
+class SoundCard(ModuleType):
+    """What is used of sounddevice."""
+
+    class PortAudioError(Exception):
+        pass
+
+    def __init__(self, street):
+        super().__init__("sounddevice")
+        self.street, self.__spec__ = street, ModuleSpec("sounddevice", None)
+
+    def query_devices(self, device=None, kind=None):
+        one = {"index": 0, "name": "roof", "max_input_channels": self.street.samples.shape[1]}
+        return [one] if kind is None else one
+
+    def check_input_settings(self, device, channels, dtype, samplerate):
+        assert (channels, samplerate) == (self.street.samples.shape[1], self.street.rate_hz)
+
+    def InputStream(self, *, callback, blocksize, **settings):  # noqa: N802 - its name there
+        street, closed = self.street, threading.Event()
+
+        def play():
+            street.begun_s = time.monotonic()
+            none = SimpleNamespace(inputBufferAdcTime=0.0, currentTime=0.0)
+            for first in range(0, len(street.samples), blocksize):
+                block = street.samples[first : first + blocksize]
+                street.wait_until((first + len(block)) / street.rate_hz)
+                if closed.is_set():
+                    return
+                callback(block, len(block), none, SimpleNamespace(input_overflow=False))
+
+        thread = threading.Thread(target=play, daemon=True)
+        return SimpleNamespace(start=thread.start, close=closed.set)
+
+
+class Camera:
+    """What is used of OpenCV's VideoCapture: image k at 0.1 k seconds, its number in a pixel."""
+
+    def __init__(self, street):
+        self.street, self.number = street, -1
+
+    def isOpened(self):  # noqa: N802 - its name there
+        return True
+
+    def read(self):
+        self.number += 1
+        if self.number >= len(self.street.images) or not self.street.wait_until(0.1 * self.number):
+            return False, None
+        image = np.zeros((1216, 1936, 3), np.uint8)
+        image[0, 0, 0] = self.number
+        return True, image
+
+    def release(self):
+        pass
+
+
+def stand_in(monkeypatch, recording, speed=2.0):
+    """Put a recording in the place of sound card, camera and detector."""
+    street, yolo = Street(recording, speed), ModuleType("ultralytics")
+
+    def model(weights):
+        return lambda image, verbose: [Results(street.images[image[0, 0, 0]], ("person", "car"))]
+
+    yolo.YOLO = model
+    monkeypatch.setitem(sys.modules, "sounddevice", SoundCard(street))
+    monkeypatch.setitem(sys.modules, "ultralytics", yolo)
+    monkeypatch.setattr("cv2.VideoCapture", lambda device: Camera(street))
