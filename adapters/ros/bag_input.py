@@ -531,7 +531,7 @@ def _array(bag: BagReader) -> MicrophoneArray | None:
 
 
 def _detections(bag: BagReader, topic: str, sound: BagSound) -> DetectionLog:
-    stamps, frames = _timed(bag, topic, sound, lambda message: _frame(message.detections))
+    stamps, frames = _timed(bag, topic, sound, lambda message: detection_frame(message.detections))
     return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), f"{bag.path} {topic}")
 
 
@@ -552,7 +552,7 @@ def _timed(
     return [times[i] for i in order], [told[i][2] for i in order]
 
 
-def _frame(found: Any) -> DetectionFrame:
+def detection_frame(found: Any) -> DetectionFrame:
     """Return the boxes of an image, checked as those of a file."""
     best = [_best(one.results) for one in found]
     labels, scores = [label for label, _ in best], [score for _, score in best]
