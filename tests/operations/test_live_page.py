@@ -109,7 +109,7 @@ def test_only_its_own_page_and_programs_of_this_machine_are_given_states(states)
 
 
 def test_a_viewer_that_takes_nothing_holds_up_neither_a_hop_nor_the_end(states, monkeypatch):
-    monkeypatch.setattr(live_page, "_PATIENCE_S", 0.5)
+    monkeypatch.setattr(live_page, "_PATIENCE_S", 1.0)
     monkeypatch.setattr(live_page, "MOST_ROWS", 5000)
     with LivePage(0) as page:
         stalled = socket.create_connection(("127.0.0.1", int(page.url.split(":")[-1].rstrip("/"))))
@@ -122,7 +122,7 @@ def test_a_viewer_that_takes_nothing_holds_up_neither_a_hop_nor_the_end(states, 
             page.show(hop(replace(states[0], stamp_ns=k)))
             longest_s = max(longest_s, time.monotonic() - before_s)
         ended_s = time.monotonic()
-    assert longest_s < 0.4
+    assert longest_s < 0.9
     assert time.monotonic() - ended_s < 10.0
     stalled.close()
 

@@ -368,6 +368,13 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
         "since": (since_1970, {}),
         "empty": ([WorldState(0, 0)], {}),
     }
+    heard = replace(
+        states[0].entities[0], status=None, hidden_probability=None, classification=None, direction=None
+    )
+    pages["without a model"] = [replace(states[0], entities=(heard,), cues=())], {}
+    colours = (
+        "[...document.querySelectorAll('#street polygon, #charts path')].map(one => one.getAttribute('fill'))"
+    )
     dashes = "document.querySelectorAll('#charts path[stroke-dasharray=\"6 4\"]').length"
     screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
     with browser(tmp_path / "profile") as page:
@@ -378,6 +385,8 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
             page.events.clear()
             page.open(path.as_uri())
             assert page.value(dashes) == (2 if name in ("whole", "since") else 0)
+            drawn = {"var(--hidden)", "var(--view)", "var(--heard)"} & set(page.value(colours))
+            assert (drawn == {"var(--heard)"}) == (name == "without a model")
             assert page.value("innerWidth") == width
             assert page.value("document.documentElement.scrollWidth <= innerWidth")
             last = len(shown) - 1

@@ -274,7 +274,7 @@ def page_row(state: WorldState) -> Row:
 def _entity(one: Entity) -> Row:
     return {
         "id": one.id[:8],
-        "hidden": one.status == "hidden",
+        "hidden": one.status and one.status == "hidden",  # None without a model
         "label": label_of(one),
         "existence": round(one.existence_probability, 3),
         "azimuth": degrees(one.azimuth_rad),
