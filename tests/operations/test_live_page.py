@@ -196,6 +196,7 @@ def test_without_a_model_the_sentence_states_no_risk(states):
     said = sentence(replace(states[-1], cues=(cue,), bearing=bearing))
     assert "Sound from 29 degrees right" in said
     assert "advisory" not in said.lower()
+    assert "acted" not in said  # there is nothing to act on
 
 
 @pytest.mark.long

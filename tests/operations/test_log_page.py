@@ -387,6 +387,8 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
             assert page.value(dashes) == (2 if name in ("whole", "since") else 0)
             drawn = {"var(--hidden)", "var(--view)", "var(--heard)"} & set(page.value(colours))
             assert (drawn == {"var(--heard)"}) == (name == "without a model")
+            titles = page.value("[...document.querySelectorAll('.chart h2')].map(one => one.textContent)")
+            assert any(one.startswith("Risk") for one in titles) == (name not in ("empty", "without a model"))
             assert page.value("innerWidth") == width
             assert page.value("document.documentElement.scrollWidth <= innerWidth")
             last = len(shown) - 1

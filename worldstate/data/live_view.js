@@ -21,11 +21,11 @@ show = (k) => {
   drawHealth(rows[shown]);
   drawCameras(rows[shown]);
 };
-function drawHealth({ live, sensors, heard }) {
+function drawHealth({ live, sensors, heard, cues }) {
   health.replaceChildren();
   const chip = (text, bad) => put(health, "span", { class: bad ? "chip bad" : "chip" }, text);
   for (const [name, condition, reason] of sensors) {
-    const share = name in heard ? `, notices ${short(heard[name])} of hidden vehicles` : "";
+    const share = cues.length && name in heard ? `, notices ${short(heard[name])} of hidden vehicles` : "";
     const bad = condition !== "working" || heard[name] < 0.5;
     chip(`${name}: ${condition}${reason ? ` (${reason})` : ""}${share}`, bad);
   }

@@ -217,7 +217,7 @@ def sentence(state: WorldState) -> str:
         said = f"Sound from {abs(to_left_deg):.0f} degrees {side}; no risk is stated."
     else:
         said = "No advisory: no vehicle is heard."
-    reasons = dict.fromkeys(WHY_NOT[one] for cue in state.cues for one in cue.why_not)
+    reasons = dict.fromkeys(WHY_NOT[one] for cue in stated for one in cue.why_not)
     return f"{said} Not to be acted on: {'; '.join(reasons)}." if reasons else said
 
 
