@@ -7,7 +7,7 @@ usually.
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from worldstate.frontend.health.common_sound import CommonSound
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
 from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError, falling
 from worldstate.ground.typing import Complex128Array, Float32Array
+from worldstate.ground.values import mean
 
 from .settings import ELEVATIONS_RAD, HIGHEST_SHARE, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 
@@ -87,23 +88,43 @@ class HopSums:
     pairs: Complex128Array  # shape (30,): Pair sums of the published feature
     energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
     health: ArrayHealth  # Faults of the array, and the microphones used
+    n_frames: int  # Number of frames that the sums are of
     # Share that coherence and positions leave to be heard, and what takes the rest.
     common: tuple[float, str | None] = (1.0, None)
 
-    @property
-    def n_frames(self) -> int:
-        """Number of frames that the sums are of."""
-        return int(np.count_nonzero(self.heard))
 
-    def masked(self, share: float, reason: str | None) -> "HopSums":
-        """Return the hop where noise leaves a share to be heard; below .2 its sums are empty."""
-        if share >= self.share:
-            return self
-        if share >= LEAST_HEARD:
-            return replace(self, share=share, unheard=reason)
-        arrays = ("heard", "power", "pairs", "energies")
-        nothing = {name: np.zeros_like(getattr(self, name)) for name in arrays}
-        return replace(self, share=share, unheard=reason, **nothing)
+class HopWindow:
+    """Sums of the hops of a window in arrays, oldest first: a row a hop, zeros before the first."""
+
+    def __init__(self, n_hops: int) -> None:
+        self.n_frames, self.n_new = np.zeros((2, n_hops), int)
+        self.share, self.lost, self.centre = np.zeros((3, n_hops))
+        self.unheard: list[str | None] = [None] * n_hops
+        self.power: FloatArray = np.zeros((n_hops, 0))
+        self.pairs: Complex128Array = np.zeros((n_hops, 0), complex)
+        self.energies: FloatArray = np.zeros((n_hops, 0))
+
+    def push(self, hop: HopSums, share: float, unheard: str | None) -> None:
+        """Take the newest hop, of which noise leaves a share to be heard; below .2 its sums are empty."""
+        if not self.power.size:
+            for name in ("power", "pairs", "energies"):
+                rows, one = getattr(self, name), getattr(hop, name)
+                setattr(self, name, np.zeros((len(rows), len(one)), rows.dtype))
+        share, unheard = (share, unheard) if share < hop.share else (hop.share, hop.unheard)
+        heard = share >= hop.share or share >= LEAST_HEARD
+        for rows, newest in (
+            (self.n_frames, hop.n_frames if heard else 0),
+            (self.n_new, len(hop.heard)),
+            (self.share, share),
+            (self.lost, hop.lost),
+            (self.centre, hop.centre),
+            (self.power, hop.power if heard else 0.0),
+            (self.pairs, hop.pairs if heard else 0.0),
+            (self.energies, hop.energies if heard else 0.0),
+        ):
+            rows[:-1] = rows[1:]
+            rows[-1] = newest
+        self.unheard = [*self.unheard[1:], unheard]
 
 
 class HopSpectra:
@@ -139,7 +160,8 @@ class HopSpectra:
         lost = lost[np.arange(len(samples)) * len(recorded) // len(samples)]
         spectra = self._stft.push(samples)
         heard = self._heard_frames(lost, len(spectra))
-        centre, spectra = self._centre(heard), spectra if heard.all() else spectra[heard]
+        n_heard = int(np.count_nonzero(heard))
+        centre, spectra = self._centre(heard), spectra if n_heard == len(heard) else spectra[heard]
         powers = power(spectra)
         whitened = whiten(spectra, powers)
         # Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`.
@@ -149,16 +171,17 @@ class HopSpectra:
         if self.monitor is not None:
             health = self.monitor.push(recorded, energies, powers, matrices)
         keep = health.mask.keep
-        common = self._common.push(matrices, len(spectra), keep) if self._common else (1.0, None)
+        common = self._common.push(matrices, n_heard, keep) if self._common else (1.0, None)
         health.mask.silence(whitened)
         inside = whitened[:, self._srp]
         srp = np.concatenate([steered_power(inside, row) for row in self.beams]) * health.mask.power_scale
         pairs = pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
         pairs = pairs * health.mask.pair_scale
-        mean_square = energies.sum(axis=0) / max(len(energies), 1)
-        share = float(lost.mean())
+        mean_square = energies.sum(axis=0) / max(n_heard, 1)
+        share = np.count_nonzero(lost) / len(lost)
         reason = "lost samples" if share else None
-        return HopSums(heard, share, 1.0 - share, reason, centre, srp, pairs, mean_square, health, common)
+        sums = srp, pairs, mean_square
+        return HopSums(heard, share, 1.0 - share, reason, centre, *sums, health, n_heard, common)
 
     def _heard_frames(self, lost: BoolArray, n_new: int) -> BoolArray:
         """Return which new frames hold no lost sample; lost has shape (n,)."""
@@ -171,8 +194,8 @@ class HopSpectra:
     def _centre(self, heard: BoolArray) -> float:
         """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""
         first, self._n_frames = self._n_frames, self._n_frames + len(heard)
-        numbers = np.flatnonzero(heard if heard.any() else ~heard)
-        return 0.5 * self._nfft * (float(numbers.mean()) + first + 1.0)
+        numbers = heard.nonzero()[0] if True in heard else np.arange(len(heard))
+        return 0.5 * self._nfft * (float(mean(numbers)) + first + 1.0)
 
 
 # Mean square below which a band is silent, far below 24-bit quantisation; keeps the logarithm finite.
@@ -208,8 +231,8 @@ def mean_square_per_bin(powers: Float32Array, nfft: int) -> FloatArray:
     >>> mean_square_per_bin(np.full((2, 1, 3), 48.0, np.float32), nfft=16)
     array([1.])
     """
-    mean = powers.sum(axis=(0, 2), dtype=np.float64) / max(powers.shape[0] * powers.shape[2], 1)
-    return np.asarray(mean * (2.0 / (nfft * 0.375 * nfft)))
+    average = np.add.reduce(powers, (0, 2), np.float64) / max(powers.shape[0] * powers.shape[2], 1)
+    return np.asarray(average * (2.0 / (nfft * 0.375 * nfft)))
 
 
 def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> FloatArray:
@@ -338,21 +361,21 @@ class NoiseMeter:
     def _masked(self, level_db: FloatArray, coherence: float, learn: bool) -> tuple[float, str | None]:
         """Return the share that noise above this place's usual leaves; learn what is usual if it is heard."""
         if learn:
-            self._memory.append(np.append(level_db, coherence))
+            self._memory.append(np.concatenate([level_db, [coherence]]))
         if self._n_hops < _EVERY_HOPS or self._n_hops % _EVERY_HOPS == 0:
             heard, rank = np.array(self._memory), int(_QUIET_SHARE * (len(self._memory) - 1))
             self._quiet = np.partition(heard[:, :BANDS], rank, axis=0)[rank]
             self._usual_coherence = float(np.median(heard[:, BANDS]))
         self._n_hops += 1
         excess = level_db - self._quiet
-        self.excess_db = float(excess.mean())
+        self.excess_db = float(mean(excess))
         incoherent = coherence < (1.0 - _INCOHERENT) * self._usual_coherence
-        jump = falling(self._rise_db(float(level_db.mean())), _JUMP_DB)
+        jump = falling(self._rise_db(float(mean(level_db))), _JUMP_DB)
         shares = (falling(self.excess_db, _NOISE_DB) if incoherent else 1.0, jump)
         if min(shares) >= 1.0:
             return 1.0, None
         quarter = BANDS // 4
-        is_low = excess[:quarter].mean() > excess[-quarter:].mean() + _WIND_DB
+        is_low = mean(excess[:quarter]) > mean(excess[-quarter:]) + _WIND_DB
         is_wind = is_low and coherence < self._usual_coherence
         return min(shares), "wind" if is_wind else "noise far above this place's usual"
 

@@ -2,13 +2,12 @@
 
 from collections import deque
 from dataclasses import dataclass
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
+from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, approach_rate
 from worldstate.frontend.approach.tone import ToneReading, ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import one_blas_thread
@@ -30,9 +29,10 @@ from worldstate.frontend.spectra.sound_character import SoundCharacter
 from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz
 from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, nanoseconds
 from worldstate.ground.checks import check_shape, in_range
-from worldstate.ground.typing import BoolArray, Float32Array
+from worldstate.ground.typing import BoolArray, Complex128Array, Float32Array, IndexArray
+from worldstate.ground.values import mean
 
-from .hop_spectra import BANDS, HopSpectra, HopSums, LevelMeter, NoiseMeter
+from .hop_spectra import BANDS, HopSpectra, HopSums, HopWindow, LevelMeter, NoiseMeter
 from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
 
 _NOT_MONITORED = NotUsable("microphones were not monitored")
@@ -143,11 +143,6 @@ _LEAST_OF_HALF = 0.3
 _LEAST_OF_HOP = 0.5
 
 
-def _n_frames(hops: list[HopSums]) -> int:
-    """Frames that sums of several hops are of, at least one."""
-    return max(sum(hop.n_frames for hop in hops), 1)
-
-
 def _full_scale(dtype: np.dtype[Any]) -> np.float32:
     """Return what brings whole numbers of a converter to full scale 1."""
     if dtype not in (np.int16, np.int32):
@@ -238,7 +233,9 @@ class FrontEnd:
         self._tone = None if band_hz is None else ToneStage(array, rate, band_hz)
         self._energy_floor = EnergyFloor()
         self._character = SoundCharacter(rate) if settings.character else None
-        self._hops: deque[HopSums] = deque(maxlen=WINDOW_HOPS)
+        self._window = HopWindow(WINDOW_HOPS)
+        self._health = ArrayHealth.unknown(n_channels)
+        self._nearest: tuple[bytes, int] = b"", 0  # Microphones kept, and the middle one of them
 
     def process(self, block: ArrayLike) -> list[AcousticFrame]:
         """Take the next samples; return one result for every hop that they complete after the first window.
@@ -330,40 +327,49 @@ class FrontEnd:
 
     def _process_hop(self, hop: Hop, recorded: Float32Array) -> AcousticFrame | None:
         with one_blas_thread():
-            self._hops.append(self._spectra.push(hop.samples, recorded))
-            levels = self._unmasked(self._meter.push(hop.samples, self._keep, self._hops[-1].heard))
-            self._energy_floor.push(float(self._hops[-1].energies[self._used].mean()))
+            newest = self._spectra.push(hop.samples, recorded)
+            self._health = newest.health
+            levels = self._unmasked(self._meter.push(hop.samples, self._keep, newest.heard), newest)
+            window = self._window
+            self._energy_floor.push(float(mean(window.energies[-1, self._used])))
             if self._tone is not None:
-                self._tone.push(hop.samples, self._hops[-1].health.mask)
-            if self._character is not None and not self._hops[-1].lost and self._hops[-1].n_frames:
-                self._character.push(hop.samples[:, self.array.nearest(self._keep)[0]])
+                self._tone.push(hop.samples, newest.health.mask)
+            if self._character is not None and not newest.lost and window.n_frames[-1]:
+                self._character.push(hop.samples[:, self._middle()])
             return self._frame(hop, levels) if hop.index >= WINDOW_HOPS else None
 
-    def _unmasked(self, levels: FloatArray) -> FloatArray:
-        """Leave the newest hop out if noise masks it; return its levels, or those of the last one heard."""
-        newest, noise = self._hops[-1], self._noise
-        if noise is None:
-            return levels
-        if not newest.n_frames:
+    def _middle(self) -> int:
+        """Return the microphone nearest to the middle of those that are used in the newest hop."""
+        kept = self._keep.tobytes()
+        if kept != self._nearest[0]:
+            self._nearest = kept, int(self.array.nearest(self._keep)[0])
+        return self._nearest[1]
+
+    def _unmasked(self, levels: FloatArray, newest: HopSums) -> FloatArray:
+        """Take the newest hop, empty if noise masks it; return its levels, or those of the last one heard."""
+        noise, share, reason = self._noise, newest.share, newest.unheard
+        if noise is not None and newest.n_frames:
+            coherence = float(mean(self._scaled(newest.pairs[None], newest.n_frames)))
+            share, reason = noise.push(levels, coherence, newest.common)
+        elif noise is not None:
             noise.skip()
-            return self._levels
-        share, reason = noise.push(levels, float(self._segment([newest], [newest]).mean()), newest.common)
-        self._hops[-1] = newest = newest.masked(share, reason)
-        if newest.n_frames:
+        self._window.push(newest, share, reason)
+        if noise is None or self._window.n_frames[-1]:
             self._levels = levels
         return self._levels
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
-        heard = self._heard(BEARING_HOPS)
+        hops, heard = self._window, self._heard(BEARING_HOPS)
         spectrum, azimuths = about_the_peak(self._srp(heard), self._azimuths)
         peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
         bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
-        window = sum(hop.share for hop in self._hops) / WINDOW_HOPS
+        shares = hops.share.tolist()
+        window = sum(shares) / WINDOW_HOPS
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.heard_rate_hz),
             sample_index=hop_end(hop.index, self.sample_rate_hz),
             azimuths_rad=self._azimuths,
-            srp=self._srp(list(self._hops)),
+            srp=self._srp(slice(None)),
             bearing_rad=bearing.azimuth_rad,
             bearing_std_rad=bearing.std_rad,
             prominence=bearing.prominence,
@@ -373,61 +379,70 @@ class FrontEnd:
             looming=self._looming(hop.end),
             feature=self._feature(),
             bearing_age_s=self._age_s(heard, hop.end),
-            health=self._hops[-1].health,
+            health=self._health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
-            lost=sum(hop.lost for hop in self._hops) / WINDOW_HOPS,
-            heard=0.0 if window < _LEAST_OF_WINDOW else min(window, self._hops[-1].share),
-            unheard=min(reversed(self._hops), key=attrgetter("share")).unheard,
+            lost=sum(hops.lost.tolist()) / WINDOW_HOPS,
+            heard=0.0 if window < _LEAST_OF_WINDOW else min(window, shares[-1]),
+            # The latest of the hops of which least was heard.
+            unheard=hops.unheard[WINDOW_HOPS - 1 - int(hops.share[::-1].argmin())],
             excess_db=0.0 if self._noise is None else self._noise.excess_db,
         )
 
-    def _heard(self, n_hops: int) -> list[HopSums]:
+    def _heard(self, n_hops: int) -> IndexArray:
         """Return the last hops of the window in which something was heard, the last ones of all if none."""
-        heard = [hop for hop in self._hops if hop.n_frames]
-        return (heard or list(self._hops))[-n_hops:]
+        heard = self._window.n_frames.nonzero()[0]
+        return (heard if len(heard) else np.arange(WINDOW_HOPS))[-n_hops:]
 
     @property
     def _keep(self) -> BoolArray:
         """Microphones that are used in the newest hop."""
-        return self._hops[-1].health.mask.keep
+        return self._health.mask.keep
 
     @property
     def _used(self) -> BoolArray | slice:
         """Microphones whose energy counts: those kept, or all where none is."""
-        return self._keep if self._keep.any() else slice(None)
+        return self._keep if True in self._keep else slice(None)
 
-    def _srp(self, hops: list[HopSums]) -> FloatArray:
+    def _srp(self, hops: IndexArray | slice) -> FloatArray:
         """SRP-PHAT of hops, (A,): the maximum over elevations."""
-        total, n_bins = np.sum([hop.power for hop in hops], axis=0), len(self._spectra.srp_bins)
-        power = normalised(total, _n_frames(hops), n_bins, self.array.n_microphones)
-        return np.asarray(power.reshape(-1, len(self._azimuths)).max(axis=0))
+        total, n_frames = np.add.reduce(self._window.power[hops]), sum(self._window.n_frames[hops].tolist())
+        n_bins, n_microphones = len(self._spectra.srp_bins), self.array.n_microphones
+        power = normalised(total, max(n_frames, 1), n_bins, n_microphones)
+        return np.asarray(np.maximum.reduce(power.reshape(-1, len(self._azimuths))))
 
-    def _age_s(self, hops: list[HopSums], end: int) -> float:
-        weights = [max(hop.n_frames, 1) for hop in hops]
-        centre = sum(n * hop.centre for n, hop in zip(weights, hops, strict=True)) / sum(weights)
+    def _age_s(self, hops: IndexArray, end: int) -> float:
+        weights = np.maximum(self._window.n_frames[hops], 1)
+        centre = float(weights @ self._window.centre[hops] / np.add.reduce(weights))
         return (end - centre) / self.heard_rate_hz
 
     def _feature(self) -> FloatArray:
-        hops, half = list(self._hops), WINDOW_HOPS // FEATURE_SEGMENTS
-        return np.concatenate([self._segment(hops[i:][:half], hops) for i in range(0, WINDOW_HOPS, half)])
+        half = WINDOW_HOPS // FEATURE_SEGMENTS
+        return np.concatenate([self._segment(slice(i, i + half)) for i in range(0, WINDOW_HOPS, half)])
 
-    def _segment(self, half: list[HopSums], hops: list[HopSums]) -> FloatArray:
+    def _segment(self, half: slice) -> FloatArray:
         """Return the feature of half a window; of the whole one where little was heard in the half."""
+        window, n_hops = self._window, WINDOW_HOPS // FEATURE_SEGMENTS
+        used = half if sum(window.share[half].tolist()) >= _LEAST_OF_HALF * n_hops else slice(None)
+        return self._scaled(window.pairs[used], sum(window.n_frames[used].tolist()))
+
+    def _scaled(self, pairs: Complex128Array, n_frames: int) -> FloatArray:
         n_bins, n_microphones = len(self._spectra.feature_bins), self.array.n_microphones
-        used = half if sum(hop.share for hop in half) >= _LEAST_OF_HALF * len(half) else hops
-        return segment_feature([hop.pairs for hop in used], _n_frames(used), n_bins, n_microphones)
+        return segment_feature(pairs, max(n_frames, 1), n_bins, n_microphones)
 
     def _looming(self, end: int) -> Looming | NotUsable:
-        hops = [hop for hop in self._hops if hop.heard.mean() >= _LEAST_OF_HOP]
+        window = self._window
+        hops = (window.n_frames >= _LEAST_OF_HOP * np.maximum(window.n_new, 1)).nonzero()[0]
+        if len(hops) < MIN_POINTS:
+            return NotUsable("silence within the window")
         # The same microphones in the whole window: one that fails within it must not look like a step of
         # level.
-        energies = np.reshape([hop.energies for hop in hops], (-1, self.array.n_microphones))
-        energies = energies[:, self._used].mean(axis=1)
-        if len(hops) < MIN_POINTS or energies.min() <= SILENCE:
+        energies = mean(window.energies[hops][:, self._used], 1)
+        lowest = float(np.minimum.reduce(energies))
+        if lowest <= SILENCE:
             return NotUsable("silence within the window")
-        times = (np.array([hop.centre for hop in hops]) - end) / self.heard_rate_hz
+        times = (window.centre[hops] - end) / self.heard_rate_hz
         low, high = LOOMING_BAND_HZ
         scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
-        noise = self._energy_floor.read(float(energies.min()), scatter)
-        return looming(times, np.log(energies), scatter, *noise)
+        noise = self._energy_floor.read(lowest, scatter)
+        return approach_rate(times, np.log(energies), scatter, *noise)

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array
+from worldstate.ground.values import mean
 
 # Two parameters and a scatter of their own need two degrees of freedom.
 MIN_POINTS = 4
@@ -138,9 +139,16 @@ def looming(
     energies = finite_array("log_energy", log_energy, times.shape)
     if len(times) < MIN_POINTS or np.any(np.diff(times) <= 0.0) or not floor_std > 0.0:
         raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, floor_std > 0")
-    level = float(energies.mean())
-    scale = np.exp(-level)
-    exponential = _fit_line(times, energies - level, np.ones_like(times))
+    return approach_rate(times, energies, floor_std, noise_energy, noise_energy_std)
+
+
+def approach_rate(
+    times: FloatArray, energies: FloatArray, floor_std: float, noise_energy: float, noise_energy_std: float
+) -> Looming | NotUsable:
+    """Return what `looming` does, of arguments that it would take: nothing is checked."""
+    level = float(mean(energies))
+    scale = float(np.exp(-level))
+    exponential = _fit_line(times, energies - level, None)
     source = _fit_source(times, np.exp(energies - level), noise_energy * scale)
     if source is None:
         return NotUsable("range reaches zero within the window")
@@ -149,12 +157,12 @@ def looming(
     if source.level**-2 < _LEAST_RATIO * noise_energy * scale:
         return NotUsable(f"the source has less than {_LEAST_RATIO} times the energy of the noise")
     scatter, noise_std = max(source.scatter, floor_std), noise_energy_std * scale
-    covariance = scatter**2 * source.covariance + noise_std**2 * np.outer(source.by_noise, source.by_noise)
-    if source.level < _MIN_RANGE_SIGMA * np.sqrt(covariance[0, 0]):
+    covariance = scatter**2 * source.covariance + noise_std**2 * source.by_noise[:, None] * source.by_noise
+    if source.level < _MIN_RANGE_SIGMA * math.sqrt(covariance[0, 0]):
         return NotUsable("range reaches zero within the error of the window")
     rate = -source.slope / source.level
     gradient = np.array([-rate, -1.0]) / source.level
-    return Looming(rate, float(np.sqrt(gradient @ covariance @ gradient)), exponential.slope)
+    return Looming(rate, math.sqrt(gradient @ covariance @ gradient), exponential.slope)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,25 +181,26 @@ def _fit_source(times: FloatArray, energy: FloatArray, noise: float) -> _Source 
     # Gauss-Newton from the line through E^(-1/2).
     excess = np.log(np.maximum(energy - noise, _LEAST_EXCESS * energy))
     # Weights from the exponential fit, which is smooth: weights from the noisy values would bias the line.
-    smooth = _fit_line(times, excess, np.ones_like(times))
-    model = np.exp(-0.5 * (smooth.level + smooth.slope * times))
-    line = _fit_line(times, np.exp(-0.5 * excess), model)
-    parameters = np.array([line.level, line.slope])
-    powers = np.stack([np.ones_like(times), times], axis=1)
+    smooth = _fit_line(times, excess, None)
+    line = _fit_line(times, np.exp(-0.5 * excess), np.exp(smooth.level + smooth.slope * times))
+    level, slope = line.level, line.slope
     for _ in range(_STEPS + 1):
-        ranges = powers @ parameters
-        if ranges.min() <= _LEAST_RANGE * ranges.max():
+        # A straight line is least at one end.
+        ranges, ends = level + slope * times, (level + slope * times[0], level + slope * times[-1])
+        if min(ends) <= _LEAST_RANGE * max(ends):
             return None
-        weights = 1.0 / (ranges**-2 + noise)
-        jacobian = powers * (-2.0 * ranges**-3 * weights)[:, None]
-        residual = (energy - noise - ranges**-2) * weights
-        covariance = np.linalg.inv(jacobian.T @ jacobian)
-        step = covariance @ (jacobian.T @ residual)
-        parameters = parameters + step
+        power = 1.0 / (ranges * ranges)
+        weights = 1.0 / (power + noise)
+        by_level = -2.0 * power / ranges * weights
+        jacobian = np.array([by_level, by_level * times])
+        residual = (energy - noise - power) * weights
+        (a, b), (_, d) = (jacobian @ jacobian.T).tolist()
+        covariance = np.array([[d, -b], [-b, a]]) / (a * d - b * b)
+        steps = (covariance @ (jacobian @ residual)).tolist()
+        level, slope = level + steps[0], slope + steps[1]
     # The last step is that of the residuals, which the scatter counts: it has become too small to matter.
-    scatter = float(np.sqrt(residual @ residual / (len(times) - 2)))
-    by_noise = -covariance @ (jacobian.T @ weights)
-    return _Source(float(parameters[0]), float(parameters[1]), scatter, covariance, by_noise)
+    scatter = math.sqrt(residual @ residual / (len(times) - 2))
+    return _Source(level, slope, scatter, covariance, -covariance @ (jacobian @ weights))
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,15 +212,16 @@ class _Line:
     scatter: float
 
 
-def _fit_line(times: FloatArray, values: FloatArray, scale: FloatArray) -> _Line:
-    """Fit a line whose errors are in proportion to `scale`: closed form of weighted least squares."""
-    weights = scale**-2.0
-    s0, s1, s2 = float(weights.sum()), float(weights @ times), float(weights @ times**2)
-    v0, v1 = float(weights @ values), float((weights * times) @ values)
+def _fit_line(times: FloatArray, values: FloatArray, weights: FloatArray | None) -> _Line:
+    """Fit a line in closed form: least squares, weighted by the reciprocal variances or none."""
+    design = np.array([np.ones(len(times)), times])
+    weighted = design if weights is None else design * weights
+    (s0, s1), (_, s2) = (weighted @ design.T).tolist()
+    v0, v1 = (weighted @ values).tolist()
     determinant = s0 * s2 - s1 * s1
     slope, level = (s0 * v1 - s1 * v0) / determinant, (s2 * v0 - s1 * v1) / determinant
-    residual = (values - level - slope * times) / scale
-    scatter = float(np.sqrt(residual @ residual / (len(times) - 2)))
+    squared = (values - level - slope * times) ** 2
+    scatter = math.sqrt((squared.sum() if weights is None else squared @ weights) / (len(times) - 2))
     return _Line(slope, level, scatter)
 
 

@@ -1,6 +1,6 @@
 """Steering matrices for many directions, factored where few dimensions suffice; products on one thread."""
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -186,10 +186,16 @@ def one_blas_thread() -> AbstractContextManager[Any]:
     # (measured on two busy cores: four times the processor time). It also keeps results the same bit for bit
     # on any number of cores. The limit is the process's: products that other threads of the host begin
     # meanwhile, about a millisecond in a hundred, run on one thread too. It costs 16 microseconds.
-    return _controller().limit(limits=1)  # type: ignore[no-any-return]
+    several = any(library.get_num_threads() > 1 for library in _libraries())
+    return _controller().limit(limits=1) if several else nullcontext()
 
 
 @lru_cache(maxsize=1)
 def _controller() -> Any:
     """Look for the libraries once: that costs a millisecond."""
     return ThreadpoolController().select(user_api="blas")
+
+
+@lru_cache(maxsize=1)
+def _libraries() -> Any:
+    return _controller().lib_controllers

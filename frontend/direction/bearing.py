@@ -29,7 +29,7 @@ as sharp as any, which no spectrum shows; a stream of bearings does: see `Bearin
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -38,7 +38,9 @@ from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.spectra.stft import whiten
 from worldstate.ground.checks import check_shape
 from worldstate.ground.typing import Complex64Array, FloatArray, IndexArray
-from worldstate.ground.values import vertex, wrap_angle
+from worldstate.ground.values import median, vertex, wrap_angle
+
+_TINY = np.finfo(np.float64).tiny
 
 
 def steered_power(whitened: Complex64Array, steering: Steering) -> FloatArray:
@@ -226,11 +228,11 @@ def find_peaks(values: FloatArray, azimuths_rad: FloatArray, max_peaks: int = 4)
     """
     if values.max() <= 0.0:
         return ()
-    median = max(float(np.median(values)), np.finfo(np.float64).tiny)
+    middle = max(float(median(values)), _TINY)
     candidates = _local_maxima(values)
-    highest = candidates[np.argsort(-values[candidates], kind="stable")][:max_peaks]
-    peaks = (_interpolate(values, azimuths_rad, int(index), median) for index in highest)
-    return tuple(peak for peak in peaks if peak.prominence >= 1.0)
+    highest = candidates[(-values[candidates]).argsort(kind="stable")][:max_peaks].tolist()
+    peaks = [_interpolate(values, azimuths_rad, index, middle) for index in highest]
+    return tuple([peak for peak in peaks if peak.prominence >= 1.0])
 
 
 def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -256,7 +258,7 @@ def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatA
 def _local_maxima(values: FloatArray) -> IndexArray:
     """Return the indices of local maxima; of a plateau the first."""
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
-    return np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+    return ((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:])).nonzero()[0]
 
 
 def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: float) -> Peak:
@@ -357,13 +359,14 @@ class BearingScatter:
             self._weight = _KEEP * self._weight + weight
         self._past.append(bearing)
         added = math.sqrt(self._sum / self._weight) if self._weight else 0.0
-        return replace(bearing, std_rad=min(math.hypot(bearing.std_rad, added), self._most_rad))
+        std_rad = min(math.hypot(bearing.std_rad, added), self._most_rad)
+        return AcousticBearing(bearing.azimuth_rad, std_rad, bearing.prominence)
 
 
 def _width(side: FloatArray) -> int:
     # Where two rows of elevation cross, a lobe may rise a little above half its height.
-    rises = (np.diff(side) > 0.0) & (side[:-1] < 0.5 * side[0])
-    ends = np.flatnonzero(rises | (side[1:] == 0.0))
+    later, before = side[1:], side[:-1]
+    ends = (((later > before) & (before < 0.5 * side[0])) | (later == 0.0)).nonzero()[0]
     return int(ends[0]) if len(ends) else len(side) - 1
 
 

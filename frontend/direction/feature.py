@@ -9,7 +9,6 @@ complex sum without the diagonal, between 0 and 1. Azimuths run from -90 to 90 d
 as in the released data: index 0 of each segment is +90 degrees, the far left, in this library's convention.
 """
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -117,22 +116,20 @@ def pair_sum_of(
     return steering.quadratic_form(steering.compress(pairs))
 
 
-def segment_feature(
-    sums: Sequence[Complex128Array], n_frames: int, n_bins: int, n_microphones: int
-) -> FloatArray:
+def segment_feature(sums: Complex128Array, n_frames: int, n_bins: int, n_microphones: int) -> FloatArray:
     r"""Return the modulus of summed pair sums, per frame, bin and pair.
 
     .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_s S_s(\theta) \Big|, \qquad P = M (M - 1) / 2
 
-    Shapes: sums (directions,).
+    Shapes: sums (S, directions).
 
     Examples
     --------
-    >>> segment_feature([np.array([3.0 + 0j]), np.array([4j])], n_frames=2, n_bins=1, n_microphones=2)
+    >>> segment_feature(np.array([[3.0 + 0j], [4j]]), n_frames=2, n_bins=1, n_microphones=2)
     array([2.5])
     """
     pairs = n_microphones * (n_microphones - 1) / 2
-    return np.asarray(np.abs(np.sum(sums, axis=0)) / (n_frames * n_bins * pairs))
+    return np.asarray(np.abs(np.add.reduce(sums)) / (n_frames * n_bins * pairs))
 
 
 def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz: float) -> FloatArray:
@@ -185,7 +182,7 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     with one_blas_thread():
         steering = feature_steering(array, bins, rate, nfft)
         sums = [pair_sum(whitened[i * length :][:length], steering) for i in range(FEATURE_SEGMENTS)]
-    return np.concatenate([segment_feature([s], length, len(bins), array.n_microphones) for s in sums])
+    return np.concatenate([segment_feature(s[None], length, len(bins), array.n_microphones) for s in sums])
 
 
 @lru_cache(maxsize=8)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from worldstate.frontend.array.microphone_array import ChannelMask
 from worldstate.ground import BoolArray, FloatArray, NotUsable
 from worldstate.ground.typing import Float32Array, IndexArray
+from worldstate.ground.values import mean
 
 DropoutKind = Literal["still", "splice", "repeat"]
 
@@ -120,11 +121,11 @@ class StillRuns:
         .. math:: L = \max\big(16,\; \ln 10^{-12} / \ln q\big)
         """
         # L is the length that constant samples by chance, a share q of all, reach once in 1e12.
-        first, moving = end - len(still), np.flatnonzero(~still)
+        first, moving = end - len(still), (~still).nonzero()[0]
         # The last run goes on.
         edges = np.concatenate([[-1 - self._length], moving, [len(still)]])
-        lengths = np.diff(edges) - 1
-        long = np.flatnonzero(lengths >= self._shortest(lengths[:-1]))
+        lengths = edges[1:] - edges[:-1] - 1
+        long = (lengths >= self._shortest(lengths[:-1])).nonzero()[0]
         self.runs = [(int(first + edges[i]), int(first + edges[i] + lengths[i] + 1)) for i in long]
         self._length = int(lengths[-1])
         over = ((begin, stop) for begin, stop in self.runs if stop < end or not self._length)
@@ -155,9 +156,9 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
     # a splice has J above 12 and above three times the fifth largest of the hop.
     error = _prediction_error(change)
     np.square(error, out=error)
-    error /= np.maximum(error.mean(axis=1, keepdims=True), _TINY)
+    error /= np.maximum(mean(error, 1), _TINY)[:, None]
     # An upper limit of J, without the ceiling: a clean hop ends here.
-    if 2.0 * float(error.mean(axis=0).max()) < _JUMP_LIMIT:
+    if 2.0 * float(mean(error, 0).max()) < _JUMP_LIMIT:
         return []
     np.minimum(error, _JUMP_CEILING**2, out=error)
     jump = np.maximum(error[:, 1:], error[:, :-1]).mean(axis=0)
@@ -210,12 +211,13 @@ class RepeatFinder:
             self._before, self._now = self._now, {}
         self._hops += 1
         keys, places = self._anchors(sound, end - sound.shape[1])
+        now, before = self._now, self._before
         lags = [
-            (place - before, place)
+            (place - (now[key] if key in now else before[key]), place)
             for key, place in zip(keys, places, strict=True)
-            if (before := self._now.get(key, self._before.get(key))) is not None
+            if key in now or key in before
         ]
-        self._now.update(zip(keys, places, strict=True))
+        now.update(zip(keys, places, strict=True))
         return self._repeat(lags)
 
     def _anchors(self, sound: Float32Array, start: int) -> tuple[list[int], list[int]]:
@@ -225,7 +227,7 @@ class RepeatFinder:
         anchored = (hashes >> np.uint64(40)) & _ANCHOR_BITS == 0
         anchored[1:] &= hashes[1:] != hashes[:-1]
         anchored[0] = False
-        where = np.flatnonzero(anchored)
+        where = anchored.nonzero()[0]
         return hashes[where].tolist(), (where + start).tolist()
 
     def _repeat(self, lags: list[tuple[int, int]]) -> list[Dropout]:
@@ -377,7 +379,7 @@ class ArrayHealth:
 
 def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:
     """List one kind of fault for all channels in which it was found; both arrays have shape (M,)."""
-    return [ChannelFault(int(m), fault, float(values[m])) for m in np.flatnonzero(found)]
+    return [ChannelFault(m, fault, float(values[m])) for m in found.nonzero()[0].tolist()]
 
 
 def repeated(

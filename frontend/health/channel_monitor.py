@@ -7,6 +7,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray
+from worldstate.ground.values import mean, median
 
 from .channel_health import (
     MASKED_FAULTS,
@@ -56,7 +57,7 @@ class ClippingCounter:
         span = highest - lowest
         for side, (sign, top) in enumerate(((np.float32(1.0), highest), (np.float32(-1.0), -lowest))):
             extreme, at, below = self._extreme[side], self._at[side], self._below[side]
-            reached = np.flatnonzero((top == extreme) & (span > 0.0))
+            reached = ((top == extreme) & (span > 0.0)).nonzero()[0]
             higher = top > extreme
             extreme[higher], at[higher], below[higher] = top[higher], 0, 0
             if not len(reached):
@@ -118,9 +119,9 @@ class ChannelLevels:
         """Take the mean power of one hop per bin and channel, (K, M), and the channels that sound, (M,)."""
         if good.any():
             level = 10.0 * np.log10(np.maximum(powers, _TINY))
-            level -= np.median(level[:, good], axis=1, keepdims=True)
+            level -= median(level[:, good])[:, None]
             # A hop in which a channel breaks off says nothing of its level.
-            self._latest = np.where(good, level.mean(axis=0), self._latest)
+            self._latest = np.where(good, mean(level, 0), self._latest)
         self._hops.append(self._latest)
         self._count += good
 
@@ -270,7 +271,7 @@ class ChannelMonitor:
         if not len(energies):
             return self._report(np.zeros(len(span), bool) if alive.any() else self._activity.all_silent())
         silent = self._silent(energies, alive)
-        self._levels.push(powers.mean(axis=0, dtype=np.float64), ~silent)
+        self._levels.push(mean(powers, 0, np.float64), ~silent)
         bad = self._judge_hop(samples, span, silent)
         self._geometry_check.push(matrices, len(energies), ~self._activity.suspects)
         return self._report(bad)
@@ -279,8 +280,8 @@ class ChannelMonitor:
         """Flag the channels that are silent in this hop or break off in it."""
         if not alive.any():
             return ~alive
-        typical = np.maximum(np.median(energies[:, alive], axis=1, keepdims=True), _TINY)
-        level = (energies / typical).mean(axis=0)
+        typical = np.maximum(median(energies[:, alive]), _TINY)[:, None]
+        level = mean(energies / typical, 0)
         return np.asarray(~alive | (level < _SILENT) | (energies < _DROPPED * typical).any(axis=0))
 
     def _judge_hop(self, samples: Float32Array, span: Float32Array, silent: BoolArray) -> BoolArray:
@@ -293,13 +294,13 @@ class ChannelMonitor:
         known = alive & (mean_span > 0.0)
         if known.any():
             growth = np.divide(span, mean_span, out=np.zeros(len(span)), where=known)
-            bad |= growth > _CRACKLE * np.median(growth[known])
+            bad |= growth > _CRACKLE * median(growth[known])
         share = np.full(len(samples), 1.0 / len(samples), np.float32)
         # Exponential means over the good hops, ordinary ones until the time constant has passed:
         # mu <- mu + (x - mu) / min(n, 30).
         self._n_good += ~bad
-        weight = ~bad / np.clip(self._n_good, 1, _HOPS)
-        self._means += weight * (np.stack([span, share @ samples]) - self._means)
+        weight = ~bad / np.minimum(np.maximum(self._n_good, 1), _HOPS)
+        self._means += weight * (np.array([span, share @ samples]) - self._means)
         return self._activity.push(bad)
 
     def _report(self, bad: BoolArray) -> ArrayHealth:

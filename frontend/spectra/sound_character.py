@@ -10,10 +10,12 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from numpy.fft import rfft
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len, rfft
+from scipy.fft import next_fast_len
 
 from worldstate.ground import FloatArray, IntArray, NotUsable, in_range
+from worldstate.ground.values import mean
 
 from .resampling import Decimator
 from .stft import power
@@ -81,9 +83,9 @@ class SoundCharacter:
         """Return `MEASURES` of the last two seconds and `BANDS` of the last, shape (measures + bands,)."""
         if self._n_hops <= _MEMORY // _FRAMES:
             return NotUsable("needs two seconds of sound")
-        bands = self._levels[-_SECOND:].mean(axis=0)
+        bands = mean(self._levels[-_SECOND:], 0)
         texture = (_modulation(self._levels), _swings(self._levels), self._lines.read())
-        return np.concatenate([*texture, bands - bands.mean()])
+        return np.concatenate([*texture, bands - mean(bands)])
 
 
 class _Lines:
@@ -115,7 +117,7 @@ class _Lines:
         """Take the sound that ends now, at least one frame of it."""
         frame = sound[-len(self._window) :]
         level = np.log(power(rfft(frame * self._window)[self._band]) + _LEAST)
-        sums = np.concatenate([[0.0], np.cumsum(level)])
+        sums = np.concatenate([[0.0], level.cumsum()])
         excess = level - (sums[self._right] - sums[self._left]) / (self._right - self._left)
         self._excess += _FORGET_LINES * (excess - self._excess)
         self._ratio += _FORGET_LINES * (np.exp(excess) - self._ratio)
@@ -139,8 +141,11 @@ class _Lines:
 
     def _combed(self, excess: FloatArray) -> float:
         """Log of the highest line of the spectrum of the spectrum, over its mean."""
-        spectrum = power(rfft(np.clip(excess, *_EXCESS) * self._taper, self._comb_size))
-        return 0.5 * float(np.log((spectrum[self._combs].max() + _LEAST) / (spectrum.mean() + _LEAST)))
+        low, high = _EXCESS
+        clipped = np.minimum(np.maximum(excess, low), high)
+        spectrum = power(rfft(clipped * self._taper, self._comb_size))
+        highest = float(np.maximum.reduce(spectrum[self._combs]))
+        return 0.5 * math.log((highest + _LEAST) / (float(mean(spectrum)) + _LEAST))
 
 
 def _modulation(levels: FloatArray) -> FloatArray:
@@ -149,21 +154,23 @@ def _modulation(levels: FloatArray) -> FloatArray:
     .. math:: m_r = \ln \langle |E_b(f)|^2 \rangle_{b, f \in r}, \qquad
               c_r = \ln \frac{\sum_{f \in r} |\sum_b E_b(f)|^2}{\sum_{f \in r} \sum_b |E_b(f)|^2}
     """
-    spectrum = rfft((levels - levels.mean(axis=0)).T * _TAPER)
-    low, high = power(spectrum[:_HIGH]).mean(axis=0), power(spectrum[_HIGH:]).mean(axis=0)
-    all_bands = power(spectrum[_HIGH:].sum(axis=0)) / (len(spectrum) - _HIGH)
+    spectrum = rfft((levels - mean(levels, 0)).T * _TAPER)
+    powers = power(spectrum)
+    low, high = mean(powers[:_HIGH], 0), mean(powers[_HIGH:], 0)
+    all_bands = power(np.add.reduce(spectrum[_HIGH:])) / (len(spectrum) - _HIGH)
     shared = np.log((_TOGETHER @ all_bands + _LEAST) / (_TOGETHER @ high + _LEAST))
     return np.concatenate([np.log(_RATES @ low + _STILL), np.log(_RATES @ high + _STILL), shared])
 
 
 def _swings(levels: FloatArray) -> FloatArray:
     """How far the level rises and falls, how long it pauses, and how fast bands change."""
-    sums = np.cumsum(levels[:, _HIGH:].mean(axis=1))
-    smooth = np.sort((sums[_SMOOTH:] - sums[:-_SMOOTH]) / _SMOOTH)
+    sums = mean(levels[:, _HIGH:], 1).cumsum()
+    smooth = (sums[_SMOOTH:] - sums[:-_SMOOTH]) / _SMOOTH
+    smooth.sort()
     low, middle, high = smooth[[int(q * len(smooth)) for q in _QUANTILES]]
-    pause = np.searchsorted(smooth, middle - _PAUSE) / len(smooth)
-    change = np.abs(levels[_LAG:] - levels[:-_LAG]).mean(axis=0)
-    return np.array([high - middle, middle - low, pause, change[:_HIGH].mean(), change[_HIGH:].mean()])
+    pause = smooth.searchsorted(middle - _PAUSE) / len(smooth)
+    change = mean(np.abs(levels[_LAG:] - levels[:-_LAG]), 0)
+    return np.array([high - middle, middle - low, pause, mean(change[:_HIGH]), mean(change[_HIGH:])])
 
 
 def _means(edges_hz: tuple[float, ...], hz: np.ndarray) -> FloatArray:

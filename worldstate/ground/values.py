@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Literal, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -65,6 +65,32 @@ def falling(value: float, between: tuple[float, float]) -> float:
     """
     low, high = between
     return min(max((high - value) / (high - low), 0.0), 1.0)
+
+
+def mean(values: np.ndarray, axis: int | None = None, dtype: Any = None) -> Any:
+    """Arithmetic mean: that of `numpy.mean` to the bit, in two calls in place of nine.
+
+    Examples
+    --------
+    >>> mean(np.array([[1.0, 2.0], [3.0, 6.0]]), 0), mean(np.array([1.0, 2.0]))
+    (array([2., 4.]), np.float64(1.5))
+    """
+    total = np.add.reduce(values, axis=axis, dtype=dtype)
+    return total / (values.size / total.size)
+
+
+def median(values: np.ndarray) -> Any:
+    """Median over the last axis, which holds no NaN: that of `numpy.median` in a tenth of its calls.
+
+    Examples
+    --------
+    >>> median(np.array([[3.0, 1.0, 2.0], [5.0, 4.0, 6.0]])), median(np.array([1.0, 4.0]))
+    (array([2., 5.]), np.float64(2.5))
+    """
+    ordered, half = values.copy(), values.shape[-1] // 2
+    ordered.sort()
+    middle = ordered[..., half]
+    return middle if values.shape[-1] % 2 else (ordered[..., half - 1] + middle) / 2
 
 
 def significant(values: FloatArray, figures: int) -> FloatArray:
