@@ -6,7 +6,7 @@ done in nats, and a prior of zero is a log of -inf.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import add
 from typing import Literal
 
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground import FloatArray, InvalidArgumentError, in_range
 from worldstate.ground.checks import all_of, check_fields, check_shape, finite_array
+from worldstate.ground.values import replaced
 
 from .co_evidence import CoEvidence
 
@@ -130,12 +131,10 @@ class SignatureEvidence:
 
 def _nats(name: str, values: object, size: int) -> tuple[float, ...]:
     """Return log-likelihoods as floats; refuse what is none or too large, or another number of them."""
-    if not isinstance(values, Sequence | np.ndarray) or len(values) != size:
+    if (type(values) is not tuple and not isinstance(values, Sequence | np.ndarray)) or len(values) != size:
         raise InvalidArgumentError(f"{name}: expected one of each direction, got {values!r:.80}")
     # Whole numbers among them would make arrays that no likelihood can be added to.
-    return tuple(
-        one if type(one) is float and abs(one) <= MOST_NATS else in_range(name, one, *_NATS) for one in values
-    )
+    return tuple([in_range(name, one, *_NATS) for one in values])
 
 
 _IMAGE = 0.02  # Chance that the peak is an image after all
@@ -173,7 +172,7 @@ def with_bearing_vote(
     left = 0.5 * _IMAGE + (1.0 - _IMAGE) * 0.5 * math.erfc(-azimuth_rad / (math.sqrt(2.0) * std_rad))
     by_bearing = np.array([left if side == "left" else 1.0 - left for side in evidence.directions])
     shares = (1.0 - direct) * np.exp(hidden - total) + direct * by_bearing
-    return replace(evidence, hidden=tuple((level + np.log(shares)).tolist()))
+    return replaced(evidence, hidden=tuple((level + np.log(shares)).tolist()))
 
 
 @dataclass(frozen=True, slots=True)

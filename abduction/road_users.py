@@ -14,7 +14,7 @@ signal where the log-odds of signals over all that is foreign exceed a second th
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import accumulate
 from math import exp
 from typing import ClassVar, TypeAlias
@@ -25,6 +25,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError
 from worldstate.ground.checks import all_of, freeze_arrays, in_range, named
 from worldstate.ground.serialisation import ADDED, Layout
+from worldstate.ground.values import replaced
 
 UNKNOWN, SIREN = "unknown", "siren"
 # As detectors of COCO's classes call them; a van is a car to some and a truck to others.
@@ -57,9 +58,11 @@ def class_shares(name: str, value: object) -> ClassShares:
         if len(one) != 2:
             raise InvalidArgumentError(f"{name}: expected a class and its probability, got {one!r:.40}")
         label, share = one
-        named(name, label)
-        shares.append((label, in_range(name, share, 0.0, 1.0)))
-    if (total := sum(share for _, share in shares)) > 1.0 + _ROUNDING:
+        if type(label) is not str or not label or type(share) is not float or not 0.0 <= share <= 1.0:
+            named(name, label)
+            share = in_range(name, share, 0.0, 1.0)
+        shares.append((label, share))
+    if (total := sum([share for _, share in shares])) > 1.0 + _ROUNDING:
         raise InvalidArgumentError(f"{name}: expected probabilities that sum to at most one, got {total:g}")
     return tuple(sorted(shares))
 
@@ -119,7 +122,7 @@ class RoadUserModel:
         if self.shares is None:
             return self
         now, before = (np.log(np.maximum(one, np.finfo(float).tiny)) for one in (shares, self.shares))
-        return replace(self, biases=self.biases + (now - before), shares=shares)
+        return replaced(self, biases=self.biases + (now - before), shares=shares)
 
     def probabilities(self, measures: FloatArray) -> FloatArray:
         r"""Return the probability of every class, shape (n, classes).
@@ -364,8 +367,8 @@ def neutral(evidence: SignatureEvidence, margin: float) -> SignatureEvidence:
     hidden = tuple((evidence.none + beyond(ratios, margin)).tolist())
     sides = evidence.sides
     if sides is not None:
-        sides = replace(sides, log_ratios=tuple(beyond(np.array(sides.log_ratios), margin).tolist()))
-    return replace(evidence, hidden=hidden, sides=sides)
+        sides = replaced(sides, log_ratios=tuple(beyond(np.array(sides.log_ratios), margin).tolist()))
+    return replaced(evidence, hidden=hidden, sides=sides)
 
 
 def beyond(ratios: FloatArray, margin: float) -> FloatArray:

@@ -3,13 +3,12 @@
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from operator import itemgetter
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import CoEvidence, Unqueried
+from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
 from worldstate.abduction.grounding.grounded_likelihood import LINE_SPACING, GroundedObservation, Observable
 from worldstate.abduction.grounding.grounded_likelihood import Grounding as Grounding
@@ -38,6 +37,7 @@ from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import LEAST_HEARD, NotUsable, OutOfDomainError, falling, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.values import replaced
 from worldstate.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
 from worldstate.measurement.measurement import MeasurementAdapter
 
@@ -159,16 +159,16 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             front_end_settings = own if domain is None else FrontEndSettings.heard_at(sample_rate_hz)
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)
-            front_end_settings = replace(front_end_settings, feature_order=order)
+            front_end_settings = replaced(front_end_settings, feature_order=order)
         if guard is not None and guard.measures != MEASURES:
             raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
         if road_users is not None and road_users.measures != (*MEASURES, *BANDS):
             expected = f"one of {len(MEASURES) + len(BANDS)} measures of this version"
             raise OutOfDomainError(f"road users: expected {expected}, got {len(road_users.measures)} others")
         if guard is not None or road_users is not None:
-            front_end_settings = replace(front_end_settings, character=True)
+            front_end_settings = replaced(front_end_settings, character=True)
         if isinstance(sequence, SequenceReader):
-            front_end_settings = replace(front_end_settings, level_band_hz=LEVEL_BAND_HZ)
+            front_end_settings = replaced(front_end_settings, level_band_hz=LEVEL_BAND_HZ)
         self.source = "acoustic"
         self.front_end: FrontEnd | SpectrumFrontEnd
         self.front_end = FrontEnd(array, sample_rate_hz, front_end_settings, start_ns=start_ns)
@@ -215,30 +215,27 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         is read of a hop that is `outside` of what the models learned, which is the reason why.
         """
         self.last_frame, heard = frame, Heard(0.0, outside) if outside else heard_of(frame, self._kinds)
-        measured = self._unheard(frame, heard)
-        if heard.usable:
-            measured = self._read(frame, measured)
-        elif isinstance(self._sequence, SequenceReader):
-            self._sequence.miss()
-        return asked_again(measured, self._vision)
+        told: dict[str, Any] = {"stamp_ns": frame.stamp_ns, "kinds": (), "heard": heard}
+        told |= self._read(frame, heard) if heard.usable else self._unheard(heard)
+        of_sound = frame.stamp_ns, told["bearing"], told["kinds"], told["signature"]
+        told |= _asked(*of_sound, self._vision)
+        # One value for all of it: what it holds is checked once.
+        return Measurement(**told, source=self.source, fault=_array_fault(frame))
 
-    def _unheard(self, frame: AcousticFrame, heard: Heard) -> Measurement:
-        """Return the measurement of a hop that could not be heard, with even likelihoods."""
-        refused = NotUsable(heard.reason or "not heard")
-        return Measurement(
-            stamp_ns=frame.stamp_ns,
-            signature=SignatureEvidence(self._directions, (0.0,) * len(self._directions), 0.0, 0.0),
-            co_evidence=Unqueried("no camera"),
-            bearing=refused,
-            approach=refused,
-            sequence=refused if isinstance(self._sequence, SequenceReader) else self._sequence,
-            source=self.source,
-            fault=_array_fault(frame),
-            heard=heard,
-        )
+    def _unheard(self, heard: Heard) -> dict[str, Any]:
+        """Return the parts of the measurement of a hop that could not be heard, with even likelihoods."""
+        refused, reader = NotUsable(heard.reason or "not heard"), self._sequence
+        if isinstance(reader, SequenceReader):
+            reader.miss()
+        return {
+            "signature": SignatureEvidence(self._directions, (0.0,) * len(self._directions), 0.0, 0.0),
+            "bearing": refused,
+            "approach": refused,
+            "sequence": refused if isinstance(reader, SequenceReader) else reader,
+        }
 
-    def _read(self, frame: AcousticFrame, unheard: Measurement) -> Measurement:
-        """Return the measurement of a hop with what the models read in it."""
+    def _read(self, frame: AcousticFrame, share: Heard) -> dict[str, Any]:
+        """Return the parts of the measurement of a hop that the models read in it."""
         heard = signature = self._model.evidence(frame.feature)
         self._directions = signature.directions
         bearing, approach = _bearing(frame), _approach(frame)
@@ -248,23 +245,14 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if self._grounding is not None:
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         domain, kinds = self._recognised(frame)
-        share = unheard.heard
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
             share = beside_foreign(domain, share)
         # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
         reader = self._sequence
         sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
-        return replace(
-            unheard,
-            heard=share,
-            signature=signature,
-            bearing=bearing,
-            approach=approach,
-            domain=domain,
-            kinds=kinds,
-            sequence=sequence,
-        )
+        read = {"heard": share, "signature": signature, "bearing": bearing, "approach": approach}
+        return read | {"domain": domain, "kinds": kinds, "sequence": sequence}
 
     def _recognised(self, frame: AcousticFrame) -> tuple[DomainVerdict | None, ClassShares]:
         """Return whether the models know such sound, and which road users it may be of."""
@@ -326,26 +314,33 @@ def beside_foreign(foreign: Foreign, heard: Heard) -> Heard:
     As likely as the sound is not foreign: a model that was not made for it reads neither a vehicle nor
     silence in it, and what was believed before is carried on.
     """
-    return replace(heard, share=heard.share / (1.0 + math.exp(min(foreign.log_odds, 700.0))), reason=FOREIGN)
+    return replaced(heard, share=heard.share / (1.0 + math.exp(min(foreign.log_odds, 700.0))), reason=FOREIGN)
 
 
 def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:
     """Return a measurement with the answers of a camera, or of none; what was heard stays as it is."""
+    heard = measurement.bearing, measurement.kinds, measurement.signature
+    return replaced(measurement, **_asked(measurement.stamp_ns, *heard, vision))
+
+
+def _asked(
+    stamp_ns: int,
+    bearing: Bearing | NotUsable,
+    kinds: ClassShares,
+    signature: SignatureEvidence,
+    vision: CoEvidenceChannel | None,
+) -> dict[str, Any]:
+    """Return what a camera answers of what is heard at a time, or that there is none."""
     if vision is None:
-        return replace(measurement, co_evidence=Unqueried("no camera"), sightings=(), look=None, further=())
-    stamp_ns = measurement.stamp_ns
-    answer, sightings = _answer(measurement, vision), vision.sightings(stamp_ns)
-    look = vision.last_look(stamp_ns)
-    further = vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else ()
-    return replace(measurement, co_evidence=answer, sightings=sightings, look=look, further=further)
-
-
-def _answer(measurement: Measurement, vision: CoEvidenceChannel) -> CoEvidence:
-    bearing, labels = measurement.bearing, expected_labels(measurement.kinds)
+        return {"co_evidence": Unqueried("no camera"), "sightings": (), "look": None, "further": ()}
+    labels = expected_labels(kinds)
     if isinstance(bearing, Bearing) and bearing.std_rad <= _COARSE_STD_RAD:
-        return vision.ask(measurement.stamp_ns, bearing, labels)
-    side = measurement.signature.likelier_side
-    return vision.ask(measurement.stamp_ns, NotUsable("coarse bearing"), labels, side)
+        answer = vision.ask(stamp_ns, bearing, labels)
+    else:
+        answer = vision.ask(stamp_ns, NotUsable("coarse bearing"), labels, signature.likelier_side)
+    found = {"co_evidence": answer, "sightings": vision.sightings(stamp_ns)}
+    further = vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else ()
+    return found | {"look": vision.last_look(stamp_ns), "further": further}
 
 
 def _bearing(frame: AcousticFrame) -> Bearing | NotUsable:

@@ -5,7 +5,7 @@ import logging
 from bisect import insort
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter, itemgetter
 from pathlib import Path
@@ -31,7 +31,7 @@ from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError, WorldstateError
 from worldstate.ground.checks import in_range, one_of
 from worldstate.ground.typing import Float32Array
-from worldstate.ground.values import integer_ns, nanoseconds, seconds
+from worldstate.ground.values import integer_ns, nanoseconds, replaced, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.measurement.odometry import Odometry
 from worldstate.state import WorldState
@@ -168,7 +168,7 @@ class Listener:
             source = array
         if spectra is not None:
             # Nobody has set a threshold with this front-end: no budget is stated.
-            source = replace(source, policy=replace(source.policy, alpha=0.0))
+            source = replaced(source, policy=replaced(source.policy, alpha=0.0))
         self.world = source.world()
         self._source, self._rate_hz = source, sample_rate_hz
         self._signature, self._reader = source.signature(), source.reader()
@@ -374,7 +374,7 @@ class Listener:
         # Ears are changed by what they hear, a camera's memory is replaced.
         eyes = {name: copy(query) for name, query in self._cameras.items()}
         senses = Senses(self._now_ns(), deepcopy(self._adapter.front_end), eyes)
-        return replace(self._learned(), senses=senses)
+        return replaced(self._learned(), senses=senses)
 
     def _learned(self) -> Checkpoint:
         """Return the belief and what was learned of site and street."""

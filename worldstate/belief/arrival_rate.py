@@ -1,7 +1,9 @@
 """How often vehicles come into view from a side, learned while a camera looks."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+
+from worldstate.ground.values import replaced
 
 from .street_model import StreetModel
 
@@ -26,7 +28,7 @@ class ArrivalRate:
 
     def with_one_more(self) -> "ArrivalRate":
         """Return the rate after one more arrival."""
-        return replace(self, count=self.count + 1.0)
+        return replaced(self, count=self.count + 1.0)
 
     def shift_nats(self, usual_hz: float, street: StreetModel) -> float:
         """Return by how much the log-odds of a vehicle coming differ from usual, in steps of .1 nats.

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from operator import attrgetter
 
 import numpy as np
@@ -12,6 +12,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
 from worldstate.belief.kinematics.motion import FARTHEST_M, LEAST_STD
 from worldstate.ground import FloatArray, wrap_angle
+from worldstate.ground.values import replaced
 from worldstate.measurement import CameraLook, Sector
 from worldstate.measurement.position import Position, PositionScan
 
@@ -68,7 +69,7 @@ class Detections:
         in_sight = self.line_of_sight(site)
         total = 1.0 - self.existence * (1.0 - in_sight)
         existence, log_new = self.existence * in_sight / total, self.log_new + np.log(total)
-        return replace(self, existence=existence, log_new=log_new)
+        return replaced(self, existence=existence, log_new=log_new)
 
     def __len__(self) -> int:
         return len(self.classes)

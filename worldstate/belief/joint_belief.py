@@ -17,7 +17,7 @@ so that without other evidence p = n, whose parts are q, whatever the chain.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, reduce
 
 import numpy as np
@@ -27,6 +27,7 @@ from worldstate.abduction.sequence.markov_chain import balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
 from worldstate.ground import TINY, FloatArray, seconds
+from worldstate.ground.values import replaced
 
 from .street_model import StreetModel
 
@@ -291,14 +292,14 @@ class JointBelief:
         changed = -math.expm1(-rate_hz * seconds(step_ns)) * weights / (street.recovers_s * rate_hz)
         kept = math.exp(-rate_hz * seconds(step_ns))
         pairs = zip(self.trust.items(), works, strict=True)
-        trust = {name: replace(one, works=kept * now + changed) for (name, one), now in pairs}
+        trust = {name: replaced(one, works=kept * now + changed) for (name, one), now in pairs}
         return JointBelief(weights, alone, trust)
 
     def times(self, evidence: FloatArray) -> "JointBelief":
         """Return the belief after evidence, a likelihood of every state."""
         weights = self.weights * evidence
         total = weights.sum()
-        trust = {name: replace(one, works=one.works * evidence / total) for name, one in self.trust.items()}
+        trust = {name: replaced(one, works=one.works * evidence / total) for name, one in self.trust.items()}
         return JointBelief(weights / total, self.alone, trust)
 
     def read(
@@ -333,7 +334,7 @@ class JointBelief:
             mixed[none] = ratio[none]
             ratio = mixed / (mixed * expected).sum()
         every = _spread(np.expand_dims(ratio**share, others))
-        return replace(self.times(every), alone=self.alone | {source: _normed(before * every)})
+        return replaced(self.times(every), alone=self.alone | {source: _normed(before * every)})
 
     def told(self, by_part: FloatArray) -> "JointBelief":
         """Return the belief after likelihoods of the parts, shape (parts, ..., parts, 2)."""
@@ -343,7 +344,7 @@ class JointBelief:
         """Return the belief at another prior than it was held at, each of the shape of the belief."""
         factor = after / before
         alone = {name: _normed(one * factor) for name, one in self.alone.items()}
-        return replace(self.times(factor), alone=alone)
+        return replaced(self.times(factor), alone=alone)
 
     def looked(
         self, sensor: str, answer: Absent | Present, stamp_ns: int, street: StreetModel
@@ -366,10 +367,10 @@ class JointBelief:
         in_view, clear, failed = (np.maximum(told, TINY) ** run[0]).tolist()
         found = works * _spread(np.reshape([clear, in_view], (*[1] * self.sides, 2)))
         after = found + (self.weights - works) * failed
-        others = replace(self, trust={name: one for name, one in self.trust.items() if name != sensor})
+        others = replaced(self, trust={name: one for name, one in self.trust.items() if name != sensor})
         seen = others.times(after / np.maximum(self.weights, np.finfo(float).tiny))
         own = SensorTrust(found / after.sum(), stamp_ns, miss, *run[1:])
-        return replace(seen, trust={**seen.trust, sensor: own})
+        return replaced(seen, trust={**seen.trust, sensor: own})
 
     def emerged(self, side: int, residual: float, apart: bool, street: StreetModel) -> "JointBelief":
         r"""Return the belief after a vehicle has come into view past the edge of a side.
@@ -403,7 +404,7 @@ class JointBelief:
             return np.ascontiguousarray(np.moveaxis(mixed.reshape(front.shape), 0, side))
 
         weights = after(self.weights)
-        trust = {name: replace(one, works=after(one.works)) for name, one in self.trust.items()}
+        trust = {name: replaced(one, works=after(one.works)) for name, one in self.trust.items()}
         # What was heard until now was the vehicle that is in view.
         return JointBelief(weights, dict.fromkeys(self.alone, weights), trust)
 

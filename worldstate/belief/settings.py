@@ -2,10 +2,11 @@
 
 import math
 import warnings
-from dataclasses import InitVar, dataclass, field, replace
+from dataclasses import InitVar, dataclass, field
 from typing import Any, Literal
 
 from worldstate.ground.checks import in_range, one_of
+from worldstate.ground.values import replaced
 
 from .street_model import StoredStreet, StreetModel
 
@@ -57,6 +58,6 @@ class FilterSettings:
             changed: dict[str, Any] = dict(reversed(given))  # Of both `death_probability` counts
             names = ", ".join(sorted(changed))
             warnings.warn(f"give {names} to StreetModel, as FilterSettings.street", DeprecationWarning, 3)
-            object.__setattr__(self, "street", replace(self.street, **changed))
+            object.__setattr__(self, "street", replaced(self.street, **changed))
         in_range("window_s", self.window_s, 0.0, math.inf, open_low=True)
         one_of("windows", self.windows, ("posterior", "likelihood"))

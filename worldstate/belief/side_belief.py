@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+
+from worldstate.ground.values import replaced
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,7 @@ class SideBelief:
         [0.2, 0.78, 0.02]
         """
         hidden, visible, none = self.hypotheses
-        return replace(self, hypotheses=(hidden, visible + max(none - nothing, 0.0), min(none, nothing)))
+        return replaced(self, hypotheses=(hidden, visible + max(none - nothing, 0.0), min(none, nothing)))
 
     def at_least(self, announced: Sequence[float]) -> "SideBelief":
         r"""Return the belief with the vehicles that messages announce, by side.
@@ -82,7 +84,7 @@ class SideBelief:
         hidden, visible, none = self.hypotheses
         now = max(hidden, some)
         kept = (1.0 - now) / (1.0 - hidden) if hidden < 1.0 else 0.0
-        return replace(
+        return replaced(
             self,
             risks=tuple(map(max, self.risks, announced)),
             risk=max(self.risk, some),

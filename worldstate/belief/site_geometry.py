@@ -1,7 +1,7 @@
 """Geometry of the site: where hidden vehicles are, where they come into view, and what the camera sees."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.belief.kinematics.cartesian import NumbersT
 from worldstate.belief.kinematics.motion import LEAST_STD, MotionBelief
 from worldstate.ground import FloatArray, wrap_angle
+from worldstate.ground.values import replaced
 from worldstate.measurement import CameraLook, Look, Sector
 
 from .settings import FilterSettings
@@ -167,9 +168,9 @@ class SiteGeometry:
         found = any(one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings)
         miss = share * answer.miss_rate + (1.0 - share)
         if not found:
-            return replace(look, answer=Absent(miss, answer.clutter_rate))
+            return replaced(look, answer=Absent(miss, answer.clutter_rate))
         # With a clutter rate of zero a box would rule out everything else.
-        return replace(look, answer=Present(miss, answer.clutter_rate or self.street.clutter))
+        return replaced(look, answer=Present(miss, answer.clutter_rate or self.street.clutter))
 
 
 def normal_shares(deviations: FloatArray) -> FloatArray:

@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import Layout, Via, decode
+from worldstate.ground.values import replaced
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +123,7 @@ class StreetModel:
         pairs = ((name, one, getattr(self, name)) for name, one in self.sources.numbers.items())
         given = "given by the caller"
         return {
-            name: one if one.value == now else replace(one, value=now, origin="given", why=given)
+            name: one if one.value == now else replaced(one, value=now, origin="given", why=given)
             for name, one, now in pairs
         }
 

@@ -1,7 +1,6 @@
 """Births, hand-overs and deaths of entities, those that have become one, and the events of all this."""
 
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import NEVER_NS, Track, Tracks, born, heard_as
 from worldstate.ground import TINY
+from worldstate.ground.values import replaced
 from worldstate.measurement import Measurement
 from worldstate.state import Event
 from worldstate.state.entity import EventKind
@@ -38,7 +38,7 @@ def birth_death(
         one = born_hidden(memory, side, 0.0, measurement.stamp_ns, measurement.source, site)
         # A detector adds to the kinds at the hand-over.
         labels, motion = measurement.kinds or one.labels, site.sides[side].prior()
-        memory.tracks = memory.tracks.joined([replace(one, labels=labels, motion=motion)])
+        memory.tracks = memory.tracks.joined([replaced(one, labels=labels, motion=motion)])
     view_heard(memory, site)
 
 
@@ -48,7 +48,7 @@ def born_hidden(
     """Return one more hidden entity of a side."""
     one = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
     memory.history[side].births += 1
-    return replace(one, side=side, came_from=1.0, sources=(source,))
+    return replaced(one, side=side, came_from=1.0, sources=(source,))
 
 
 def view_heard(memory: Memory, site: SiteGeometry) -> None:
@@ -85,7 +85,7 @@ def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
     """Return the belief of the sides without a vehicle that has just come into view: it has a track."""
     sides, found = memory.sides, memory.belief.emerged_since(memory.stamp_ns, site.street.beside_s)
     emerged = tuple(0.0 if own else one for own, one in zip(found, sides.emerged, strict=True))
-    return replace(sides, emerged=emerged)
+    return replaced(sides, emerged=emerged)
 
 
 def _heard_rows(tracks: Tracks) -> list[int]:

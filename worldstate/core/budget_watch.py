@@ -15,12 +15,12 @@ Sources: Shafer, "Testing by betting", J. R. Statist. Soc. A 184, 2021; Shin, Ra
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S, HELD_HOPS, SequenceAlarm
 from worldstate.ground import TINY, InvalidArgumentError, nanoseconds, seconds
-from worldstate.ground.values import SECONDS_PER_HOUR
+from worldstate.ground.values import SECONDS_PER_HOUR, replaced
 from worldstate.state.cue import Budget, Tally, Verdict
 
 # Whatever is advised of comes into view within the risk's own horizon, or was not there. So long after one
@@ -141,13 +141,13 @@ class BudgetWatch:
         now_ns, watch = hop.stamp_ns, self
         if not (hop.looked and self.watches(now_ns)):
             since_ns = now_ns if hop.looked else None
-            watch = replace(self, since_ns=since_ns, stamp_ns=now_ns, pending_ns=(), bet=None)
+            watch = replaced(self, since_ns=since_ns, stamp_ns=now_ns, pending_ns=(), bet=None)
         if hop.looked:
             watch = watch._counted(hop, onsets_per_hour)._betted(hop)
         begins = any(hop.over) and all(ns is None or now_ns - ns > ENDS_NS for ns in self.over_ns)
         pending_ns = (*watch.pending_ns, now_ns) if begins else watch.pending_ns
         over_ns = tuple(now_ns if yes else ns for ns, yes in zip(self.over_ns, hop.over, strict=True))
-        return replace(
+        return replaced(
             watch, stamp_ns=now_ns, emerged_ns=hop.emerged_ns, pending_ns=pending_ns, over_ns=over_ns
         )
 
@@ -167,18 +167,18 @@ class BudgetWatch:
         )
         onsets = self.onsets.after(onset_factors(false, seconds(step_ns), onsets_per_hour), seconds(step_ns))
         pending_ns = tuple(ns for ns in pending_ns if ns > known_ns)
-        return replace(self, tally=tally, onsets=onsets, pending_ns=pending_ns)
+        return replaced(self, tally=tally, onsets=onsets, pending_ns=pending_ns)
 
     def _betted(self, hop: WatchedHop) -> "BudgetWatch":
         """Return the watch after a bet on the chances of two seconds ago, with the next one laid."""
         if self.bet is None:
-            return replace(self, bet=(hop.stamp_ns, hop.within))
+            return replaced(self, bet=(hop.stamp_ns, hop.within))
         laid_ns, chances = self.bet
         if hop.stamp_ns - laid_ns < BET_NS:
             return self
         came = [ns is not None and 0 < ns - laid_ns <= BET_NS for ns in hop.emerged_ns]
         within = self.within.after(chance_factors(chances, came), BET_S)
-        return replace(self, within=within, bet=(hop.stamp_ns, hop.within))
+        return replaced(self, within=within, bet=(hop.stamp_ns, hop.within))
 
     def check(self, sides: int) -> None:
         """Refuse what a file cannot have been written with."""

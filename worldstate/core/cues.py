@@ -1,7 +1,7 @@
 """Advisories and cues: the alarm over the belief and what messages announce, and what is published."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -15,6 +15,7 @@ from worldstate.belief.hidden_bearing import announced, time_to_visible
 from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.side_belief import SideBelief
 from worldstate.ground import TINY
+from worldstate.ground.values import replaced
 from worldstate.measurement import Measurement
 from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
 
@@ -82,7 +83,7 @@ class SideAlarms:
             risk = min(float(self.model.policy.risk_map(hidden)), hidden)
             # The floor only matters where P(hidden) has underflowed; then no direction has a share.
             share = risk / max(hidden, TINY)
-            sides = replace(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
+            sides = replaced(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
         # What drives behind the ego explains nothing of what is ahead.
         ahead = tracks.seen & tracks.moving & (np.cos(tracks.mean[:, AZIMUTH]) > 0.0)
         unseen = 1.0 - tracks.existence[ahead] * (1.0 - tracks.behind[ahead])

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +38,7 @@ from worldstate.belief.track import (
 )
 from worldstate.ground import TINY, FloatArray, seconds, wrap_angle
 from worldstate.ground.typing import IndexArray
+from worldstate.ground.values import replaced
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
 from .birth_death import HIDDEN, after_look, born_hidden
@@ -76,7 +76,7 @@ def new_looks(
         elif not in_time or (last is not None and last.source != measurement.source):
             when = "was counted before" if in_time else "is of another time"
             unasked = Unqueried(f"this look of {look.sensor} {when}")
-            measurement = replace(measurement, co_evidence=unasked)
+            measurement = replaced(measurement, co_evidence=unasked)
     return measurement, new
 
 
@@ -127,7 +127,7 @@ def detection_update(
     whose = associated(known, detections, site)
     if in_sight:
         # A detection that may be of a known entity is a new one the less.
-        detections = replace(detections, existence=detections.existence * whose.unclaimed)
+        detections = replaced(detections, existence=detections.existence * whose.unclaimed)
     born = [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
     memory.tracks = tracks = known.joined(born)
     chances, detection = np.append(whose.chances, np.ones(len(whose.new))), np.full(len(tracks), -1)
@@ -176,7 +176,7 @@ def _born(
     if side is None:
         track = born("visible", memory.counts.sighted, existence, stamp_ns, site)
         memory.counts.sighted += 1
-        return replace(track, side=site.nearest_side(azimuth_rad), sources=(scan.source,), behind=0.0)
+        return replaced(track, side=site.nearest_side(azimuth_rad), sources=(scan.source,), behind=0.0)
     return born_hidden(memory, side, existence, stamp_ns, scan.source, site)
 
 

@@ -1,7 +1,7 @@
 """The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -11,6 +11,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds
 from worldstate.ground.serialisation import Layout, decode, encode
+from worldstate.ground.values import replaced
 from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 from worldstate.state.world_state import judged
@@ -109,13 +110,13 @@ class WorldFilter:
             seq=memory.counts.measurements,
             entities=entities_of(tracks, memory, model.site),
             relations=memory.relations if is_fresh else relations_at(memory, tracks, model),
-            context=replace(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
+            context=replaced(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
             cues=SideAlarms(memory, model).cues(sensors),
             calibrated=self.policy.alpha > 0.0,
             bearing=last.bearing,
             domain=last.domain,
             no_sequence=last.no_sequence,
-            delivery=replace(self._lag.delivery, tracks_left_out=memory.counts.left_out),
+            delivery=replaced(self._lag.delivery, tracks_left_out=memory.counts.left_out),
             valid_until_ns=max((one.stamp_ns + NEWS_HOLDS_NS for one in sensors), default=None),
             sensors=sensors,
             searched=searched_views(memory, context),
@@ -199,7 +200,7 @@ class WorldFilter:
 
     def _with(self, memory: Memory, lag: FixedLag) -> "WorldFilter":
         """Return the filter with another memory; what follows from its configuration is the same."""
-        world = replace(self, memory=memory, lag=lag)
+        world = replaced(self, memory=memory, lag=lag)
         vars(world)["_model"] = self._model
         return world
 
@@ -207,7 +208,7 @@ class WorldFilter:
         fresh = first_memory(self.context, self.settings, measurement.stamp_ns)
         fresh.counts.left_out = self._memory.counts.left_out
         lag = FixedLag(fresh, (), self._lag.counted(reanchored=1).delivery)
-        return replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=lag).update(measurement)
+        return replaced(self, start_ns=measurement.stamp_ns, memory=fresh, lag=lag).update(measurement)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a checkpoint as JSON-able values: what is read back continues bit for bit.
@@ -237,7 +238,7 @@ class WorldFilter:
         kept = decode(FilterRecord, value, "checkpoint")
         past, latest = kept.past, kept.memory
         world = cls(kept.context, kept.policy, kept.settings, kept.start_ns, latest)
-        world = replace(world, lag=restored(latest, past, world._step))
+        world = replaced(world, lag=restored(latest, past, world._step))
         return world if past.stamp_ns <= latest.stamp_ns else world.predict_to(past.stamp_ns)
 
     @cached_property
@@ -280,7 +281,7 @@ def _fitting(measurement: object, context: Context) -> tuple[Timed, int]:
     One that does not fit the context is refused.
     """
     if isinstance(measurement, PositionScan):
-        return replace(measurement, stamp_ns=measurement.observed_ns, latency_s=0.0), 0
+        return replaced(measurement, stamp_ns=measurement.observed_ns, latency_s=0.0), 0
     if isinstance(measurement, Odometry):
         return measurement, 0
     if not isinstance(measurement, Measurement):
@@ -293,7 +294,7 @@ def _fitting(measurement: object, context: Context) -> tuple[Timed, int]:
     if left_out:
         first, *others = (tuple(sorted(boxes, key=_first_counting)[:MOST_BOXES]) for boxes in every)
         further = map(CameraLook, (one.look for one in measurement.further), others)
-        measurement = replace(measurement, sightings=first, further=tuple(further))
+        measurement = replaced(measurement, sightings=first, further=tuple(further))
     return measurement, left_out
 
 

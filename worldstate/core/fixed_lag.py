@@ -7,13 +7,13 @@ that is ahead of all others by more than the lag waits until another one confirm
 
 from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import accumulate
 from operator import attrgetter
 from typing import TypeAlias
 
 from worldstate.ground.serialisation import ADDED, encode
-from worldstate.ground.values import nanoseconds
+from worldstate.ground.values import nanoseconds, replaced
 from worldstate.measurement import Measurement, Odometry, PositionScan
 from worldstate.state import Delivery
 
@@ -65,14 +65,14 @@ class FixedLag:
             since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
             if stamp_ns - since_ns >= REANCHOR_NS:
                 return None
-            return replace(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
+            return replaced(self.counted(too_late=1), late_since_ns=min(since_ns, stamp_ns))
         if held is not None and self._agree(held.stamp_ns, stamp_ns):
             first, second = sorted((held, measurement), key=attrgetter("stamp_ns"))
-            return replace(self.counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
+            return replaced(self.counted(held_back=-1), held=None)._taken(first, step)._taken(second, step)
         if self._is_ahead(stamp_ns, now_ns):
-            return replace(self.counted(held_back=1), held=measurement)
+            return replaced(self.counted(held_back=1), held=measurement)
         refuted = held is not None and held.source == measurement.source
-        return replace(self, held=None if refuted else held)._taken(measurement, step)
+        return replaced(self, held=None if refuted else held)._taken(measurement, step)
 
     def _agree(self, held_ns: int, stamp_ns: int) -> bool:
         """Tell whether two stamps are ahead of all others, and as near to each other as to these."""
@@ -100,7 +100,7 @@ class FixedLag:
         kept = [*self.arrivals[:at], *map(Arrival, again, befores)]
         oldest = bisect_left(kept, memory.stamp_ns - LAG_NS, key=_STAMP_NS)
         counted = self.counted(replayed=1) if measurement.stamp_ns < self.latest.stamp_ns else self
-        return replace(counted, latest=memory, arrivals=tuple(kept[oldest:]), late_since_ns=None)
+        return replaced(counted, latest=memory, arrivals=tuple(kept[oldest:]), late_since_ns=None)
 
     def _at(self, stamp_ns: int) -> list[Timed]:
         """Return what was taken of one instant, in its order."""
@@ -109,7 +109,7 @@ class FixedLag:
     def counted(self, **more: int) -> "FixedLag":
         """Return the buffer with some counts of its delivery raised."""
         counts = {name: getattr(self.delivery, name) + number for name, number in more.items()}
-        return replace(self, delivery=replace(self.delivery, **counts))
+        return replaced(self, delivery=replaced(self.delivery, **counts))
 
 
 _STAMP_NS = attrgetter("measurement.stamp_ns")
@@ -121,9 +121,10 @@ def _content(measurement: Timed) -> tuple[int, str]:
     """Return what measurements of one instant are in order of: their kind, and all of them but names."""
     if not isinstance(measurement, Measurement):
         order = 0 if isinstance(measurement, Odometry) else 2 + (measurement.searched is None)
-        return order, str(encode(replace(measurement, source="-")))
-    looks = sorted(str(encode(replace(one, look=replace(one.look, sensor="-")))) for one in measurement.looks)
-    return 1, str((looks, encode(replace(measurement, source="-", look=None, sightings=(), further=()))))
+        return order, str(encode(replaced(measurement, source="-")))
+    unnamed = [replaced(one, look=replaced(one.look, sensor="-")) for one in measurement.looks]
+    looks = sorted(str(encode(one)) for one in unnamed)
+    return 1, str((looks, encode(replaced(measurement, source="-", look=None, sightings=(), further=()))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -13,6 +12,7 @@ from worldstate.belief.kinematics.motion import LEAST_STD
 from worldstate.belief.site_geometry import normal_share
 from worldstate.belief.track import Track, Tracks, occluded, side_weights
 from worldstate.ground import TINY, FloatArray, nanoseconds
+from worldstate.ground.values import replaced
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
 
@@ -56,10 +56,10 @@ def _held(edge: Relation, before: Relation | None) -> Relation:
     before = before or edge
     if edge.probability >= _HOLDS:
         begins = before.since_ns is None or before.until_ns is not None
-        return replace(edge, since_ns=edge.stamp_ns if begins else before.since_ns)
+        return replaced(edge, since_ns=edge.stamp_ns if begins else before.since_ns)
     until_ns = edge.stamp_ns if before.until_ns is None else before.until_ns
     is_kept = before.since_ns is not None and edge.stamp_ns - until_ns <= _KEPT_NS
-    return replace(edge, since_ns=before.since_ns, until_ns=until_ns) if is_kept else edge
+    return replaced(edge, since_ns=before.since_ns, until_ns=until_ns) if is_kept else edge
 
 
 def _edges(track: Track, belief: StreetBelief, model: FilterModel) -> Iterator[Edge]:

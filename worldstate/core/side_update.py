@@ -1,12 +1,11 @@
 """Update the belief of the sides, and how well a source can hear beside what is in view."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.belief.street_model import StreetModel
 from worldstate.ground import LEAST_HEARD, falling
-from worldstate.ground.values import NotUsable
+from worldstate.ground.values import NotUsable, replaced
 from worldstate.measurement import CameraLook, Heard, Measurement
 from worldstate.state.sensor import MASKED
 
@@ -37,7 +36,7 @@ def heard_beside(memory: Memory, measurement: Measurement, street: StreetModel) 
     if in_view < 0.5 or share >= heard.share:
         return heard
     # What masks is heard itself: the ear is not deaf.
-    return replace(heard, share=max(share, LEAST_HEARD), reason=MASKED)
+    return replaced(heard, share=max(share, LEAST_HEARD), reason=MASKED)
 
 
 def update_belief(

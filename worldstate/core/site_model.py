@@ -1,13 +1,14 @@
 """What the filter knows of the place: the context as the ego vehicle has it, and the belief with it."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import MOST_NATS
 from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
+from worldstate.ground.values import replaced
 from worldstate.measurement import Measurement
 from worldstate.state import Context
 from worldstate.state.context import seen_from
@@ -56,8 +57,8 @@ def from_here(model: FilterModel, ego: EgoBelief | None) -> FilterModel:
     stds = math.sqrt(0.5 * (x_var + y_var)), math.sqrt(yaw_var)
     x, y, yaw = ego.pose.tolist()
     occluders = tuple(seen_from(one, (x, y, yaw), *stds) for one in model.context.occluders)
-    context = replace(model.context, occluders=occluders, ego_speed_mps=ego.speed_mps)
-    return replace(model, context=context, site=site_geometry_of(context, model.site.settings, ego))
+    context = replaced(model.context, occluders=occluders, ego_speed_mps=ego.speed_mps)
+    return replaced(model, context=context, site=site_geometry_of(context, model.site.settings, ego))
 
 
 def without_open_sides(measurement: Measurement, context: Context) -> Measurement:
@@ -68,4 +69,4 @@ def without_open_sides(measurement: Measurement, context: Context) -> Measuremen
     said = measurement.signature
     pairs = zip(said.directions, said.hidden, strict=True)
     hidden = tuple(-MOST_NATS if side in is_open else nats for side, nats in pairs)
-    return replace(measurement, signature=replace(said, hidden=hidden))
+    return replaced(measurement, signature=replaced(said, hidden=hidden))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -46,6 +46,7 @@ from worldstate.ground import (
     nanoseconds,
     seconds,
 )
+from worldstate.ground.values import replaced
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Budget, Context, Priors, Rates
 
@@ -193,7 +194,7 @@ class StreetBelief:
         read_ns = {name: ns for name, ns in self.read_ns.items() if ns >= since_ns}
         alone = {name: one for name, one in self.joint.alone.items() if name in read_ns}
         trust = {name: one for name, one in self.joint.trust.items() if one.stamp_ns >= since_ns}
-        return replace(self, joint=replace(self.joint, alone=alone, trust=trust), read_ns=read_ns)
+        return replaced(self, joint=replaced(self.joint, alone=alone, trust=trust), read_ns=read_ns)
 
     def handed_over(
         self, kept: Mapping[int, float], apart: Collection[int], stamp_ns: int, street: StreetModel
@@ -207,7 +208,7 @@ class StreetBelief:
         for k, residual in kept.items():
             is_apart = two or bool((set(kept) | set(apart)) - {k})
             joint = joint.emerged(k, residual, is_apart, street)
-        return replace(
+        return replaced(
             self,
             joint=joint,
             emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
@@ -233,7 +234,7 @@ class StreetBelief:
         least = self.threshold_nats(policy, street)
         pairs = enumerate(zip(self.over_ns, self.decided, strict=True))
         over_ns = tuple(None if k in sides and one < least else ns for k, (ns, one) in pairs)
-        return replace(self, over_ns=over_ns)
+        return replaced(self, over_ns=over_ns)
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
         """Return for each side when its alarm ends: a second after it was last above the threshold."""
@@ -323,7 +324,7 @@ def carried(
         arrivals = tuple(one.watched_for(seconds(step_ns), street) for one in arrivals)
     gone = math.exp(-seconds(step_ns) / street.passage_s)
     shown = tuple(gone * one for one in kept.shown)
-    return replace(kept, joint=joint, arrivals=arrivals, shown=shown, stamp_ns=stamp_ns)
+    return replaced(kept, joint=joint, arrivals=arrivals, shown=shown, stamp_ns=stamp_ns)
 
 
 def _expecting(kept: StreetBelief, context: Context, street: StreetModel) -> StreetBelief:
@@ -331,8 +332,8 @@ def _expecting(kept: StreetBelief, context: Context, street: StreetModel) -> Str
     usual = _usual(context, kept.share)
     if usual is not kept.usual and not np.array_equal(usual, kept.usual):
         before, after = (StreetPrior.of(one, street).weights for one in (kept.usual, usual))
-        kept = replace(kept, joint=kept.joint.at_prior(before, after), usual=usual)
-    return replace(kept, groups=_with_traffic(kept, context, street))
+        kept = replaced(kept, joint=kept.joint.at_prior(before, after), usual=usual)
+    return replaced(kept, groups=_with_traffic(kept, context, street))
 
 
 def informed(
@@ -347,8 +348,8 @@ def informed(
     street, reading = settings.street, measurement.sequence
     if measurement.heard.usable and isinstance(reading, SequenceReading):
         if not kept.has_times:  # The alarm by windows goes by another event
-            kept = replace(kept, recent=(), over_ns=(None,) * kept.k)
-        kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
+            kept = replaced(kept, recent=(), over_ns=(None,) * kept.k)
+        kept = replaced(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
     before = kept = _expecting(kept, context, street)
     if measurement.heard.usable:
         kept = _read(kept, measurement, context, settings)
@@ -357,17 +358,17 @@ def informed(
         if not isinstance(look.answer, Unqueried):
             joint = joint.looked(look.sensor, look.answer, look.stamp_ns, street)
     if kept is before and joint is kept.joint:  # No news: what is out ends as in silence
-        return replace(kept, stamp_ns=measurement.stamp_ns)
-    return alerted(_shown(replace(kept, joint=joint, stamp_ns=measurement.stamp_ns), street), policy, street)
+        return replaced(kept, stamp_ns=measurement.stamp_ns)
+    return alerted(_shown(replaced(kept, joint=joint, stamp_ns=measurement.stamp_ns), street), policy, street)
 
 
 def _shown(kept: StreetBelief, street: StreetModel) -> StreetBelief:
     """Return the belief with the vehicles that are in view by their sound alone; a look finds them itself."""
     if kept.watched(kept.stamp_ns):
-        return replace(kept, shown=(0.0,) * kept.k)
+        return replaced(kept, shown=(0.0,) * kept.k)
     own, now = kept.emerged_since(kept.stamp_ns, street.beside_s), kept.joint.emerged_from.tolist()
     pairs = zip(own, kept.shown, now, strict=True)
-    return replace(kept, shown=tuple(0.0 if is_own else max(pair) for is_own, *pair in pairs))
+    return replaced(kept, shown=tuple(0.0 if is_own else max(pair) for is_own, *pair in pairs))
 
 
 def _read(
@@ -391,16 +392,16 @@ def _read(
         if settings.windows == "likelihood":
             weight = min(step_s / settings.window_s, 1.0) * measurement.heard.share
             read_ns = kept.read_ns | {source: stamp_ns}
-            return kept if masked else replace(kept, joint=kept.joint.told(told**weight), read_ns=read_ns)
+            return kept if masked else replaced(kept, joint=kept.joint.told(told**weight), read_ns=read_ns)
         joint, sides, memory_s = usual * told, list(range(kept.k)), street.window_s
     read_ns = kept.read_ns | {source: stamp_ns}
     if masked:
-        return replace(kept, read_ns=read_ns)
+        return replaced(kept, read_ns=read_ns)
     # Of evidence that overlaps, what is new counts.
     new = -math.expm1(-step_s / memory_s)
     joint, heard = joint / joint.sum(), measurement.heard.share
     after = kept.joint.read(source, joint, kept.prior(street), sides, new, heard)
-    return replace(kept, joint=after, read_ns=read_ns)
+    return replaced(kept, joint=after, read_ns=read_ns)
 
 
 def _sequence(
@@ -453,7 +454,7 @@ def alerted(kept: StreetBelief, policy: CueingPolicy, street: StreetModel) -> St
     sides = zip(over, denied | moved, kept.over_ns, strict=True)
     over_ns = tuple(None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides)
     decided = np.where(over & denied, _LEAST_NATS, decided)
-    after = replace(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns, watch=watch)
+    after = replaced(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns, watch=watch)
     # The belief is the same: what was derived of it, half of the time of a step, is not derived again.
     vars(after).update(vars(kept) | vars(after))
     return after

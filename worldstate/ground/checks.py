@@ -91,6 +91,8 @@ def in_range(
     >>> in_range("alpha", 0.02, 0, 1, open_low=True)
     0.02
     """
+    if type(value) is float and low < value < high:  # Nearly all
+        return value
     try:
         number = math.ldexp(value, 0)  # As `float`, which would read text
     except (TypeError, OverflowError) as error:
@@ -150,7 +152,7 @@ def named(name: str, value: object) -> None:
     --------
     >>> named("source", "radar")
     """
-    if not isinstance(value, str) or not value:
+    if (type(value) is not str and not isinstance(value, str)) or not value:
         raise InvalidArgumentError(f"{name}: expected a name, got {value!r:.40}")
 
 
@@ -170,7 +172,10 @@ def check_fields(instance: object, **expected: Any) -> None:
     for name, wanted in expected.items():
         value, is_range = getattr(instance, name), type(wanted) is tuple
         # Nearly all: NaN compares false, and numpy's float64 is a float of another type.
-        if is_range and type(value) is float and wanted[0] <= value <= wanted[1]:
+        if is_range:
+            if type(value) is float and wanted[0] <= value <= wanted[1]:
+                continue
+        elif type(value) in _EXACT[wanted]:
             continue
         if isinstance(value, np.generic):
             value = value.item()
@@ -182,6 +187,17 @@ def check_fields(instance: object, **expected: Any) -> None:
             raise InvalidArgumentError(f"{name}: expected {_called(wanted)}, got {_shown(value)}")
 
 
+class _Types(dict[Any, frozenset[type]]):
+    """The types that a type, or a union of some, names: `isinstance` walks through a union."""
+
+    def __missing__(self, kind: Any) -> frozenset[type]:
+        self[kind] = frozenset(get_args(kind) or (kind,))
+        return self[kind]
+
+
+_EXACT = _Types()
+
+
 def all_of(name: str, values: object, kind: type[T], most: int = 64) -> tuple[T, ...]:
     """Return the values as a tuple if they are at most so many, and all of one kind.
 
@@ -190,12 +206,14 @@ def all_of(name: str, values: object, kind: type[T], most: int = 64) -> tuple[T,
     >>> all_of("sides", ["left", "right"], str, most=2)
     ('left', 'right')
     """
+    if values == ():
+        return ()
     if not isinstance(values, list | tuple):
         raise InvalidArgumentError(f"{name}: expected {kind.__name__}s in a tuple, got {_shown(values)}")
     if len(values) > most:
         raise InvalidArgumentError(f"{name}: expected at most {most}, got {len(values)}")
     for i, one in enumerate(values):
-        if not isinstance(one, kind):
+        if type(one) is not kind and not isinstance(one, kind):
             raise InvalidArgumentError(f"{name}[{i}]: expected {kind.__name__}, got {_shown(one)}")
     return tuple(values)
 

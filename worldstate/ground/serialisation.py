@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
+from operator import attrgetter
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -390,13 +391,16 @@ def _writer(
 ) -> Write:
     """Return the function that writes a dataclass: fields that stand as they are first, for speed."""
     stamp = {"schema": {"name": layout.schema, "version": layout.version}} if layout.schema else {}
-    constants, pairs = {**stamp, **layout.constants}, [(keys[name], name) for name in (*writers, *flat)]
+    constants, names = {**stamp, **layout.constants}, (*writers, *flat)
     changed = [(keys[name], write) for name, write in writers.items() if write is not _as_is]
+    # All at once, and never one alone, of which it would give no tuple.
+    written, values_of = [keys[name] for name in names], attrgetter(*names, *names[:1]) if names else None
 
     def write(value: Any) -> dict[str, Any]:
-        record = constants | {key: getattr(value, name) for key, name in pairs}
+        record = constants | (dict(zip(written, values_of(value), strict=False)) if values_of else {})
         for key, write_value in changed:
-            record[key] = write_value(record[key])
+            if record[key] is not None:
+                record[key] = write_value(record[key])
         for name, (write_flat, _) in flat.items():
             record |= write_flat(record.pop(name))
         return record

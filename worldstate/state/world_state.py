@@ -1,7 +1,7 @@
 """The snapshot S_t."""
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
@@ -10,6 +10,7 @@ from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout, decode, decode_json, encode
+from worldstate.ground.values import replaced
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
@@ -228,11 +229,11 @@ def judged(state: WorldState) -> WorldState:
     reasons = why_not(state)
     cues = tuple(
         # Of a side that no source distinguishes nothing was measured.
-        replace(cue, usable=not why, why_not=why)
+        replaced(cue, usable=not why, why_not=why)
         for cue in state.cues
         for why in [reasons or (() if cue.evidence else ("uncalibrated",))]
     )
-    return replace(state, cues=cues, calibrated=_NO_BUDGET.isdisjoint(reasons))
+    return replaced(state, cues=cues, calibrated=_NO_BUDGET.isdisjoint(reasons))
 
 
 def is_former(value: object) -> bool:
@@ -258,8 +259,8 @@ def _upgraded(value: Any) -> WorldState:
     state = decode(WorldState, value | {"schema": schema, "cues": cues}, "snapshot")
     # `calibrated` was false while nothing was heard, or the budget was broken, even if one was measured.
     stated = state.budget is not None or any(cue.alpha is not None for cue in state.cues)
-    lost = not _NO_BUDGET.isdisjoint(why_not(replace(state, calibrated=True)))
-    return judged(replace(state, calibrated=state.calibrated or (stated and lost)))
+    lost = not _NO_BUDGET.isdisjoint(why_not(replaced(state, calibrated=True)))
+    return judged(replaced(state, calibrated=state.calibrated or (stated and lost)))
 
 
 def snapshot_schema() -> dict[str, Any]:
