@@ -15,7 +15,6 @@ signal where the log-odds of signals over all that is foreign exceed a second th
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import accumulate
 from math import exp
 from typing import ClassVar, TypeAlias
 
@@ -170,9 +169,12 @@ def likeliest(shares: Iterable[tuple[str, float]], mass: float) -> frozenset[str
     >>> sorted(likeliest((("car", 0.7), ("truck", 0.1), ("van", 0.2)), mass=0.85))
     ['car', 'van']
     """
-    ranked = sorted(shares, key=lambda one: -one[1])
-    before = accumulate((share for _, share in ranked), initial=0.0)
-    return frozenset(name for (name, _), total in zip(ranked, before, strict=False) if total < mass)
+    found, total = set[str](), 0.0
+    for share, name in sorted([(-share, name) for name, share in shares]):
+        if total < mass:
+            found |= {name}
+        total -= share
+    return frozenset(found)
 
 
 @dataclass(frozen=True, slots=True)

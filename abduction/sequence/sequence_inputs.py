@@ -8,6 +8,7 @@ model serves both. Where less than that was heard, the oldest hop stands in.
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import mean, part_means
 
 _SECOND = 10  # hops
 _HALF, _TWO, _THREE = _SECOND // 2, 2 * _SECOND, _SECOND + 2 * _SECOND
@@ -124,15 +125,14 @@ def hop_columns(
     refused = ~np.isfinite(looming_hz)
     single = [
         visible,
-        np.log(np.asarray(feature, np.float64)).mean(axis=1),
-        energy.mean(axis=1),
+        mean(np.log(np.asarray(feature, np.float64)), 1),
+        mean(energy, 1),
         np.log(prominence),
         np.where(refused, 0.0, looming_hz),
         np.where(refused, _UNKNOWN_HZ, np.minimum(looming_std_hz, _UNKNOWN_HZ)),
         np.where(np.isfinite(bearing_rad), bearing_rad, 0.0),
     ]
-    bands = [part.mean(axis=1) for part in np.array_split(energy, BANDS, axis=1)]
-    return np.concatenate([sides, np.stack([*single, *bands], axis=1)], axis=1)
+    return np.concatenate([sides, np.array(single).T, part_means(energy, BANDS)], axis=1)
 
 
 def streets_own(columns: FloatArray) -> FloatArray:
@@ -166,24 +166,36 @@ def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
 
     def bands(hops: int) -> FloatArray:
         at = before(hops)
-        return np.asarray(recent[max(at - _BAND_HOPS, 0) : at + 1, _BAND_COLUMNS].mean(axis=0))
+        return np.asarray(mean(recent[max(at - _BAND_HOPS, 0) : at + 1, _BAND_COLUMNS], 0))
 
-    now, second, two, three = (recent[before(hops)] for hops in (0, _SECOND, _TWO, _THREE))
+    now, second, two, three = [recent[before(hops)] for hops in (0, _SECOND, _TWO, _THREE)]
     last_second, this_bands = recent[-1 - _SECOND :], bands(0)
     swing, spread = last_second[:, _BEARING], now[_SPREAD]
-    mean_1s, mean_3s = (rows[:, : len(SIDES)].mean(axis=0) for rows in (last_second, recent))
-    usual = [_ranked(minute[:, :_LEVELS], QUIET_SHARE), _ranked(minute[:, _LEVELS:], USUAL_SHARE)]
-    usual_bands, usual_rest = np.split(np.concatenate(usual), [BANDS])
+    mean_1s, mean_3s = [mean(rows[:, : len(SIDES)], 0) for rows in (last_second, recent)]
+    usual_levels, usual_evidence = [
+        _ranked(minute[:, :_LEVELS], QUIET_SHARE),
+        _ranked(minute[:, _LEVELS:], USUAL_SHARE),
+    ]
+    usual_bands, usual_rest = usual_levels[:BANDS], np.concatenate([usual_levels[BANDS:], usual_evidence])
     rest = [now[_PROMINENCE], second[_PROMINENCE], now[_RATE] / spread, np.log(spread)]
-    rest += [now[_BEARING], now[_BEARING] - second[_BEARING], swing.max() + (-swing).max()]
+    rest += [
+        now[_BEARING],
+        now[_BEARING] - second[_BEARING],
+        np.maximum.reduce(swing) - np.minimum.reduce(swing),
+    ]
     parts = [now[:_HIGHEST], now[_OWN[BANDS:]] - usual_rest]
     parts += [(now - one)[:_CHANGING] for one in (second, two)]
-    parts += [(second - three)[: len(SIDES)], recent[:, :_HIGHEST].max(axis=0), np.array(rest), mean_3s]
+    parts += [
+        (second - three)[: len(SIDES)],
+        np.maximum.reduce(recent[:, :_HIGHEST]),
+        np.array(rest),
+        mean_3s,
+    ]
     parts += [side[:1] - side[1:2] for side in (now, mean_1s, mean_3s)]
     parts += [this_bands - one for one in (usual_bands, bands(_SECOND), bands(_TWO))]
     every = np.concatenate([*parts, *_remembered(whole)])
-    left, right = (every[order] for order in _ORDER)
-    return np.stack([left, right * _MIRRORED])[None]
+    left, right = [every[order] for order in _ORDER]
+    return np.array([[left, right * _MIRRORED]])
 
 
 def _remembered(whole: FloatArray) -> list[FloatArray]:
@@ -199,7 +211,7 @@ def _remembered(whole: FloatArray) -> list[FloatArray]:
     recent, half = before(0), before(_HALF)
     followed = whole[:, _FOLLOWED]
     at, now, lean = followed.argmax(axis=0), followed[-1], followed[:, 1] - followed[:, 2]
-    highest, dip = followed[at, _EACH], followed[at[0] :].min(axis=0)
+    highest, dip = followed[at, _EACH], np.minimum.reduce(followed[at[0] :])
     level = recent[_LOUDNESS]
     return [
         (recent - half)[_CHANGED],
@@ -216,4 +228,6 @@ def _remembered(whole: FloatArray) -> list[FloatArray]:
 def _ranked(values: FloatArray, share: float) -> FloatArray:
     """Return the value of each column that a share of its rows stays below."""
     rank = int(share * (len(values) - 1))
-    return np.asarray(np.partition(values, rank, axis=0)[rank])
+    ordered = values.copy()
+    ordered.partition(rank, axis=0)
+    return np.asarray(ordered[rank])

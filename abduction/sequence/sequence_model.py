@@ -374,6 +374,6 @@ class SequenceModel:
     def of_inputs(self, inputs: FloatArray) -> SequencePosterior:
         """Return what is believed by rows of inputs, shape (n, 2, inputs)."""
         scores = self.trees.scores(inputs.reshape(-1, inputs.shape[-1]))
-        exponent = np.exp(scores - scores.max(axis=1, keepdims=True))
-        groups = exponent / exponent.sum(axis=1, keepdims=True)
+        exponent = np.exp(scores - np.maximum.reduce(scores, 1)[:, None])
+        groups = exponent / np.add.reduce(exponent, 1)[:, None]
         return SequencePosterior(groups.reshape(-1, len(SIDES), len(GROUPS)), self.margin_s)

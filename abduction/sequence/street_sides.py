@@ -17,6 +17,7 @@ import numpy as np
 
 from worldstate.ground import TINY, FloatArray, InvalidArgumentError
 from worldstate.ground.checks import freeze_arrays
+from worldstate.ground.values import mean, part_means
 
 from .sequence_inputs import RECENT_HOPS, SIDES
 from .sequence_model import COMING_S, GROUPS
@@ -38,13 +39,13 @@ def arrival_pattern(feature: FloatArray) -> FloatArray:
     ((1, 12), 0.0)
     """
     level = np.log(np.asarray(feature, np.float64))
-    sectors = np.stack([part.mean(axis=-1) for part in np.array_split(level, SECTORS, axis=-1)], axis=-1)
-    return np.asarray(sectors - sectors.mean(axis=-1, keepdims=True))
+    sectors = part_means(level, SECTORS)
+    return np.asarray(sectors - mean(sectors, -1)[..., None])
 
 
 def coming_probability(groups: FloatArray) -> FloatArray:
     """Return the probability that a vehicle comes, shape (...,) of posteriors (..., 2, groups)."""
-    return np.asarray((groups[..., :_COMING].sum(axis=-1) + groups[..., _OTHER]).mean(axis=-1))
+    return np.asarray(mean(np.add.reduce(groups[..., :_COMING], -1) + groups[..., _OTHER], -1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +193,7 @@ class StreetHearing:
     since: tuple[int, int] = (HEARD_HOPS, HEARD_HOPS)  # Hops since a vehicle came out of either arm
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "recent", np.reshape(self.recent, (-1, SECTORS + 1)))
+        object.__setattr__(self, "recent", np.asarray(self.recent).reshape(-1, SECTORS + 1))
         freeze_arrays(self, recent=(None, SECTORS + 1))
         if len(self.recent) > HEARD_HOPS:
             raise InvalidArgumentError(f"recent: expected at most {HEARD_HOPS} hops, got {len(self.recent)}")
@@ -222,9 +223,10 @@ class StreetListener:
 
         Shapes: groups (2, groups), feature (azimuths,), positive.
         """
-        before, now = self.hearing, np.append(arrival_pattern(feature[None])[0], coming_probability(groups))
-        left, right = (min(one + 1, HEARD_HOPS) for one in before.since)
-        recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now[None]])
+        before, comes = self.hearing, coming_probability(groups)
+        now = np.concatenate([arrival_pattern(feature[None]), comes[None, None]], axis=1)
+        left, right = [min(one + 1, HEARD_HOPS) for one in before.since]
+        recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now])
         self.hearing = StreetHearing(before.known, recent, (left, right))
         # So long after a vehicle came into view its sound, from wherever it is now, is of no arm.
         if self._sides is None or min(left, right) < HEARD_HOPS:

@@ -12,6 +12,7 @@ are their own mirror images: see `window_classes`.
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import pairwise
 from typing import ClassVar
 
@@ -22,6 +23,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
 from worldstate.ground.checks import check_shape, freeze_arrays, in_range, one_of
 from worldstate.ground.serialisation import ADDED, Layout
+from worldstate.ground.values import mean, median
 
 from . import window_classes
 from .published_signature import ModelDomain, SignatureModel
@@ -98,28 +100,41 @@ def shape_features(levels: FloatArray) -> FloatArray:
     # Mirroring the directions exchanges the sides and changes the sign of what points to one.
     stretches = levels.reshape(len(levels), SEGMENTS, -1)
     first, last = stretches[:, 0], stretches[:, -1]
-    change, peak = last - first, last.max(axis=1) - first.max(axis=1)
-    changes = [change.max(axis=1), change.min(axis=1), change.mean(axis=1), peak, change.std(axis=1)]
-    by_segment = np.stack(_columns(stretches), axis=2).reshape(len(levels), -1)
-    return np.concatenate([by_segment, np.stack(changes, axis=1)], axis=1)
+    change, highest = last - first, np.maximum.reduce
+    peak, lowest = highest(last, 1) - highest(first, 1), np.minimum.reduce(change, 1)
+    changes = np.array([highest(change, 1), lowest, mean(change, 1), peak, _std(change)])
+    by_segment = np.array(_columns(stretches)).transpose(1, 2, 0).reshape(len(levels), -1)
+    return np.concatenate([by_segment, changes.T], axis=1)
+
+
+def _std(values: FloatArray) -> FloatArray:
+    """Return the standard deviation over the last axis."""
+    around = values - mean(values, -1)[..., None]
+    return np.asarray(np.sqrt(mean(around * around, -1)))
 
 
 def _columns(levels: FloatArray) -> list[FloatArray]:
     """Numbers of each stretch, every one of shape (n, segments)."""
     n_directions = levels.shape[2]
-    peak, middle = levels.max(axis=2), np.median(levels, axis=2)
+    highest, total = np.maximum.reduce, np.add.reduce
+    peak, middle = highest(levels, 2), median(levels)
     third = n_directions // _PARTS
     ends = [0, third, n_directions - third, n_directions]
-    first, centre, last = (levels[:, :, a:b].max(axis=2) for a, b in pairwise(ends))
-    direction = np.linspace(-1.0, 1.0, n_directions)
+    first, centre, last = [highest(levels[:, :, a:b], 2) for a, b in pairwise(ends)]
+    direction = _directions(n_directions)
     weights = np.exp(_SHARPNESS * (levels - peak[..., None]))
-    weights /= weights.sum(axis=2, keepdims=True)
+    weights /= total(weights, 2)[..., None]
     # Sums, not products of matrices: a row then comes out to the bit the same among whatever others.
-    position, square = (weights * direction).sum(axis=2), (weights * direction**2).sum(axis=2)
+    position, square = total(weights * direction, 2), total(weights * direction**2, 2)
     width = np.sqrt(np.maximum(square - position**2, 0.0))
-    heights = [peak, middle, levels.min(axis=2), peak - middle]
+    heights = [peak, middle, np.minimum.reduce(levels, 2), peak - middle]
     sides = [first, centre, last, first - last, position, np.abs(position)]
-    return [*heights, *sides, levels.std(axis=2), width, np.diff(levels, axis=2).std(axis=2)]
+    return [*heights, *sides, _std(levels), width, _std(levels[..., 1:] - levels[..., :-1])]
+
+
+@lru_cache
+def _directions(count: int) -> FloatArray:
+    return np.linspace(-1.0, 1.0, count)
 
 
 SHAPE, SHAPE_CHANGE = "shape", "shape_change"
@@ -171,7 +186,8 @@ def expert_views(levels: FloatArray, reference: FloatArray) -> dict[str, FloatAr
 
     Shapes: levels (n, features), reference (n, 3 * features).
     """
-    summaries = dict(zip(KINDS, np.split(reference, len(KINDS), axis=1), strict=True))
+    n = levels.shape[1]
+    summaries = {kind: reference[:, n * k : n * (k + 1)] for k, kind in enumerate(KINDS)}
     views = {kind: levels - summary for kind, summary in summaries.items()}
     # One call for both: of a single window most of it is what calls cost.
     shapes = shape_features(np.concatenate([levels, summaries["median"]]))
@@ -186,7 +202,7 @@ def log_softmax(sums: FloatArray) -> FloatArray:
 
     Shapes: sums (n, classes).
     """
-    below = sums - sums.max(axis=1, keepdims=True)
+    below = sums - np.maximum.reduce(sums, 1)[:, None]
     return np.asarray(below - np.log(total(np.exp(below))))
 
 
@@ -202,7 +218,9 @@ def total(values: FloatArray) -> FloatArray:
     >>> total(np.array([[1.0, 2.0, 3.0]]))
     array([[6.]])
     """
-    return np.asarray(np.sort(values, axis=1).sum(axis=1, keepdims=True))
+    ordered = values.copy()
+    ordered.sort()
+    return np.asarray(np.add.reduce(ordered, 1)[:, None])
 
 
 def split_reference(X: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -343,8 +361,8 @@ class EnsembleModel:
         both = log_softmax(np.concatenate(sums)).reshape(len(told), 2, n, -1)
         # Added to each other first: the sum of two does not depend on which is the mirror image.
         pairs = both[:, 0] + both[:, 1][..., window_classes.mirrored_classes(len(self.classes))]
-        mean = log_softmax(pairs.sum(axis=0) / (2 * len(told)))
-        shares = np.maximum(np.exp(mean), window_classes.SMALLEST_PROBABILITY)
+        pooled = log_softmax(np.add.reduce(pairs) / (2 * len(told)))
+        shares = np.maximum(np.exp(pooled), window_classes.SMALLEST_PROBABILITY)
         return np.asarray(shares / total(shares))
 
     def explain(self, X: ArrayLike) -> FloatArray:

@@ -28,6 +28,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
 from worldstate.ground.serialisation import Check
+from worldstate.ground.values import mean
 
 from .ensemble import KINDS, EnsembleModel, log_levels
 from .window_classes import window_evidence
@@ -147,9 +148,10 @@ class SiteEstimate:
         if not self.heard_s:
             return home
         difference = self.level - empty
-        level = difference.mean()
+        level = mean(difference)
         offset = _LEVEL_GAIN * level + (difference - level)
-        return np.asarray(home + np.tile(self.heard_s / (self.heard_s + prior_s) * offset, len(KINDS)))
+        moved = self.heard_s / (self.heard_s + prior_s) * offset
+        return np.asarray(home + np.concatenate([moved] * len(KINDS)))
 
 
 class SiteSignature:
