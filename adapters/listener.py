@@ -393,7 +393,10 @@ class Listener:
                 self.world = self.world.update(other)
                 self._speed_mps = other.speed_mps if isinstance(other, Odometry) else self._speed_mps
             measurement = self._adapter.interpret(frame, self._outside())
-            self.world = self.world.predict_to(measurement.stamp_ns).update(measurement)
+            # After a long loss the belief is carried there first: what is far ahead of it is held back.
+            if measurement.stamp_ns - self.world.stamp_ns > LAG_NS:
+                self.world = self.world.predict_to(measurement.stamp_ns)
+            self.world = self.world.update(measurement)
             if isinstance(reader, SequenceReader):
                 learn_passes(reader.street, self.world.state)
             yield Step(frame, measurement, self._learned())

@@ -315,7 +315,7 @@ class FrontEnd:
         if energy <= _LOUDEST**2:
             return samples
         # Written so that NaN, for which every comparison is false, is refused.
-        if loud := np.flatnonzero(~(np.abs(samples).max(axis=0) <= _LOUDEST)).tolist():
+        if loud := (~(np.abs(samples).max(axis=0) <= _LOUDEST)).nonzero()[0].tolist():
             problem = f"expected finite numbers up to {_LOUDEST:g}, got others in channels {loud}"
             raise InvalidArgumentError(f"block: {problem}")
         return samples

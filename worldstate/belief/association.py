@@ -203,7 +203,7 @@ def _log_ratios(
     density = _azimuth_density(tracks, detected, detections, site)
     if detections.in_sight and not detected.all():
         # What was only heard is found where it comes into view.
-        heard = np.flatnonzero(~detected)
+        heard = (~detected).nonzero()[0]
         hidden = tracks.taken(heard).rows()
         density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), TINY))
         reached = np.array([reached_edge(one, site) for one in hidden])
@@ -242,7 +242,7 @@ def _alike(tracks: Tracks, detected: BoolArray, detections: Detections, site: Si
     others = own + 2.0 * site.street.size_spread**2
     squares = (logs[0][:, None] - logs[1]) ** 2
     alike += np.where(known, 0.5 * (math.log(others / own) - squares * (1.0 / own - 1.0 / others)), 0.0)
-    for i in np.flatnonzero(~detected).tolist():
+    for i in (~detected).nonzero()[0].tolist():
         labels, seen_as = tracks.labels[i], (shares[0][0] for shares in detections.classes)
         classes = [math.log(_shared_class(labels, label, site.street.misread)) for label in seen_as]
         alike[:, i] = np.where(moving[:, 0], classes, FORBIDDEN)

@@ -174,7 +174,7 @@ def announced(tracks: Tracks, site: SiteGeometry) -> tuple[float, ...]:
     """Return for each side the probability that a hidden entity with a place comes into view, shape (K,)."""
     hidden, chances = tracks.placed & ~tracks.seen & tracks.moving, [0.0] * len(site.sides)
     for k in set(tracks.side[hidden].tolist()):
-        rows = np.flatnonzero(hidden & (tracks.side == k))
+        rows = (hidden & (tracks.side == k)).nonzero()[0]
         places = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
         comes, _ = time_to_visible(places, site.sides[k], site)
         chances[k] = float((tracks.existence[rows] * tracks.behind[rows] * comes).max())

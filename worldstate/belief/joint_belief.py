@@ -19,6 +19,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, reduce
+from itertools import product
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from worldstate.abduction.sequence.markov_chain import balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
 from worldstate.ground import TINY, FloatArray, seconds
-from worldstate.ground.values import replaced
+from worldstate.ground.values import mean, replaced
 
 from .street_model import StreetModel
 
@@ -37,6 +38,7 @@ NONE, DISTANT, FIRST_BIN = 0, 1, 2
 PARTS = FIRST_BIN + BINS
 STATES = 2 * PARTS  # Of a side: hidden part, then whether one from there is in view
 COMES = np.arange(PARTS) >= FIRST_BIN
+_COMES_OF = {n: np.ix_(*[COMES.astype(int)] * n) for n in (1, 2)}  # Of so many sides that a reading is about
 _GROUP = {name: k for k, name in enumerate(GROUPS)}
 _SEEN, _OTHER = _GROUP["seen"], _GROUP["other"]
 _DISTANT = [_GROUP["rising"], _GROUP["falling"]]
@@ -115,7 +117,7 @@ class StreetPrior:
 
     def carry(self, every: Sequence[FloatArray], street: StreetModel, step_ns: int) -> FloatArray:
         """Return some distributions a step later, in their order."""
-        weights = np.stack(every, axis=-1)
+        weights = np.array(every).transpose(*range(1, every[0].ndim + 1), 0)
         for chain in chains(self, street, step_ns):
             # The axis in front goes to the end, so that at last the order is the same, but many in front.
             weights = weights.reshape(len(chain), -1).T @ chain
@@ -154,7 +156,7 @@ def _by_part(weights: FloatArray) -> FloatArray:
     split = weights.reshape(*[PARTS, 2] * sides, 2)
     by_part = np.empty((*[PARTS] * sides, 2))
     by_part[..., 0] = split[_clear(sides)]
-    every = split.sum(axis=(*range(1, 2 * sides, 2), 2 * sides))
+    every = np.add.reduce(split, (*range(1, 2 * sides, 2), 2 * sides))
     np.maximum(every - by_part[..., 0], 0.0, out=by_part[..., 1])
     return by_part
 
@@ -167,7 +169,7 @@ def _spread(by_part: FloatArray) -> FloatArray:
     sides = by_part.ndim - 1
     # In C order, as a checkpoint is read: sums over another order differ in their last bit.
     every = np.empty((*[PARTS, 2] * sides, 2))
-    every[:] = np.expand_dims(by_part[..., 1], (*range(1, 2 * sides, 2), 2 * sides))
+    every[:] = by_part[..., 1].reshape(*[one for n in by_part.shape[:-1] for one in (n, 1)], 1)
     every[_clear(sides)] = by_part[..., 0]
     return every.reshape(*[STATES] * sides, 2)
 
@@ -199,31 +201,33 @@ def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> 
     Shapes: groups (sides, groups).
     """
     coming, other = groups[:, :BINS], groups[:, _OTHER] * (len(groups) > 1)
-    every = np.minimum(coming.sum(axis=1), 1.0 - TINY)
-    rest = np.maximum(groups[:, BINS:].sum(axis=1) - other, TINY)
-    distant = np.minimum(groups[:, _DISTANT].sum(axis=1) / rest, 1.0)
-    seen = min(float((groups[:, _SEEN] / rest).mean()), 1.0)
+    every = np.minimum(np.add.reduce(coming, 1), 1.0 - TINY)
+    rest = np.maximum(np.add.reduce(groups[:, BINS:], 1) - other, TINY)
+    distant = np.minimum(np.add.reduce(groups[:, _DISTANT], 1) / rest, 1.0)
+    seen = min(float(mean(groups[:, _SEEN] / rest)), 1.0)
     behind = min((1.0 - by_sound) * usual_in_view + by_sound * seen, seen)
     # Of every side the hidden parts, given whether a vehicle comes there.
-    parts = np.column_stack([1.0 - distant, distant, coming / np.maximum(every, TINY)[:, None]])
+    far_or_not = np.array([1.0 - distant, distant]).T
+    parts = np.concatenate([far_or_not, coming / np.maximum(every, TINY)[:, None]], axis=1)
     comes = every.tolist()
     if len(groups) == 1:
         none, chances = 1.0 - comes[0], np.array([0.0, comes[0]])
     else:
-        none = float((1.0 - every - other).mean())
-        none = min(max(none, 1.0 - float(every.sum()), 0.0), 1.0 - max(comes))
-        both = max(float(every.sum()) - (1.0 - none), 0.0)
+        some = sum(comes)
+        none = float(mean(1.0 - every - other))
+        none = min(max(none, 1.0 - some, 0.0), 1.0 - max(comes))
+        both = max(some - (1.0 - none), 0.0)
         chances = np.array([[0.0, comes[1] - both], [comes[0] - both, both]])
-    beside = chances[np.ix_(*[COMES.astype(int)] * len(groups))] * reduce(np.multiply.outer, parts)
+    beside = chances[_COMES_OF[len(groups)]] * reduce(np.multiply.outer, parts)
     joint = np.multiply.outer(beside, (1.0 - behind, behind))
     # If none comes: what is in view is all that is heard, and what is far off is as few as explain it.
     far = np.minimum(distant / max(1.0 - seen, TINY), 1.0).tolist()
-    for heard in np.ndindex(*[2] * len(groups)):
-        on, off = ([one for one, is_far in zip(far, heard, strict=True) if is_far == k] for k in (1, 0))
+    for heard in product((0, 1), repeat=len(groups)):
+        on, off = [[one for one, is_far in zip(far, heard, strict=True) if is_far == k] for k in (1, 0)]
         joint[(*heard, 0)] = none * ((1.0 - seen) * max(min(on, default=1.0) - max(off, default=0.0), 0.0))
     joint[(*[NONE] * len(groups), 1)] = none * seen
     joint = np.maximum(joint, TINY)
-    return np.asarray(joint / joint.sum())
+    return _normed(joint)
 
 
 def window_likelihoods(
@@ -298,7 +302,7 @@ class JointBelief:
     def times(self, evidence: FloatArray) -> "JointBelief":
         """Return the belief after evidence, a likelihood of every state."""
         weights = self.weights * evidence
-        total = weights.sum()
+        total = np.add.reduce(weights, None)
         trust = {name: replaced(one, works=one.works * evidence / total) for name, one in self.trust.items()}
         return JointBelief(weights / total, self.alone, trust)
 
@@ -325,15 +329,17 @@ class JointBelief:
         before = self.alone.get(source)
         if before is None:
             before, share = prior.weights, 1.0
-        others = tuple(k for k in range(self.sides) if k not in sides)
-        expected = np.maximum(_by_part(before).sum(axis=others), TINY)
+        others = tuple([k for k in range(self.sides) if k not in sides])
+        expected = np.maximum(np.add.reduce(_by_part(before), others), TINY)
         ratio, none = reading / expected, (slice(FIRST_BIN),) * len(sides)
         if heard < 1.0:
-            quiet = reading[none].sum() / expected[none].sum()
+            quiet = np.add.reduce(reading[none], None) / np.add.reduce(expected[none], None)
             mixed = heard * ratio + (1.0 - heard) * quiet
             mixed[none] = ratio[none]
-            ratio = mixed / (mixed * expected).sum()
-        every = _spread(np.expand_dims(ratio**share, others))
+            ratio = mixed / np.add.reduce(mixed * expected, None)
+        for axis in others:
+            ratio = np.expand_dims(ratio, axis)
+        every = _spread(ratio**share)
         return replaced(self.times(every), alone=self.alone | {source: _normed(before * every)})
 
     def told(self, by_part: FloatArray) -> "JointBelief":
@@ -421,19 +427,20 @@ class JointBelief:
     @cached_property
     def hidden(self) -> FloatArray:
         """Marginals of the hidden parts, shape (sides, parts)."""
-        every, sides = self.by_part.sum(axis=-1), range(self.sides)
-        return np.stack([every.sum(axis=tuple(j for j in sides if j != k)) for k in sides])
+        every, sides = np.add.reduce(self.by_part, -1), range(self.sides)
+        return np.array([np.add.reduce(every, tuple([j for j in sides if j != k])) for k in sides])
 
     @cached_property
     def emerged_from(self) -> FloatArray:
         """P(one from a side is in view, and none comes there), shape (sides,)."""
-        axes = [tuple(j for j in range(self.sides + 1) if j != k) for k in range(self.sides)]
-        return np.array([self.weights.sum(axis=one)[1 : 2 * FIRST_BIN : 2].sum() for one in axes])
+        axes = [tuple([j for j in range(self.sides + 1) if j != k]) for k in range(self.sides)]
+        marginals = [np.add.reduce(self.weights, one) for one in axes]
+        return np.array([np.add.reduce(one[1 : 2 * FIRST_BIN : 2]) for one in marginals])
 
     @property
     def in_view(self) -> float:
         """P(anything is in view)."""
-        return float(self.by_part[..., 1].sum())
+        return float(np.add.reduce(self.by_part[..., 1], None))
 
     @cached_property
     def explanations(self) -> tuple[float, float, float]:
@@ -445,8 +452,8 @@ class JointBelief:
     @cached_property
     def none_comes(self) -> float:
         """P(no vehicle comes into view from any side within eight seconds)."""
-        return float(self.by_part[(slice(FIRST_BIN),) * self.sides].sum())
+        return float(np.add.reduce(self.by_part[(slice(FIRST_BIN),) * self.sides], None))
 
 
 def _normed(weights: FloatArray) -> FloatArray:
-    return np.asarray(weights / weights.sum())
+    return np.asarray(weights / np.add.reduce(weights, None))

@@ -4,8 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from worldstate.ground.values import replaced
 
 
@@ -44,9 +42,11 @@ class SideBelief:
 
     def side_shares(self, least: float) -> tuple[float, ...]:
         """Return P(side | one vehicle of unknown side exists), zero below the least, shape (K,)."""
-        shares = np.array([self.existence(side) for side in range(len(self.hidden))])
-        shares = np.where(shares >= least * shares.sum(), shares, 0.0)
-        return tuple((shares / shares.sum()).tolist())
+        shares = [self.existence(side) for side in range(len(self.hidden))]
+        total = sum(shares)
+        shares = [share if share >= least * total else 0.0 for share in shares]
+        total = sum(shares)
+        return tuple([share / total for share in shares])
 
     def beside(self, nothing: float) -> "SideBelief":
         r"""Return the belief if no vehicle is in view with a probability e.

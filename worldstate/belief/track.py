@@ -121,11 +121,14 @@ class Tracks:
 
     def rows(self) -> tuple[Track, ...]:
         """Return the entities one by one."""
-        columns = {name: getattr(self, name).tolist() for name in _COLUMNS}
+        lists = [column.tolist() for column in _COLUMNS_OF(self)]
+        columns: dict[str, list[Any]] = dict(zip(_COLUMNS, lists, strict=True))
         columns["last_seen_ns"] = [None if ns == NEVER_NS else ns for ns in columns["last_seen_ns"]]
-        columns["miss_rate"] = [None if math.isnan(rate) else rate for rate in columns["miss_rate"]]
-        columns["motion"], columns["place"] = self.motion.each(), list(map(self.place, range(len(self))))
-        return tuple(starmap(Track, zip(*(columns[name] for name in Track.__slots__), strict=True)))
+        columns["miss_rate"] = [None if rate != rate else rate for rate in columns["miss_rate"]]  # NaN
+        columns["motion"], columns["place"] = self.motion.each(), [None] * len(lists[0])
+        for row in self.placed.nonzero()[0].tolist():
+            columns["place"][row] = self.place(row)
+        return tuple(starmap(Track, zip(*[columns[name] for name in Track.__slots__], strict=True)))
 
     def row(self, number: int) -> Track:
         """Return one of the entities by itself."""
@@ -133,7 +136,7 @@ class Tracks:
 
     def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":
         """Return the columns of some of them."""
-        return Tracks(*(column[where] for column in vars(self).values()))
+        return Tracks(*[column[where] for column in vars(self).values()])
 
     def without(self, rows: Sequence[int]) -> "Tracks":
         """Return the columns of all others."""
@@ -148,7 +151,7 @@ class Tracks:
 
     def draft(self) -> "Tracks":
         """Return a copy that a step may write into."""
-        return Tracks(*(column.copy() for column in vars(self).values()))
+        return Tracks(*[column.copy() for column in vars(self).values()])
 
     @property
     def motion(self) -> MotionBelief:
@@ -182,6 +185,7 @@ _BELIEFS = ("mean", "covariance", "placed", "place_mean", "place_covariance")
 _UNKNOWN = {"last_seen_ns": NEVER_NS, "miss_rate": math.nan}  # What columns hold for None
 _KINDS: dict[Any, Any] = {Objects: object, BoolArray: bool, IntArray: np.int64, FloatArray: float}
 _COLUMNS = {name: _KINDS[hint] for name, hint in get_type_hints(Tracks).items() if name not in _BELIEFS}
+_COLUMNS_OF = attrgetter(*_COLUMNS)
 _NOWHERE = CartesianBelief(np.zeros_like(IN_VIEW.mean), np.zeros_like(IN_VIEW.covariance))
 
 
@@ -215,7 +219,7 @@ def predict_tracks(tracks: Tracks, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
     tracks.existence[tracks.seen] *= math.exp(-step_s / site.street.unseen_s)
     if tracks.placed.any():
-        _drive_on(tracks, np.flatnonzero(tracks.placed), step_s, site)
+        _drive_on(tracks, tracks.placed.nonzero()[0], step_s, site)
     polar = ~tracks.placed  # Those that have just lost their place, too
     if polar.any():
         # All of them are read and written where they stand.
@@ -268,7 +272,7 @@ def follow_places(tracks: Tracks, site: SiteGeometry) -> None:
     """Give tracks the polar motion that follows from their places."""
     if not tracks.placed.any():
         return
-    rows = np.flatnonzero(tracks.placed)
+    rows = tracks.placed.nonzero()[0]
     places = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
     polar = polar_motion(places, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
     tracks.mean[rows], tracks.covariance[rows] = polar.mean, polar.covariance

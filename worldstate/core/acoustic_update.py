@@ -34,7 +34,7 @@ def acoustic_update(memory: Memory, measurement: Measurement, weight: float, sit
     """
     tracks, bearing, approach, street = memory.tracks, measurement.bearing, measurement.approach, site.street
     # A measured position tells more than a bearing that may be that of a wall.
-    rows = np.flatnonzero(tracks.moving & ~tracks.placed)
+    rows = (tracks.moving & ~tracks.placed).nonzero()[0]
     silent = isinstance(bearing, NotUsable) and isinstance(approach, NotUsable)
     if weight <= 0.0 or silent or not len(rows):
         return

@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping, Sequence, Set
 
-import numpy as np
-
 from worldstate.abduction.co_evidence import MOSTLY_MISSED
 from worldstate.belief.hidden_bearing import hidden_motion, motion_in_view
 from worldstate.belief.kinematics.motion import AZIMUTH, MotionBelief
@@ -89,7 +87,7 @@ def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
 
 
 def _heard_rows(tracks: Tracks) -> list[int]:
-    rows: list[int] = np.flatnonzero(~tracks.detected).tolist()
+    rows: list[int] = (~tracks.detected).nonzero()[0].tolist()
     return rows
 
 
@@ -97,7 +95,7 @@ def hidden_rows(tracks: Tracks) -> list[int]:
     """Return the rows of the hidden entities."""
     if tracks.seen.all():
         return []
-    rows: list[int] = np.flatnonzero(~tracks.seen & (~tracks.detected | (tracks.behind >= HIDDEN))).tolist()
+    rows: list[int] = (~tracks.seen & (~tracks.detected | (tracks.behind >= HIDDEN))).nonzero()[0].tolist()
     return rows
 
 

@@ -14,6 +14,7 @@ from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.belief.hidden_bearing import announced, time_to_visible
 from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.track import Track
 from worldstate.ground import TINY
 from worldstate.ground.values import replaced
 from worldstate.measurement import Measurement
@@ -87,7 +88,11 @@ class SideAlarms:
         # What drives behind the ego explains nothing of what is ahead.
         ahead = tracks.seen & tracks.moving & (np.cos(tracks.mean[:, AZIMUTH]) > 0.0)
         unseen = 1.0 - tracks.existence[ahead] * (1.0 - tracks.behind[ahead])
-        return sides.at_least(self._announced).beside(float(unseen.prod()))
+        return sides.at_least(self._announced).beside(float(np.multiply.reduce(unseen)))
+
+    @cached_property
+    def _tracks(self) -> tuple[Track, ...]:
+        return self.memory.tracks.rows()
 
     @cached_property
     def _announced(self) -> tuple[float, ...]:
@@ -98,9 +103,10 @@ class SideAlarms:
         """Log-odds that an announced road user comes into view, and when that ends without news, by side."""
         memory, tracks = self.memory, self.memory.tracks
         placed, long_ago_ns = tracks.placed & ~tracks.seen, memory.stamp_ns - 2 * NEWS_HOLDS_NS
-        updated_ns = (tracks.updated_ns[placed & (tracks.side == k)] for k in range(len(memory.history)))
-        ends_ns = [int(ns.max(initial=long_ago_ns)) + NEWS_HOLDS_NS for ns in updated_ns]
-        return list(zip(map(bounded_log_odds, self._announced), ends_ns, strict=True))
+        updated_ns = [tracks.updated_ns[placed & (tracks.side == k)] for k in range(len(memory.history))]
+        ends_ns = [max(ns.tolist(), default=long_ago_ns) for ns in updated_ns]
+        latest_ns = [max(ns, long_ago_ns) + NEWS_HOLDS_NS for ns in ends_ns]
+        return list(zip(map(bounded_log_odds, self._announced), latest_ns, strict=True))
 
     @cached_property
     def _threshold_nats(self) -> float:
@@ -145,17 +151,17 @@ class SideAlarms:
         """Return one risk cue per side, none before the first measurement."""
         if not self.memory.counts.measurements:
             return ()
-        rested_on = tuple(one for one in sensors if one.condition != "silent")
+        rested_on = tuple([one for one in sensors if one.condition != "silent"])
         # All sides together: what is taken out of arrays once.
         pairs = zip(self._times(), self._evidence(), strict=True)
-        return tuple(self._cue(k, times, evidence, rested_on) for k, (times, evidence) in enumerate(pairs))
+        return tuple([self._cue(k, times, evidence, rested_on) for k, (times, evidence) in enumerate(pairs)])
 
     def _cue(
         self, k: int, times: _Times, evidence: EvidenceTerms, sensors: tuple[SensorHealth, ...]
     ) -> RiskCue:
         memory, site, sides, told = self.memory, self.model.site, self.sides, self.advisories[k]
         row = hidden_on(memory.tracks, k)
-        track = None if row is None else memory.tracks.row(row)
+        track = None if row is None else self._tracks[row]
         azimuth_rad, std_rad, source = hidden_azimuth(k, track, memory.belief, site)
         within, interval_s = times
         arrival_s = None
@@ -221,7 +227,7 @@ class SideAlarms:
             return [(None, None)] * len(self.advisories)
         posterior = belief.posterior
         within = posterior.within()[0].tolist()
-        soon = posterior.groups[0, :, :STATED].sum(axis=1).tolist()
+        soon = np.add.reduce(posterior.groups[0, :, :STATED], 1).tolist()
         # The times are those of a vehicle that comes: in an empty street they would say nothing.
         stated = [
             chance > (0.5 if told is None else 0.0)
@@ -244,7 +250,9 @@ class SideAlarms:
         belief, threshold = self.memory.belief, self._threshold_nats
         after = belief.log_odds(self.model.site.street)
         heard: Literal["coming", "hidden"] = "coming" if belief.has_times else "hidden"
-        terms = np.diff(list(after.values()), axis=0, prepend=0.0).T.tolist()
+        pieces = np.array(list(after.values()))
+        pieces[1:] -= pieces[:-1].copy()
+        terms = pieces.T.tolist()
         evidence = []
         for k, (own, decides) in enumerate(zip(terms, belief.decided_at(self.memory.stamp_ns), strict=True)):
             one, (nats, _) = self._raised[k], self._messages[k]

@@ -84,10 +84,15 @@ def update_looks(
     memory: Memory, measurement: Measurement, looks: Sequence[tuple[CameraLook, float]], model: FilterModel
 ) -> None:
     """Update the memory with the new looks of a measurement, all cameras at once."""
-    if looks:
+    asked, tracks = measurement.co_evidence, memory.tracks
+    unasked = [isinstance(seen.look.answer, Unqueried) and not seen.sightings for seen, _ in looks]
+    if looks and all(unasked) and isinstance(asked, Unqueried) and True not in tracks.detected:
+        # Nothing has looked, and nothing is there that a look finds: the answer alone changes.
+        tracks.answer[:], tracks.miss_rate[:] = "unqueried", math.nan
+    elif looks:
         site = model.site
         scans = [camera_scan(seen, site.view(seen.look), weight, site.street) for seen, weight in looks]
-        detection_update(memory, scans, measurement.co_evidence, measurement.stamp_ns, site)
+        detection_update(memory, scans, asked, measurement.stamp_ns, site)
 
 
 def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> None:
@@ -132,14 +137,14 @@ def detection_update(
     memory.tracks = tracks = known.joined(born)
     chances, detection = np.append(whose.chances, np.ones(len(whose.new))), np.full(len(tracks), -1)
     detection[list(whose.found)], detection[n:] = list(whose.found.values()), whose.new
-    rows, missed, was_seen = np.flatnonzero(detection >= 0), np.flatnonzero(detection < 0), tracks.seen.copy()
+    rows, missed, was_seen = (detection >= 0).nonzero()[0], (detection < 0).nonzero()[0], tracks.seen.copy()
     found = _Found(rows, detection[rows], chances[rows], detections)
     if in_sight:
         hits, existence = np.minimum(whose.pairs.T @ by_look, 1.0), tracks.existence.copy()
         existence[:n], detected = _existence(known, hits, scans, site.street)
         tracks.behind[:n] = _hidden(known, detected, chances[:n], bool(detections.positions), site.street)
         # What was only heard is found, or another one is.
-        first = np.flatnonzero((detection[:n] >= 0) & ~known.detected)
+        first = ((detection[:n] >= 0) & ~known.detected).nonzero()[0]
         another = (1.0 - chances[first]) * detections.existence[detection[first]]
         existence[first], tracks.behind[first] = chances[first] + another, 0.0
     else:
@@ -311,7 +316,7 @@ def _see(tracks: Tracks, found: _Found, scans: Sequence[Scan], stamp_ns: int, si
 
 def _hide(tracks: Tracks, site: SiteGeometry) -> None:
     """Put the tracks that a corner hides on its side; what has a place is announced there."""
-    rows = np.flatnonzero(tracks.detected & (tracks.behind >= HIDDEN))
+    rows = (tracks.detected & (tracks.behind >= HIDDEN)).nonzero()[0]
     if len(rows):
         by = occluded(tracks, site)[rows].argmax(axis=1)
         rows, by = rows[by < len(site.sides)], by[by < len(site.sides)]

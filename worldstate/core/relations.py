@@ -42,13 +42,13 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
     known_m = model.site.street.known_m
     placed = [one for one in some if one.place and one.place.position_std_m < known_m]
     if placed:
-        edges += (edge for edge in _between(placed, model.context) if edge[-1] >= _LEAST)
+        edges += [edge for edge in _between(placed, model.context) if edge[-1] >= _LEAST]
     edges += _hiding(tracks, model)
     now = {edge[:-1]: edge[-1] for edge in edges}
-    names = {*tracks.id, *(one.id for one in model.context.occluders), EGO}
+    names = {*tracks.id, *[one.id for one in model.context.occluders], EGO}
     now |= {key: 0.0 for key in before if key not in now and names.issuperset(key[:2])}
-    held = (_held(Relation(*key, chance, memory.stamp_ns), before.get(key)) for key, chance in now.items())
-    return tuple(edge for edge in held if edge.probability or edge.until_ns is not None)
+    held = [_held(Relation(*key, chance, memory.stamp_ns), before.get(key)) for key, chance in now.items()]
+    return tuple([edge for edge in held if edge.probability or edge.until_ns is not None])
 
 
 def _held(edge: Relation, before: Relation | None) -> Relation:
@@ -80,7 +80,7 @@ def _edges(track: Track, belief: StreetBelief, model: FilterModel) -> Iterator[E
 
 def _hiding(tracks: Tracks, model: FilterModel) -> Iterator[Edge]:
     """Yield which corners and entities hide those that were in view before."""
-    rows = np.flatnonzero(tracks.seen & (tracks.behind >= _LEAST))
+    rows = (tracks.seen & (tracks.behind >= _LEAST)).nonzero()[0]
     if len(rows):
         names = [*(one.id for one in model.context.occluders), *tracks.id]
         by = occluded(tracks, model.site)[rows]

@@ -56,11 +56,11 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
     now = {name: row for row, name in enumerate(tracks.id)}
     # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
     heard = [chance >= street.birth for chance in memory.sides.hidden]
-    for old in np.flatnonzero(before.placed & ~before.seen).tolist():
+    for old in (before.placed & ~before.seen).nonzero()[0].tolist():
         row, side = now[before.id[old]], int(before.side[old])
         if before.behind[old] >= 0.5 > tracks.behind[row]:
             emerged.append(side)
-        only_heard = np.flatnonzero(~tracks.detected & (tracks.side == side)).tolist()
+        only_heard = (~tracks.detected & (tracks.side == side)).nonzero()[0].tolist()
         others = set(only_heard).difference(gone)
         if row in others and (len(others) > 1 or not heard[side]):
             gone.append(row)

@@ -60,6 +60,7 @@ _BET_GROUPS = COMING_S.index(BET_S) + 1
 _TWO = 0.5  # P(both) from which on the vehicles of two sides are two
 # Parts of vehicles that come into view within three seconds.
 _SOON = COMES & (np.arange(PARTS) < FIRST_BIN + COMING_S.index(HORIZONS_S[-1]) + 1)
+_SOON_OR_NOT = np.array([_SOON, ~_SOON], float).T
 
 
 def bounded_log_odds(probability: float) -> float:
@@ -165,19 +166,19 @@ class StreetBelief:
     @cached_property
     def comes(self) -> FloatArray:
         """P(a vehicle comes into view within eight seconds), shape (K,)."""
-        return np.asarray(np.minimum(self.coming.sum(axis=1), 1.0))
+        return np.asarray(np.minimum(np.add.reduce(self.coming, 1), 1.0))
 
     @property
     def both_come(self) -> float:
         """P(vehicles come into view on two sides)."""
-        return max(float(self.comes.sum()) - (1.0 - self.joint.none_comes), 0.0)
+        return max(float(np.add.reduce(self.comes)) - (1.0 - self.joint.none_comes), 0.0)
 
     @cached_property
     def sides(self) -> SideBelief:
         """Marginals of the joint belief over sides and explanations."""
         # The last digits depend on the order of sums, and must not decide at a threshold.
         in_view = np.maximum(self.joint.emerged_from, self.shown)
-        told, emerged = (tuple(one.round(12).tolist()) for one in (self.comes, in_view))
+        told, emerged = [tuple(one.round(12).tolist()) for one in (self.comes, in_view)]
         any_comes = 1.0 - self.joint.none_comes
         return SideBelief(told, emerged, told, any_comes, self.joint.explanations, self.both_come)
 
@@ -238,13 +239,14 @@ class StreetBelief:
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
         """Return for each side when its alarm ends: a second after it was last above the threshold."""
-        ends_ns = (None if over_ns is None else over_ns + _HELD_NS + SLACK_NS for over_ns in self.over_ns)
-        return tuple(None if end_ns is None or end_ns < stamp_ns else end_ns for end_ns in ends_ns)
+        ends_ns = [None if over_ns is None else over_ns + _HELD_NS + SLACK_NS for over_ns in self.over_ns]
+        return tuple([None if end_ns is None or end_ns < stamp_ns else end_ns for end_ns in ends_ns])
 
     def watched(self, stamp_ns: int, miss_rate: float = 1.0) -> bool:
         """Tell whether a sensor has just looked that misses less than so much of what is in view."""
         looks = self.joint.trust.values()
-        return any(one.miss_rate < miss_rate and stamp_ns - one.stamp_ns <= LOOK_NS for one in looks)
+        since_ns = stamp_ns - LOOK_NS
+        return any(one.miss_rate < miss_rate and one.stamp_ns >= since_ns for one in looks)
 
     def log_odds(self, street: StreetModel) -> dict[str, FloatArray]:
         """Return the log-odds of what the alarm goes by, shape (K,), after each piece of evidence.
@@ -266,7 +268,7 @@ class StreetBelief:
 
     def _log_odds(self, joint: JointBelief) -> FloatArray:
         if self.has_times:
-            soon, rest = (np.maximum(joint.hidden @ of, TINY) for of in (_SOON, ~_SOON))
+            soon, rest = np.maximum(joint.hidden @ _SOON_OR_NOT, TINY).T
             return np.asarray(np.log(soon / rest))
         return np.full(self.k, bounded_log_odds(1.0 - joint.none_comes))
 
@@ -277,8 +279,8 @@ def _usual(context: Context, share: FloatArray | None) -> FloatArray:
     It is that of the context's priors, or else of a sequence model, once one was read (`share`), or of the
     context's rates.
     """
-    given, hides = context.hidden_by_side or {}, tuple(one.hides for one in context.occluders)
-    of_sides = tuple(given.get(side) for side in context.directions)
+    given, hides = context.hidden_by_side or {}, tuple([one.hides for one in context.occluders])
+    of_sides = tuple([given.get(side) for side in context.directions])
     content = None if share is None else share.tobytes()
     return _usual_of(context.priors, context.rates, of_sides, hides, content)
 
@@ -368,7 +370,7 @@ def _shown(kept: StreetBelief, street: StreetModel) -> StreetBelief:
         return replaced(kept, shown=(0.0,) * kept.k)
     own, now = kept.emerged_since(kept.stamp_ns, street.beside_s), kept.joint.emerged_from.tolist()
     pairs = zip(own, kept.shown, now, strict=True)
-    return replaced(kept, shown=tuple(0.0 if is_own else max(pair) for is_own, *pair in pairs))
+    return replaced(kept, shown=tuple([0.0 if is_own else max(pair) for is_own, *pair in pairs]))
 
 
 def _read(
@@ -399,7 +401,7 @@ def _read(
         return replaced(kept, read_ns=read_ns)
     # Of evidence that overlaps, what is new counts.
     new = -math.expm1(-step_s / memory_s)
-    joint, heard = joint / joint.sum(), measurement.heard.share
+    joint, heard = joint / np.add.reduce(joint, None), measurement.heard.share
     after = kept.joint.read(source, joint, kept.prior(street), sides, new, heard)
     return replaced(kept, joint=after, read_ns=read_ns)
 
@@ -411,7 +413,7 @@ def _sequence(
     sides = [k for k, side in enumerate(context.directions) if side in SIDES]
     rows = [SIDES.index(context.directions[k]) for k in sides]
     expected, share = kept.groups[sides], reading.share
-    usual_in_view = float(share[BINS] / share[BINS:].sum())
+    usual_in_view = float(share[BINS] / np.add.reduce(share[BINS:]))
     joint = joint_reading(at_prior(reading.groups[rows], share, expected), usual_in_view, street.by_sound)
     # Averaged, hops are surer than each.
     usual = StreetPrior.of(expected, street).by_part
@@ -420,7 +422,7 @@ def _sequence(
 
 def _watched(kept: StreetBelief, over: BoolArray) -> WatchedHop:
     """Return a hop for the watch over the alarm; `over` its own threshold, by side."""
-    within = kept.coming[:, :_BET_GROUPS].sum(axis=1).tolist()
+    within = np.add.reduce(kept.coming[:, :_BET_GROUPS], 1).tolist()
     looked = kept.watched(kept.stamp_ns, MOSTLY_MISSED)
     return WatchedHop(kept.stamp_ns, looked, tuple(over.tolist()), kept.emerged_ns, tuple(within))
 
@@ -433,7 +435,7 @@ def alerted(kept: StreetBelief, policy: CueingPolicy, street: StreetModel) -> St
     """
     nats = kept.alarm_nats.round(9)  # Rounding must not choose a side
     since_ns = kept.stamp_ns - _SMOOTHED_NS + SLACK_NS
-    recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, tuple(nats.tolist())))
+    recent = (*[one for one in kept.recent if one[0] > since_ns], (kept.stamp_ns, tuple(nats.tolist())))
     # Of each hop the last one: however many measurements there are, time counts.
     of_hop = {(kept.stamp_ns - one[0] + SLACK_NS) // HOP_NS: one for one in recent}.values()
     rows = [
@@ -452,7 +454,7 @@ def alerted(kept: StreetBelief, policy: CueingPolicy, street: StreetModel) -> St
     # is on one side: what is held there ends as another side's alarm begins.
     moved = ~over & (over.any() and kept.both_come <= _TWO)
     sides = zip(over, denied | moved, kept.over_ns, strict=True)
-    over_ns = tuple(None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides)
+    over_ns = tuple([None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides])
     decided = np.where(over & denied, _LEAST_NATS, decided)
     after = replaced(kept, recent=recent, decided=tuple(decided.tolist()), over_ns=over_ns, watch=watch)
     # The belief is the same: what was derived of it, half of the time of a step, is not derived again.

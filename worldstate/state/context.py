@@ -383,7 +383,7 @@ class Context:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "occluders", all_of("occluders", self.occluders, Occluder))
-        for names in (self.directions, tuple(occluder.id for occluder in self.occluders)):
+        for names in (self.directions, tuple([occluder.id for occluder in self.occluders])):
             if not names or len(set(names)) != len(names):
                 raise InvalidArgumentError(f"occluders: expected different ids and directions, got {names}")
         check_fields(self, rates=Rates, priors=Priors | None, site=str | None, hidden_by_side=Mapping | None)
@@ -397,4 +397,4 @@ class Context:
     @property
     def directions(self) -> tuple[str, ...]:
         """Labels of the approach sides."""
-        return tuple(occluder.direction for occluder in self.occluders)
+        return tuple([occluder.direction for occluder in self.occluders])
