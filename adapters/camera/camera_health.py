@@ -9,8 +9,6 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, gaussian_filter, sobel
-from scipy.special import ndtri
 
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.checks import one_of
@@ -108,6 +106,8 @@ def _noisy(frame: ImageArray, sigma: float, rng: np.random.Generator) -> ImageAr
 @cache
 def normal_quantiles() -> Float32Array:
     """Quantiles of the standard normal distribution."""
+    from scipy.special import ndtri
+
     return np.asarray(ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES), dtype=np.float32)
 
 
@@ -159,6 +159,9 @@ def image_quality(frame: ImageArray) -> ImageQuality:
     # and the sharpness compares two scales of the gradient, less what white noise adds to each,
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or min(frame.shape[:2]) < 16:
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
+    # Imported where it is needed: it takes as long as all else that a run without a camera imports.
+    from scipy.ndimage import convolve
+
     grey = _central_grey(frame)
     second = np.abs(convolve(grey, _SECOND_DIFFERENCE.astype(np.float32)))
     noise = float(_MAD_TO_STD * np.median(second) / _GAIN)
@@ -180,6 +183,8 @@ def _sharpness(grey: Float32Array, noise: float) -> float | None:
 
 def _gradient_energy(grey: Float32Array, scale_px: float, noise: float) -> tuple[float, float]:
     """Energy of the gradient without, and of, the noise."""
+    from scipy.ndimage import gaussian_filter, sobel
+
     smooth = gaussian_filter(grey, scale_px)
     total = sum(float(np.mean((sobel(smooth, axis) / 8.0) ** 2)) for axis in (0, 1))
     spurious = (noise**2 + _QUANTISATION) / (4.0 * np.pi * scale_px**4)

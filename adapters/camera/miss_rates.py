@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.special import betaincinv
 
 from worldstate.abduction.co_evidence import MissRateTable, isotonic_grid
 from worldstate.adapters.files.file_io import read_record, write_json
@@ -58,6 +57,8 @@ class FamilyCounts:
 
     def interval(self, repeats: float = 1.0) -> tuple[FloatArray, FloatArray]:
         """Return the 95 % limits of the Beta posterior of each cell, two arrays of shape (bins, levels)."""
+        from scipy.special import betaincinv
+
         looks, misses = np.array(self.looks) / repeats, np.array(self.misses) / repeats
         a, b = misses + PRIOR, looks - misses + PRIOR
         return betaincinv(a, b, 0.025), betaincinv(a, b, 0.975)

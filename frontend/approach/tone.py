@@ -11,13 +11,13 @@ IEEE Trans. IT 20, 1974.
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
+from numpy.fft import rfft
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
 from worldstate.frontend.spectra.resampling import Decimator
-from worldstate.frontend.spectra.stft import power
+from worldstate.frontend.spectra.stft import fast_length, power
 from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, ComplexArray, Float32Array, FloatArray
@@ -115,10 +115,10 @@ def estimate_tone(samples: ArrayLike, sample_rate_hz: float) -> Tone:
         raise InvalidArgumentError("samples: expected a signal, got zeros only")
     resolution = 2 * np.pi / len(y)
     bounds = resolution, np.pi - resolution
-    size = scipy.fft.next_fast_len(ZERO_PADDING * len(y), real=True)
+    size = fast_length(ZERO_PADDING * len(y))
     omegas = 2 * np.pi / size * np.arange(size // 2 + 1)
     inside = (omegas >= bounds[0]) & (omegas <= bounds[1])
-    coarse = omegas[inside][np.argmax(np.abs(scipy.fft.rfft(y, size))[inside])]
+    coarse = omegas[inside][np.argmax(np.abs(rfft(y, size))[inside])]
     omega, amplitude, residual = climb(y, float(coarse), bounds)
     # Three parameters are fitted.
     power = float(residual @ residual) / (len(y) - 3)
@@ -316,7 +316,7 @@ class _Spectrum:
     def __init__(self, n_samples: int, rate: float, band_hz: tuple[float, float]) -> None:
         hann = np.hanning(n_samples + 2)[1:-1]
         self._window = hann / np.sqrt(np.square(hann).sum())
-        self._size = scipy.fft.next_fast_len(_PADDING * n_samples, real=True)
+        self._size = fast_length(_PADDING * n_samples)
         self._step = float(2.0 * np.pi / self._size)
         low, high = (2.0 * np.pi * f / rate for f in band_hz)
         self.omega_range = (low, high)
@@ -327,7 +327,7 @@ class _Spectrum:
         return float(self._window @ sound) / float(self._window.sum())
 
     def power(self, sound: FloatArray) -> FloatArray:
-        return power(scipy.fft.rfft(sound * self._window, self._size))
+        return power(rfft(sound * self._window, self._size))
 
     def peak(self, power: FloatArray) -> float:
         """Return the frequency (rad per sample) of the highest power over its block median."""

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S, MicrophoneArray
 from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray, IndexArray
@@ -497,6 +496,11 @@ def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
     # not displace a third channel to its second-best position.
     movable_mask = scores.max(axis=1) - scores.diagonal() > _CANDIDATE_GAIN
     movable = np.flatnonzero(candidates & movable_mask)
+    if len(movable) < 2:
+        return []
+    # Imported where it is needed: few arrays have exchanged channels.
+    from scipy.optimize import linear_sum_assignment
+
     table = scores[np.ix_(movable, movable)]
     best = linear_sum_assignment(table, maximize=True)[1]
     gain = table[np.arange(len(movable)), best] - table.diagonal()

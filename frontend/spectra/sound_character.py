@@ -12,13 +12,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.fft import rfft
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
 
 from worldstate.ground import FloatArray, IntArray, NotUsable, in_range
 from worldstate.ground.values import mean
 
 from .resampling import Decimator
-from .stft import power
+from .stft import fast_length, power
 
 HOPS_A_SECOND = 10
 EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)
@@ -62,7 +61,7 @@ class SoundCharacter:
         self._sound: FloatArray = np.zeros(max(long, short - ends[0]))
         self._frames = len(self._sound) + ends[:, None] + np.arange(-short, 0)
         self._window = np.hanning(short + 1)[:-1] / np.sqrt(short)
-        self._size = next_fast_len(short, real=True)
+        self._size = fast_length(short)
         # A mean: at another rate three bins or four lie within the same band.
         self._means = np.ascontiguousarray(_means(EDGES_HZ, np.fft.rfftfreq(self._size, 1.0 / rate)).T)
         self._lines = _Lines(long, rate)
@@ -103,7 +102,7 @@ class _Lines:
         self._right = np.minimum(np.arange(count) + half + 1, count)
         self._taper = np.hanning(count + 2)[1:-1]
         # Twice as long as the band: what lies at its ends is no neighbour.
-        self._comb_size = next_fast_len(2 * count, real=True)
+        self._comb_size = fast_length(2 * count)
         low, high = (round(period * self._comb_size * self._step_hz) for period in _COMB_S)
         self._combs = slice(low, high)
         self._excess, self._ratio = np.zeros(count), np.ones(count)

@@ -36,6 +36,21 @@ def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Compl
     return spectra * weights
 
 
+def fast_length(least: int) -> int:
+    """Return the smallest length from `least` on whose transform is fast: of no prime factor above 5.
+
+    Examples
+    --------
+    >>> [fast_length(length) for length in (7, 121, 1024)]
+    [8, 125, 1024]
+    """
+    rest = least
+    for prime in (2, 3, 5):
+        while rest % prime == 0:
+            rest //= prime
+    return least if rest == 1 else fast_length(least + 1)
+
+
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
     """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded."""
     low, high = (int(np.round(frequency / sample_rate_hz * nfft)) for frequency in band_hz)

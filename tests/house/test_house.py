@@ -106,6 +106,22 @@ def test_import_stays_light(statement):
     assert done.stdout.split() == []
 
 
+HEARD = """
+import numpy as np
+from worldstate import Listener
+from worldstate.frontend import ovad_array
+assert len(Listener(ovad_array(), 48_000).push(np.random.default_rng(0).normal(0.0, 0.01, (57_600, 56)))) == 3
+"""
+
+
+@pytest.mark.long
+def test_a_stream_is_heard_without_the_parts_of_scipy_that_are_slow_to_import():
+    slow = {"scipy.stats", "scipy.signal", "scipy.fft", "scipy.ndimage", "scipy.special", "scipy.optimize"}
+    script = f"{HEARD}\nimport sys; print(*sorted({slow!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def exporting_packages():
     found = [import_module(name) for name in sorted(packages_in_tree())]
     return {package.__name__: package for package in found if hasattr(package, "__all__")}

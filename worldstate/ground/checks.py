@@ -206,7 +206,7 @@ def all_of(name: str, values: object, kind: type[T], most: int = 64) -> tuple[T,
     >>> all_of("sides", ["left", "right"], str, most=2)
     ('left', 'right')
     """
-    if values == ():
+    if type(values) is tuple and not values:
         return ()
     if not isinstance(values, list | tuple):
         raise InvalidArgumentError(f"{name}: expected {kind.__name__}s in a tuple, got {_shown(values)}")
