@@ -20,7 +20,7 @@ from worldstate.ground.values import NotUsable
 
 FILTER = {f"{name}_{n}" for name in ("update", "state") for n in (1, 20, 64, 600)}
 BATCHES = {"numpy_batch_1", "numpy_batch_20"}
-WHOLE = "front_end", "everything", "evidence", "feature_chain", "sound_to_state"
+WHOLE = "front_end", "everything", "evidence", "feature_chain", "sound_to_state", "published_chain_8"
 
 
 @pytest.mark.long

@@ -29,7 +29,7 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.commissioning.sequence_training import STANDING
 from worldstate.frontend import hop_spectra, stream
 from worldstate.frontend.approach.tone import ToneStage
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.hop_spectra import LevelMeter
 from worldstate.frontend.spectra.sound_character import MEASURES
@@ -118,8 +118,8 @@ def _clocked(stage: Callable[..., Any], name: str, spent: dict[str, float]) -> C
 REPEATS = 9
 
 
-def published_chain_times(sound: Float32Array) -> Milliseconds:
-    """Return milliseconds per hop of the published chain on a sound, shape (n, M)."""
+def published_chain_times(sound: Float32Array, array: MicrophoneArray) -> Milliseconds:
+    """Return milliseconds per hop of the published chain on a sound of an array, shape (n, M)."""
     import pyroomacoustics
     from scipy.signal import stft
 
@@ -129,7 +129,7 @@ def published_chain_times(sound: Float32Array) -> Milliseconds:
     shared_ms = 0.1 * elapsed_ms(partial(transform, sound)) * RATE_HZ / len(sound)
     second = np.stack(transform(sound[:RATE_HZ]))
     azimuths = np.radians(np.linspace(-90.0, 90.0, 30))
-    peer = pyroomacoustics.doa.SRP(roof_array_56().positions_m.T, RATE_HZ, NFFT, azimuth=azimuths)
+    peer = pyroomacoustics.doa.SRP(array.positions_m.T, RATE_HZ, NFFT, azimuth=azimuths)
     half = second.shape[2] // 2
 
     def one_hop() -> None:
