@@ -278,7 +278,7 @@ def posterior_of(prior: Sequence[float], evidence: SignatureEvidence, co_evidenc
     log_evidence = _log_sum(joint)
     if log_evidence == -math.inf:
         raise InvalidArgumentError("log_prior: expected mass on an explanation that the co-evidence allows")
-    log_probabilities = tuple(one - log_evidence for one in joint)
+    log_probabilities = tuple([one - log_evidence for one in joint])
     return Posterior(evidence.directions, log_probabilities, _log_ratio(prior, log_likelihood), log_evidence)
 
 
@@ -407,4 +407,4 @@ def _log_sum(values: Iterable[float]) -> float:
     largest = max(every)
     if largest == -math.inf:
         return largest
-    return largest + math.log(sum(math.exp(one - largest) for one in every))
+    return largest + math.log(sum([math.exp(one - largest) for one in every]))

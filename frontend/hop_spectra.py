@@ -60,7 +60,8 @@ class HopCutter:
         """Take a block (n, M) and yield the hops that it completes; the iterator must be read to its end."""
         while len(block):
             length = self._end - self._start
-            part, block = np.split(block, [length - self._filled])
+            missing = length - self._filled
+            part, block = block[:missing], block[missing:]
             # A whole hop is not copied.
             samples = part if len(part) == length else self._buffer[:length]
             if samples is not part:

@@ -301,20 +301,19 @@ class FrontEnd:
 
     def _checked(self, block: ArrayLike) -> Float32Array:
         try:
-            with np.errstate(over="ignore"):
-                samples = np.ascontiguousarray(block, dtype=np.float32)
+            samples: Float32Array = np.asarray(block)
+            if samples.dtype != np.float32 or not samples.flags.c_contiguous:
+                with np.errstate(over="ignore"):
+                    samples = np.ascontiguousarray(samples, dtype=np.float32)
         except (TypeError, ValueError) as error:
             raise InvalidArgumentError(f"block: expected numbers, got {type(block).__name__}") from error
         if isinstance(block, np.ndarray) and block.dtype.kind in "iu":
             samples = samples * _full_scale(block.dtype)
         check_shape("block", samples.shape, (None, self.array.n_microphones))
-        # One pass without a copy: a finite sum of squares below the limit holds no NaN and no infinity.
-        flat = samples.ravel()
-        with np.errstate(over="ignore", invalid="ignore"):
-            energy = float(flat @ flat)
-        if energy <= _LOUDEST**2:
+        # Written so that NaN is refused: it is the least and the most, and every comparison with it is false.
+        lowest, highest = [one(samples, None, initial=0.0) for one in (np.minimum.reduce, np.maximum.reduce)]
+        if lowest >= -_LOUDEST and highest <= _LOUDEST:
             return samples
-        # Written so that NaN, for which every comparison is false, is refused.
         if loud := (~(np.abs(samples).max(axis=0) <= _LOUDEST)).nonzero()[0].tolist():
             problem = f"expected finite numbers up to {_LOUDEST:g}, got others in channels {loud}"
             raise InvalidArgumentError(f"block: {problem}")

@@ -200,7 +200,7 @@ def best_card(values: FloatArray, projection: FloatArray, candidates: FloatArray
 
     Shapes: values (M,), projection Q (M, M), candidates (R, M).
     """
-    power = np.einsum("rm,mn,rn->r", candidates, projection, candidates, optimize=True)
+    power = np.add.reduce(candidates @ projection * candidates, 1)
     # A pattern that a tilt explains but for a twentieth would turn any noise into a large amount.
     power = np.where(power > 0.05 * candidates.sum(axis=1), power, np.inf)
     found = candidates @ values

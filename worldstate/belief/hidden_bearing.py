@@ -54,7 +54,7 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     sign, edge_rad = math.copysign(1.0, along_rad), abs(along_rad)
     slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * _MIDDLE_S
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
-    weight = (coming + TINY) / (coming + TINY).sum()
+    weight = (coming + TINY) / np.add.reduce(coming + TINY)
     mean = float(weight @ azimuth)
     # The five degrees of the usual edge hold more than the edge, from which five junctions deviate by 2.6:
     # errors of the time, which a known edge does not end. Half of their variance stays: likeliest on exam

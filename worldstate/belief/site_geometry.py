@@ -88,7 +88,7 @@ class SiteGeometry:
     ego_speed_mps: float = 0.0  # Along the x axis
     ego_yaw_rate_rad_s: float = 0.0
 
-    @property
+    @cached_property
     def street(self) -> StreetModel:
         """The numbers of the belief."""
         return self.settings.street
@@ -144,7 +144,7 @@ class SiteGeometry:
     def line_of_sight(self, azimuth_rad: FloatArray, std_rad: FloatArray, range_m: FloatArray) -> FloatArray:
         """Return P(no occluder stands before what is at some places)."""
         hidden = self.behind(azimuth_rad, np.hypot(std_rad[:, None], self._edges[1].T), range_m)
-        return np.asarray(1.0 - (hidden * [one.certainty for one in self.sides]).max(axis=1))
+        return np.asarray(1.0 - np.maximum.reduce(hidden * [one.certainty for one in self.sides], 1))
 
     def view(self, look: Look) -> Sector:
         """Return where a look has searched."""

@@ -218,12 +218,12 @@ def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
 def predict_tracks(tracks: Tracks, step_s: float, site: SiteGeometry) -> None:
     """Move tracks on by a time step without a measurement."""
     tracks.existence[tracks.seen] *= math.exp(-step_s / site.street.unseen_s)
-    if tracks.placed.any():
+    if True in tracks.placed:
         _drive_on(tracks, tracks.placed.nonzero()[0], step_s, site)
     polar = ~tracks.placed  # Those that have just lost their place, too
-    if polar.any():
+    if True in polar:
         # All of them are read and written where they stand.
-        _relax(tracks, slice(None) if polar.all() else polar, step_s, site)
+        _relax(tracks, polar if False in polar else slice(None), step_s, site)
     occlude(tracks, site, step_s)
 
 
@@ -270,7 +270,7 @@ def _relax(tracks: Tracks, rows: BoolArray | slice, step_s: float, site: SiteGeo
 
 def follow_places(tracks: Tracks, site: SiteGeometry) -> None:
     """Give tracks the polar motion that follows from their places."""
-    if not tracks.placed.any():
+    if True not in tracks.placed:
         return
     rows = tracks.placed.nonzero()[0]
     places = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
@@ -293,7 +293,7 @@ def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatAr
     at = np.zeros((len(tracks), sides + len(tracks)))
     nearer = np.zeros_like(at)
     at[:, :sides] = site.past_edge(azimuth_rad + 0.5 * way * widths, tracks.azimuth_std_rad, way)
-    if (placed := tracks.placed).any():
+    if True in (placed := tracks.placed):
         range_m = np.hypot(*tracks.place_mean[placed, :2].T)
         at[placed, :sides] = site.behind(azimuth_rad[placed], tracks.azimuth_std_rad[placed, None], range_m)
     nearer[:, :sides] = np.where(tracks.seen[:, None], [one.certainty for one in site.sides], 1.0)
@@ -317,7 +317,7 @@ def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatAr
 
 def occlude(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> None:
     """Give the tracks that were detected the chance to be hidden that follows from where they are."""
-    if tracks.detected.any():
+    if True in tracks.detected:
         tracks.behind = np.where(tracks.detected, occluded(tracks, site, step_s).max(axis=1), tracks.behind)
 
 
@@ -339,7 +339,7 @@ def relabelled(
 
 def side_weights(track: Track, sides: int) -> tuple[float, ...]:
     """Return P(an entity is of a side | exists), shape (sides,)."""
-    known = tuple(float(k == track.side) for k in range(sides))
+    known = tuple([float(k == track.side) for k in range(sides)])
     return known if track.detected or not track.side_shares else track.side_shares
 
 

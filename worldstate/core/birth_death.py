@@ -61,7 +61,7 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
     sides = _unseen(memory, site)
     for i in rows:
         shares = sides.side_shares(site.street.death) if len(rows) == 1 else ()
-        is_open = sum(share > 0.0 for share in shares) > 1
+        is_open = sum([share > 0.0 for share in shares]) > 1
         # In a tie it stays, which rounding must not undo.
         if shares and shares[tracks.side[i]] < max(shares) * (1.0 - TINY):
             tracks.side[i] = shares.index(max(shares))
@@ -82,7 +82,7 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
 def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
     """Return the belief of the sides without a vehicle that has just come into view: it has a track."""
     sides, found = memory.sides, memory.belief.emerged_since(memory.stamp_ns, site.street.beside_s)
-    emerged = tuple(0.0 if own else one for own, one in zip(found, sides.emerged, strict=True))
+    emerged = tuple([0.0 if own else one for own, one in zip(found, sides.emerged, strict=True)])
     return replaced(sides, emerged=emerged)
 
 
@@ -93,7 +93,7 @@ def _heard_rows(tracks: Tracks) -> list[int]:
 
 def hidden_rows(tracks: Tracks) -> list[int]:
     """Return the rows of the hidden entities."""
-    if tracks.seen.all():
+    if False not in tracks.seen:
         return []
     rows: list[int] = (~tracks.seen & (~tracks.detected | (tracks.behind >= HIDDEN))).nonzero()[0].tolist()
     return rows
@@ -157,7 +157,7 @@ def published(tracks: Tracks, street: StreetModel) -> Tracks:
     """Return the tracks that a snapshot names."""
     # A refuted claim is remembered while it is repeated: forgotten, it would be believed anew.
     refuted = tracks.placed & (tracks.existence < street.death)
-    return tracks.taken(~refuted) if refuted.any() else tracks
+    return tracks.taken(~refuted) if True in refuted else tracks
 
 
 def events_between(before: Tracks, after: Tracks, steps: Sequence[Memory]) -> tuple[Event, ...]:
@@ -230,4 +230,4 @@ def surviving(tracks: Tracks, street: StreetModel) -> Tracks:
     known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= (2.0 * street.past_std_rad) ** 2
     known |= tracks.miss_rate > MOSTLY_MISSED
     kept = known & (tracks.existence >= street.death) | ~tracks.seen
-    return tracks if kept.all() else tracks.taken(kept)
+    return tracks.taken(kept) if False in kept else tracks

@@ -177,7 +177,7 @@ class WorldFilter:
             return self._begun_anew(measurement)
         if lag.latest is not self._lag.latest:
             # From what was published last on: a late measurement changes what has become of it since.
-            steps = (*(one.before for one in lag.arrivals), lag.latest)
+            steps = (*[one.before for one in lag.arrivals], lag.latest)
             known, now = (published(one.latest.tracks, self.settings.street) for one in (self._lag, lag))
             lag.latest.last.events = events_between(known, now, steps)
             lag = lag.counted(boxes_left_out=left_out) if left_out else lag

@@ -34,7 +34,7 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
     # What a camera alone has found, first in view, has none.
     related = ~tracks.seen | (tracks.came_from >= _LEAST) | tracks.approach_heard | tracks.placed
     related |= tracks.behind >= _LEAST
-    if not memory.relations and not related.any():
+    if not memory.relations and True not in related:
         return ()
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
     some = tracks.taken(related).rows()
@@ -94,7 +94,8 @@ def _comes(track: Track, side: int, belief: StreetBelief, model: FilterModel) ->
     if track.place is not None:
         return float(time_to_visible(track.place, model.site.sides[side], model.site, LONGEST_S)[0])
     coming = belief.coming[side]
-    return float(coming[:STATED].sum() / max(coming.sum(), TINY)) if belief.has_times else 1.0
+    total = np.add.reduce
+    return float(total(coming[:STATED]) / max(total(coming), TINY)) if belief.has_times else 1.0
 
 
 def _between(tracks: Sequence[Track], context: Context) -> Iterator[Edge]:

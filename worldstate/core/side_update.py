@@ -25,7 +25,7 @@ def heard_beside(memory: Memory, measurement: Measurement, street: StreetModel) 
     """
     heard, tracks = measurement.heard, memory.tracks
     near = tracks.moving & (tracks.last_seen_ns >= measurement.stamp_ns - _JUST_LEFT_NS)
-    in_view = float(tracks.existence[near].max(initial=0.0))
+    in_view = max(tracks.existence[near].tolist(), default=0.0)
     if memory.belief.has_times:
         in_view = max(in_view, memory.belief.in_view)
     # P(a vehicle that comes into view within three seconds adds a decibel or more to 300 Hz to 2 kHz); with

@@ -61,16 +61,17 @@ def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
     a, b = 1.0 + rho * _AFTER_S, omega * _AFTER_S
     # At the array itself, q = 0, the coordinates are singular; this is 1 % of the first range.
     q = np.maximum(a * a + b * b, LEAST_STD)
-    gradient = np.stack([np.ones_like(a), a * _AFTER_S / q, -b * _AFTER_S / q], axis=-1)
-    known = (gradient @ tracks.covariance[:, :LOG_RANGE, :LOG_RANGE] * gradient).sum(axis=-1)
+    gradient = np.array([np.ones(a.shape), a * _AFTER_S / q, -b * _AFTER_S / q]).transpose(1, 2, 0)
+    known = np.add.reduce(gradient @ tracks.covariance[:, :LOG_RANGE, :LOG_RANGE] * gradient, -1)
     density = acceleration_psd(tracks.moving, site)
     range_m = np.exp(np.minimum(np.maximum(log_range, math.log(NEAREST_M)), math.log(FARTHEST_M)))
     variance = known + density[:, None] * _CUBES / (range_m**2 * q)
     azimuth_rad = theta + np.arctan2(b, a)
     azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
     # Full precision would take twice as long to write.
-    means, stds = np.clip(azimuth_rad.round(_SHORT), -np.pi, np.pi), np.sqrt(variance).round(_SHORT)
-    return [{_SOONER: (*soon,), _LATER: (*late,)} for soon, late in np.stack([means, stds], axis=-1).tolist()]
+    means = np.minimum(np.maximum(azimuth_rad.round(_SHORT), -np.pi), np.pi).tolist()
+    pairs = zip(means, np.sqrt(variance).round(_SHORT).tolist(), strict=True)
+    return [{_SOONER: (at[0], std[0]), _LATER: (at[1], std[1])} for at, std in pairs]
 
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
@@ -83,7 +84,7 @@ def entities_of(tracks: Tracks, memory: Memory, site: SiteGeometry) -> tuple[Ent
     """Return some tracks as published entities."""
     # All at once: a number taken out of an array by itself costs as much as a row.
     stds = np.sqrt(tracks.covariance.diagonal(axis1=1, axis2=2))
-    lists = (array.round(_DIGITS).tolist() for array in (tracks.mean, stds, tracks.covariance[:, *_UPPER]))
+    lists = [array.round(_DIGITS).tolist() for array in (tracks.mean, stds, tracks.covariance[:, *_UPPER])]
     moments = zip(*lists, forecasts(tracks, site), strict=True)
     return tuple(map(partial(_entity, memory.belief, site), tracks.rows(), moments))
 

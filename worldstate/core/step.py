@@ -45,7 +45,7 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     memory.forget()
     memory.belief = carried(memory.belief, stamp_ns, step_ns, model.context, model.site.street)
     view_heard(memory, model.site)
-    if (before.tracks.placed & ~before.tracks.seen).any():
+    if True in before.tracks.placed & ~before.tracks.seen:
         _pass_places(before.tracks, memory, model)
     return memory
 
@@ -145,7 +145,7 @@ def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
     if not hidden_rows(before.tracks):
         return []
     seen = set(memory.tracks.id[memory.tracks.seen])
-    told = (hidden_on(before.tracks, k) for k in range(len(before.history)))
+    told = [hidden_on(before.tracks, k) for k in range(len(before.history))]
     return [k for k, row in enumerate(told) if row is not None and before.tracks.id[row] in seen]
 
 

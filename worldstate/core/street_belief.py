@@ -312,8 +312,8 @@ def _with_traffic(kept: StreetBelief, context: Context, street: StreetModel) -> 
     groups, given = kept.usual.copy(), context.hidden_by_side or {}
     for row, side, rate in zip(groups, context.directions, kept.arrivals, strict=True):
         if context.priors is None and side not in given:
-            row[:BINS] *= math.exp(rate.shift_nats(row[:BINS].sum() / COMING_S[-1], street))
-    return np.asarray(groups / groups.sum(axis=1, keepdims=True))
+            row[:BINS] *= math.exp(rate.shift_nats(np.add.reduce(row[:BINS]) / COMING_S[-1], street))
+    return np.asarray(groups / np.add.reduce(groups, 1)[:, None])
 
 
 def carried(
@@ -452,7 +452,7 @@ def alerted(kept: StreetBelief, policy: CueingPolicy, street: StreetModel) -> St
         watch = watch.after(_watched(kept, over & ~denied), kept.alarm.onsets_per_hour)
     # A risk that denies an alarm ends it: it is not held, and time alone does not bring it back. One vehicle
     # is on one side: what is held there ends as another side's alarm begins.
-    moved = ~over & (over.any() and kept.both_come <= _TWO)
+    moved = ~over & (True in over and kept.both_come <= _TWO)
     sides = zip(over, denied | moved, kept.over_ns, strict=True)
     over_ns = tuple([None if no else kept.stamp_ns if yes else ns for yes, no, ns in sides])
     decided = np.where(over & denied, _LEAST_NATS, decided)
@@ -483,4 +483,4 @@ def of_two(
     apart = np.log(np.maximum(here, TINY)) - np.log(np.maximum(elsewhere, TINY))
     # One that is exactly as likely alone as here is not named.
     least = threshold + np.where(apart > 0.0, apart, np.minimum(apart, -TINY))
-    return np.asarray(np.where(rank >= rank.max(), nats, np.minimum(nats, least)))
+    return np.asarray(np.where(rank >= np.maximum.reduce(rank), nats, np.minimum(nats, least)))

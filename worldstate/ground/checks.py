@@ -67,8 +67,8 @@ def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None])
     --------
     >>> check_shape("block", (4800, 56), (None, 56))
     """
-    fits = len(got) == len(expected) and all(e in (None, g) for g, e in zip(got, expected, strict=True))
-    if not fits:
+    as_expected = [e in (None, g) for g, e in zip(got, expected, strict=False)]
+    if len(got) != len(expected) or False in as_expected:
         wanted = ", ".join("any" if e is None else str(e) for e in expected)
         raise InvalidArgumentError(f"{name}: expected shape ({wanted}), got {got}")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from numbers import Integral
 from operator import attrgetter
-from typing import Any, Literal, TypeAlias, TypeVar, cast
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -87,7 +87,8 @@ def replaced(value: T, /, **changes: Any) -> T:
     """
     cls: Any = type(value)
     names, values = _fields_of(cls)
-    return cast(T, cls(**dict(zip(names, values(value), strict=False)) | changes))
+    changed: T = cls(**dict(zip(names, values(value), strict=False)) | changes)
+    return changed
 
 
 def mean(values: np.ndarray, axis: int | None = None, dtype: Any = None) -> Any:
@@ -164,7 +165,7 @@ def wrap_angle(angle_rad: RealT) -> RealT:
     >>> round(wrap_angle(3 * np.pi / 2), 3), wrap_angle(-np.pi) == np.pi
     (-1.571, True)
     """
-    if isinstance(angle_rad, float):
+    if type(angle_rad) is float or isinstance(angle_rad, float):
         # Ten times as fast as an array of one angle, of which a step of the filter has hundreds.
         return math.pi - (math.pi - float(angle_rad)) % _TURN % _TURN
     # Taken twice: of the least that is negative the first is rounded to a whole turn.

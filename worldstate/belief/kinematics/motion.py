@@ -101,8 +101,8 @@ def conditioned(covariance: FloatArray, largest_std: float = LARGEST_STD) -> Flo
     covariance = 0.5 * (covariance + covariance.mT)
     # A view of the diagonals.
     variance = np.einsum("...ii->...i", covariance)
-    largest = variance.max(axis=-1, keepdims=True)
-    if (largest > largest_std**2).any():
+    largest = np.maximum.reduce(variance, -1)[..., None]
+    if True in (largest > largest_std**2):
         scale = np.minimum(largest_std / np.sqrt(np.maximum(variance, LEAST_STD**2)), 1.0)
         covariance *= _outer(scale, scale)
         largest = variance.max(axis=-1, keepdims=True)
