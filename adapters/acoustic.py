@@ -217,8 +217,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self.last_frame, heard = frame, Heard(0.0, outside) if outside else heard_of(frame, self._kinds)
         told: dict[str, Any] = {"stamp_ns": frame.stamp_ns, "kinds": (), "heard": heard}
         told |= self._read(frame, heard) if heard.usable else self._unheard(heard)
-        of_sound = frame.stamp_ns, told["bearing"], told["kinds"], told["signature"]
-        told |= _asked(*of_sound, self._vision)
+        told |= _asked(told, self._vision)
         # One value for all of it: what it holds is checked once.
         return Measurement(**told, source=self.source, fault=_array_fault(frame))
 
@@ -319,25 +318,19 @@ def beside_foreign(foreign: Foreign, heard: Heard) -> Heard:
 
 def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:
     """Return a measurement with the answers of a camera, or of none; what was heard stays as it is."""
-    heard = measurement.bearing, measurement.kinds, measurement.signature
-    return replaced(measurement, **_asked(measurement.stamp_ns, *heard, vision))
+    told = {name: getattr(measurement, name) for name in ("stamp_ns", "bearing", "kinds", "signature")}
+    return replaced(measurement, **_asked(told, vision))
 
 
-def _asked(
-    stamp_ns: int,
-    bearing: Bearing | NotUsable,
-    kinds: ClassShares,
-    signature: SignatureEvidence,
-    vision: CoEvidenceChannel | None,
-) -> dict[str, Any]:
-    """Return what a camera answers of what is heard at a time, or that there is none."""
+def _asked(told: Mapping[str, Any], vision: CoEvidenceChannel | None) -> dict[str, Any]:
+    """Return what a camera answers of the sound of a measurement, or that there is none."""
     if vision is None:
         return {"co_evidence": Unqueried("no camera"), "sightings": (), "look": None, "further": ()}
-    labels = expected_labels(kinds)
+    stamp_ns, bearing, labels = told["stamp_ns"], told["bearing"], expected_labels(told["kinds"])
     if isinstance(bearing, Bearing) and bearing.std_rad <= _COARSE_STD_RAD:
         answer = vision.ask(stamp_ns, bearing, labels)
     else:
-        answer = vision.ask(stamp_ns, NotUsable("coarse bearing"), labels, signature.likelier_side)
+        answer = vision.ask(stamp_ns, NotUsable("coarse bearing"), labels, told["signature"].likelier_side)
     found = {"co_evidence": answer, "sightings": vision.sightings(stamp_ns)}
     further = vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else ()
     return found | {"look": vision.last_look(stamp_ns), "further": further}

@@ -8,13 +8,19 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.direction.bearing import steered_power
-from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_steering, pair_sum_of
+from worldstate.frontend.direction.feature import (
+    FEATURE_AZIMUTHS_RAD,
+    FEATURE_BAND_HZ,
+    feature_steering,
+    pair_sum_of,
+)
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.health.common_sound import CommonSound
@@ -94,38 +100,22 @@ class HopSums:
     common: tuple[float, str | None] = (1.0, None)
 
 
-class HopWindow:
-    """Sums of the hops of a window in arrays, oldest first: a row a hop, zeros before the first."""
+def hop_window(n_hops: int, n_directions: int, n_channels: int) -> Any:
+    """Return the sums of the hops of a window, a row a hop, the oldest first: all zero before the first."""
+    numbers = [(name, float) for name in ("n_frames", "n_new", "share", "lost", "centre")]
+    pairs = ("pairs", complex, len(FEATURE_AZIMUTHS_RAD))
+    sums = [("power", float, n_directions), pairs, ("energies", float, n_channels)]
+    return np.zeros(n_hops, [*numbers, ("unheard", object), *sums])
 
-    def __init__(self, n_hops: int) -> None:
-        self.n_frames, self.n_new = np.zeros((2, n_hops), int)
-        self.share, self.lost, self.centre = np.zeros((3, n_hops))
-        self.unheard: list[str | None] = [None] * n_hops
-        self.power: FloatArray = np.zeros((n_hops, 0))
-        self.pairs: Complex128Array = np.zeros((n_hops, 0), complex)
-        self.energies: FloatArray = np.zeros((n_hops, 0))
 
-    def push(self, hop: HopSums, share: float, unheard: str | None) -> None:
-        """Take the newest hop, of which noise leaves a share to be heard; below .2 its sums are empty."""
-        if not self.power.size:
-            for name in ("power", "pairs", "energies"):
-                rows, one = getattr(self, name), getattr(hop, name)
-                setattr(self, name, np.zeros((len(rows), len(one)), rows.dtype))
-        share, unheard = (share, unheard) if share < hop.share else (hop.share, hop.unheard)
-        heard = share >= hop.share or share >= LEAST_HEARD
-        for rows, newest in (
-            (self.n_frames, hop.n_frames if heard else 0),
-            (self.n_new, len(hop.heard)),
-            (self.share, share),
-            (self.lost, hop.lost),
-            (self.centre, hop.centre),
-            (self.power, hop.power if heard else 0.0),
-            (self.pairs, hop.pairs if heard else 0.0),
-            (self.energies, hop.energies if heard else 0.0),
-        ):
-            rows[:-1] = rows[1:]
-            rows[-1] = newest
-        self.unheard = [*self.unheard[1:], unheard]
+def push_hop(window: Any, hop: HopSums, share: float, unheard: str | None) -> None:
+    """Put the newest hop into a window: noise leaves it a share to be heard; below 0.2 its sums are empty."""
+    least = min(share, hop.share)
+    heard = least == hop.share or least >= LEAST_HEARD
+    window[:-1] = window[1:]
+    sums = (hop.power, hop.pairs, hop.energies) if heard else (0.0, 0.0, 0.0)
+    why = unheard if share < hop.share else hop.unheard
+    window[-1] = (hop.n_frames * heard, len(hop.heard), least, hop.lost, hop.centre, why, *sums)
 
 
 class HopSpectra:

@@ -32,7 +32,7 @@ from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.typing import BoolArray, Complex128Array, Float32Array, IndexArray
 from worldstate.ground.values import mean
 
-from .hop_spectra import BANDS, HopSpectra, HopSums, HopWindow, LevelMeter, NoiseMeter
+from .hop_spectra import BANDS, HopSpectra, HopSums, LevelMeter, NoiseMeter, hop_window, push_hop
 from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
 
 _NOT_MONITORED = NotUsable("microphones were not monitored")
@@ -233,7 +233,8 @@ class FrontEnd:
         self._tone = None if band_hz is None else ToneStage(array, rate, band_hz)
         self._energy_floor = EnergyFloor()
         self._character = SoundCharacter(rate) if settings.character else None
-        self._window = HopWindow(WINDOW_HOPS)
+        n_directions = sum([row.weights.shape[2] for row in self._spectra.beams])
+        self._window = hop_window(WINDOW_HOPS, n_directions, n_channels)
         self._health = ArrayHealth.unknown(n_channels)
         self._nearest: tuple[bytes, int] = b"", 0  # Microphones kept, and the middle one of them
 
@@ -330,10 +331,10 @@ class FrontEnd:
             self._health = newest.health
             levels = self._unmasked(self._meter.push(hop.samples, self._keep, newest.heard), newest)
             window = self._window
-            self._energy_floor.push(float(mean(window.energies[-1, self._used])))
+            self._energy_floor.push(float(mean(window["energies"][-1, self._used])))
             if self._tone is not None:
                 self._tone.push(hop.samples, newest.health.mask)
-            if self._character is not None and not newest.lost and window.n_frames[-1]:
+            if self._character is not None and not newest.lost and window["n_frames"][-1]:
                 self._character.push(hop.samples[:, self._middle()])
             return self._frame(hop, levels) if hop.index >= WINDOW_HOPS else None
 
@@ -352,8 +353,8 @@ class FrontEnd:
             share, reason = noise.push(levels, coherence, newest.common)
         elif noise is not None:
             noise.skip()
-        self._window.push(newest, share, reason)
-        if noise is None or self._window.n_frames[-1]:
+        push_hop(self._window, newest, share, reason)
+        if noise is None or self._window["n_frames"][-1]:
             self._levels = levels
         return self._levels
 
@@ -362,7 +363,7 @@ class FrontEnd:
         spectrum, azimuths = about_the_peak(self._srp(heard), self._azimuths)
         peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
         bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
-        shares = hops.share.tolist()
+        shares = hops["share"].tolist()
         window = sum(shares) / WINDOW_HOPS
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.heard_rate_hz),
@@ -381,16 +382,16 @@ class FrontEnd:
             health=self._health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
-            lost=sum(hops.lost.tolist()) / WINDOW_HOPS,
+            lost=sum(hops["lost"].tolist()) / WINDOW_HOPS,
             heard=0.0 if window < _LEAST_OF_WINDOW else min(window, shares[-1]),
             # The latest of the hops of which least was heard.
-            unheard=hops.unheard[WINDOW_HOPS - 1 - int(hops.share[::-1].argmin())],
+            unheard=hops["unheard"][WINDOW_HOPS - 1 - int(hops["share"][::-1].argmin())],
             excess_db=0.0 if self._noise is None else self._noise.excess_db,
         )
 
     def _heard(self, n_hops: int) -> IndexArray:
         """Return the last hops of the window in which something was heard, the last ones of all if none."""
-        heard = self._window.n_frames.nonzero()[0]
+        heard = self._window["n_frames"].nonzero()[0]
         return (heard if len(heard) else np.arange(WINDOW_HOPS))[-n_hops:]
 
     @property
@@ -405,14 +406,15 @@ class FrontEnd:
 
     def _srp(self, hops: IndexArray | slice) -> FloatArray:
         """SRP-PHAT of hops, (A,): the maximum over elevations."""
-        total, n_frames = np.add.reduce(self._window.power[hops]), sum(self._window.n_frames[hops].tolist())
+        some = self._window[hops]
+        total, n_frames = np.add.reduce(some["power"]), sum(some["n_frames"].tolist())
         n_bins, n_microphones = len(self._spectra.srp_bins), self.array.n_microphones
         power = normalised(total, max(n_frames, 1), n_bins, n_microphones)
         return np.asarray(np.maximum.reduce(power.reshape(-1, len(self._azimuths))))
 
     def _age_s(self, hops: IndexArray, end: int) -> float:
-        weights = np.maximum(self._window.n_frames[hops], 1)
-        centre = float(weights @ self._window.centre[hops] / np.add.reduce(weights))
+        weights = np.maximum(self._window["n_frames"][hops], 1)
+        centre = float(weights @ self._window["centre"][hops] / np.add.reduce(weights))
         return (end - centre) / self.heard_rate_hz
 
     def _feature(self) -> FloatArray:
@@ -422,8 +424,8 @@ class FrontEnd:
     def _segment(self, half: slice) -> FloatArray:
         """Return the feature of half a window; of the whole one where little was heard in the half."""
         window, n_hops = self._window, WINDOW_HOPS // FEATURE_SEGMENTS
-        used = half if sum(window.share[half].tolist()) >= _LEAST_OF_HALF * n_hops else slice(None)
-        return self._scaled(window.pairs[used], sum(window.n_frames[used].tolist()))
+        used = half if sum(window["share"][half].tolist()) >= _LEAST_OF_HALF * n_hops else slice(None)
+        return self._scaled(window["pairs"][used], sum(window["n_frames"][used].tolist()))
 
     def _scaled(self, pairs: Complex128Array, n_frames: int) -> FloatArray:
         n_bins, n_microphones = len(self._spectra.feature_bins), self.array.n_microphones
@@ -431,16 +433,16 @@ class FrontEnd:
 
     def _looming(self, end: int) -> Looming | NotUsable:
         window = self._window
-        hops = (window.n_frames >= _LEAST_OF_HOP * np.maximum(window.n_new, 1)).nonzero()[0]
+        hops = (window["n_frames"] >= _LEAST_OF_HOP * np.maximum(window["n_new"], 1)).nonzero()[0]
         if len(hops) < MIN_POINTS:
             return NotUsable("silence within the window")
         # The same microphones in the whole window: one that fails within it must not look like a step of
         # level.
-        energies = mean(window.energies[hops][:, self._used], 1)
+        energies = mean(window["energies"][hops][:, self._used], 1)
         lowest = float(np.minimum.reduce(energies))
         if lowest <= SILENCE:
             return NotUsable("silence within the window")
-        times = (window.centre[hops] - end) / self.heard_rate_hz
+        times = (window["centre"][hops] - end) / self.heard_rate_hz
         low, high = LOOMING_BAND_HZ
         scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
         noise = self._energy_floor.read(lowest, scatter)

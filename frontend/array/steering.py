@@ -186,7 +186,7 @@ def one_blas_thread() -> AbstractContextManager[Any]:
     # (measured on two busy cores: four times the processor time). It also keeps results the same bit for bit
     # on any number of cores. The limit is the process's: products that other threads of the host begin
     # meanwhile, about a millisecond in a hundred, run on one thread too. It costs 16 microseconds.
-    several = any(library.get_num_threads() > 1 for library in _libraries())
+    several = any(library.get_num_threads() > 1 for library in _controller().lib_controllers)
     return _controller().limit(limits=1) if several else nullcontext()
 
 
@@ -194,8 +194,3 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 def _controller() -> Any:
     """Look for the libraries once: that costs a millisecond."""
     return ThreadpoolController().select(user_api="blas")
-
-
-@lru_cache(maxsize=1)
-def _libraries() -> Any:
-    return _controller().lib_controllers

@@ -6,6 +6,7 @@ Every check names the argument, what came and what was expected.
 import math
 import sys
 from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Any, TypeVar, get_args
 
 import numpy as np
@@ -175,7 +176,7 @@ def check_fields(instance: object, **expected: Any) -> None:
         if is_range:
             if type(value) is float and wanted[0] <= value <= wanted[1]:
                 continue
-        elif type(value) in _EXACT[wanted]:
+        elif type(value) in _types(wanted):
             continue
         if isinstance(value, np.generic):
             value = value.item()
@@ -187,15 +188,10 @@ def check_fields(instance: object, **expected: Any) -> None:
             raise InvalidArgumentError(f"{name}: expected {_called(wanted)}, got {_shown(value)}")
 
 
-class _Types(dict[Any, frozenset[type]]):
-    """The types that a type, or a union of some, names: `isinstance` walks through a union."""
-
-    def __missing__(self, kind: Any) -> frozenset[type]:
-        self[kind] = frozenset(get_args(kind) or (kind,))
-        return self[kind]
-
-
-_EXACT = _Types()
+@cache
+def _types(kind: Any) -> frozenset[type]:
+    """Return the types that a type, or a union of some, names: `isinstance` walks through a union."""
+    return frozenset(get_args(kind) or (kind,))
 
 
 def all_of(name: str, values: object, kind: type[T], most: int = 64) -> tuple[T, ...]:

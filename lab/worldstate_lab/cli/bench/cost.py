@@ -76,8 +76,8 @@ SETTINGS = {
     "published_chain": "per hop: scipy.signal.stft of the file, channel by channel, its cost shared among "
     "the hops; pyroomacoustics SRP, 30 azimuths, 50-1500 Hz (bins 1-15), on each half of one second; against "
     "stft + phat + feature",
-    "listener_hop": "the same sound through a listener, hop by hop, to its snapshot as JSON, with the models of "
-    "the roof array and no camera; against published_chain; _8: eight of the microphones, as in its chain",
+    "listener_hop": "the same sound through a listener, hop by hop, to its snapshot as JSON, with the models "
+    "of the roof array and no camera; against published_chain; _8: eight of the microphones in both",
     "scikit_learn_trees": "the two rows of a hop through as many trees as training makes, as a "
     "histogram classifier; against sequence_reader, its inputs included",
     "scikit_learn_classifier": "the published linear machines on one window, without probabilities; against "
