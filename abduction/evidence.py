@@ -13,9 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, InvalidArgumentError, in_range
+from worldstate.ground import FloatArray, InvalidArgumentError, in_range, replaced
 from worldstate.ground.checks import all_of, check_fields, check_shape, finite_array
-from worldstate.ground.values import replaced
 
 from .co_evidence import CoEvidence
 

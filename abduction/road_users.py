@@ -21,10 +21,9 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground import FloatArray, InvalidArgumentError
+from worldstate.ground import FloatArray, InvalidArgumentError, replaced
 from worldstate.ground.checks import all_of, freeze_arrays, in_range, named
 from worldstate.ground.serialisation import ADDED, Layout
-from worldstate.ground.values import replaced
 
 UNKNOWN, SIREN = "unknown", "siren"
 # As detectors of COCO's classes call them; a van is a car to some and a truck to others.

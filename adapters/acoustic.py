@@ -35,9 +35,8 @@ from worldstate.frontend.health.common_sound import ARRAY_FAULTS
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground import LEAST_HEARD, NotUsable, OutOfDomainError, falling, wrap_angle
+from worldstate.ground import LEAST_HEARD, NotUsable, OutOfDomainError, falling, replaced, wrap_angle
 from worldstate.ground.typing import Float32Array, FloatArray
-from worldstate.ground.values import replaced
 from worldstate.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
 from worldstate.measurement.measurement import MeasurementAdapter
 

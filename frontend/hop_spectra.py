@@ -25,9 +25,16 @@ from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.health.common_sound import CommonSound
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
-from worldstate.ground import LEAST_HEARD, BoolArray, FloatArray, IntArray, InvalidArgumentError, falling
+from worldstate.ground import (
+    LEAST_HEARD,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    InvalidArgumentError,
+    falling,
+    mean,
+)
 from worldstate.ground.typing import Complex128Array, Float32Array
-from worldstate.ground.values import mean
 
 from .settings import ELEVATIONS_RAD, HIGHEST_SHARE, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 

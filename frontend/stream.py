@@ -27,10 +27,9 @@ from worldstate.frontend.hop_spectra import SILENCE, Hop, HopCutter, hop_end
 from worldstate.frontend.spectra.resampling import Resampler
 from worldstate.frontend.spectra.sound_character import SoundCharacter
 from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz
-from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, nanoseconds
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, mean, nanoseconds
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.typing import BoolArray, Complex128Array, Float32Array, IndexArray
-from worldstate.ground.values import mean
 
 from .hop_spectra import BANDS, HopSpectra, HopSums, LevelMeter, NoiseMeter, hop_window, push_hop
 from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings

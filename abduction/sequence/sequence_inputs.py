@@ -172,25 +172,16 @@ def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
     last_second, this_bands = recent[-1 - _SECOND :], bands(0)
     swing, spread = last_second[:, _BEARING], now[_SPREAD]
     mean_1s, mean_3s = [mean(rows[:, : len(SIDES)], 0) for rows in (last_second, recent)]
-    usual_levels, usual_evidence = [
-        _ranked(minute[:, :_LEVELS], QUIET_SHARE),
-        _ranked(minute[:, _LEVELS:], USUAL_SHARE),
-    ]
+    usual_levels = _ranked(minute[:, :_LEVELS], QUIET_SHARE)
+    usual_evidence = _ranked(minute[:, _LEVELS:], USUAL_SHARE)
     usual_bands, usual_rest = usual_levels[:BANDS], np.concatenate([usual_levels[BANDS:], usual_evidence])
     rest = [now[_PROMINENCE], second[_PROMINENCE], now[_RATE] / spread, np.log(spread)]
-    rest += [
-        now[_BEARING],
-        now[_BEARING] - second[_BEARING],
-        np.maximum.reduce(swing) - np.minimum.reduce(swing),
-    ]
+    swung = np.maximum.reduce(swing) - np.minimum.reduce(swing)
+    rest += [now[_BEARING], now[_BEARING] - second[_BEARING], swung]
     parts = [now[:_HIGHEST], now[_OWN[BANDS:]] - usual_rest]
     parts += [(now - one)[:_CHANGING] for one in (second, two)]
-    parts += [
-        (second - three)[: len(SIDES)],
-        np.maximum.reduce(recent[:, :_HIGHEST]),
-        np.array(rest),
-        mean_3s,
-    ]
+    highest = np.maximum.reduce(recent[:, :_HIGHEST])
+    parts += [(second - three)[: len(SIDES)], highest, np.array(rest), mean_3s]
     parts += [side[:1] - side[1:2] for side in (now, mean_1s, mean_3s)]
     parts += [this_bands - one for one in (usual_bands, bands(_SECOND), bands(_TWO))]
     every = np.concatenate([*parts, *_remembered(whole)])

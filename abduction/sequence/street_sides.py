@@ -15,9 +15,8 @@ from functools import partial
 
 import numpy as np
 
-from worldstate.ground import TINY, FloatArray, InvalidArgumentError
+from worldstate.ground import TINY, FloatArray, InvalidArgumentError, mean, part_means
 from worldstate.ground.checks import freeze_arrays
-from worldstate.ground.values import mean, part_means
 
 from .sequence_inputs import RECENT_HOPS, SIDES
 from .sequence_model import COMING_S, GROUPS

@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, mean, median
 from worldstate.ground.checks import check_shape, freeze_arrays, in_range, one_of
 from worldstate.ground.serialisation import ADDED, Layout
-from worldstate.ground.values import mean, median
 
 from . import window_classes
 from .published_signature import ModelDomain, SignatureModel

@@ -26,9 +26,8 @@ from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
-from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range, mean
 from worldstate.ground.serialisation import Check
-from worldstate.ground.values import mean
 
 from .ensemble import KINDS, EnsembleModel, log_levels
 from .window_classes import window_evidence

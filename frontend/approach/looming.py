@@ -32,8 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array
-from worldstate.ground.values import mean
+from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, mean
 
 # Two parameters and a scatter of their own need two degrees of freedom.
 MIN_POINTS = 4

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.frontend.array.microphone_array import ChannelMask
-from worldstate.ground import BoolArray, FloatArray, NotUsable
+from worldstate.ground import BoolArray, FloatArray, NotUsable, mean
 from worldstate.ground.typing import Float32Array, IndexArray
-from worldstate.ground.values import mean
 
 DropoutKind = Literal["still", "splice", "repeat"]
 

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.fft import rfft
 from numpy.typing import NDArray
 
-from worldstate.ground import FloatArray, IntArray, NotUsable, in_range
-from worldstate.ground.values import mean
+from worldstate.ground import FloatArray, IntArray, NotUsable, in_range, mean
 
 from .resampling import Decimator
 from .stft import fast_length, power

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
 from worldstate.belief.kinematics.motion import FARTHEST_M, LEAST_STD
-from worldstate.ground import FloatArray, wrap_angle
-from worldstate.ground.values import replaced
+from worldstate.ground import FloatArray, replaced, wrap_angle
 from worldstate.measurement import CameraLook, Sector
 from worldstate.measurement.position import Position, PositionScan
 

@@ -27,8 +27,7 @@ from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.markov_chain import balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import HOP_S
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
-from worldstate.ground import TINY, FloatArray, seconds
-from worldstate.ground.values import mean, replaced
+from worldstate.ground import TINY, FloatArray, mean, replaced, seconds
 
 from .street_model import StreetModel
 

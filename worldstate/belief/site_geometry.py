@@ -9,8 +9,7 @@ import numpy as np
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.belief.kinematics.cartesian import NumbersT
 from worldstate.belief.kinematics.motion import LEAST_STD, MotionBelief
-from worldstate.ground import FloatArray, wrap_angle
-from worldstate.ground.values import replaced
+from worldstate.ground import FloatArray, replaced, wrap_angle
 from worldstate.measurement import CameraLook, Look, Sector
 
 from .settings import FilterSettings

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
-from worldstate.ground import InvalidArgumentError, in_range
+from worldstate.ground import InvalidArgumentError, in_range, replaced
 from worldstate.ground.serialisation import Layout, Via, decode
-from worldstate.ground.values import replaced
 
 
 @dataclass(frozen=True, slots=True)

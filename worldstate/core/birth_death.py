@@ -9,8 +9,7 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import NEVER_NS, Track, Tracks, born, heard_as
-from worldstate.ground import TINY
-from worldstate.ground.values import replaced
+from worldstate.ground import TINY, replaced
 from worldstate.measurement import Measurement
 from worldstate.state import Event
 from worldstate.state.entity import EventKind

@@ -15,8 +15,7 @@ from worldstate.belief.hidden_bearing import announced, time_to_visible
 from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Track
-from worldstate.ground import TINY
-from worldstate.ground.values import replaced
+from worldstate.ground import TINY, replaced
 from worldstate.measurement import Measurement
 from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
 

@@ -36,9 +36,8 @@ from worldstate.belief.track import (
     occluded,
     relabelled,
 )
-from worldstate.ground import TINY, FloatArray, seconds, wrap_angle
+from worldstate.ground import TINY, FloatArray, replaced, seconds, wrap_angle
 from worldstate.ground.typing import IndexArray
-from worldstate.ground.values import replaced
 from worldstate.measurement import CameraLook, Measurement, PositionScan, Sector
 
 from .birth_death import HIDDEN, after_look, born_hidden

@@ -9,9 +9,8 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated
 from worldstate.belief.detection import BY_ALL
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
-from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds
+from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds, replaced
 from worldstate.ground.serialisation import Layout, decode, encode
-from worldstate.ground.values import replaced
 from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sighting
 from worldstate.state import Context, Priors, WorldState
 from worldstate.state.world_state import judged

@@ -11,8 +11,7 @@ from worldstate.belief.hidden_bearing import time_to_visible
 from worldstate.belief.kinematics.motion import LEAST_STD
 from worldstate.belief.site_geometry import normal_share
 from worldstate.belief.track import Track, Tracks, occluded, side_weights
-from worldstate.ground import TINY, FloatArray, nanoseconds
-from worldstate.ground.values import replaced
+from worldstate.ground import TINY, FloatArray, nanoseconds, replaced
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
 

@@ -44,9 +44,9 @@ from worldstate.ground import (
     InvalidArgumentError,
     finite_array,
     nanoseconds,
+    replaced,
     seconds,
 )
-from worldstate.ground.values import replaced
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Budget, Context, Priors, Rates
 

@@ -17,6 +17,10 @@ from .values import TINY as TINY
 from .values import NotUsable as NotUsable
 from .values import falling as falling
 from .values import integer_ns as integer_ns
+from .values import mean as mean
+from .values import median as median
 from .values import nanoseconds as nanoseconds
+from .values import part_means as part_means
+from .values import replaced as replaced
 from .values import seconds as seconds
 from .values import wrap_angle as wrap_angle

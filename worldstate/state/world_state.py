@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
 from worldstate.abduction.road_users import DomainVerdict, Foreign
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
-from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable
+from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable, replaced
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout, decode, decode_json, encode
-from worldstate.ground.values import replaced
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
