@@ -190,7 +190,8 @@ def test_a_card_is_found_under_any_tilt(seed: int, amount: float) -> None:
     card = candidates[rng.integers(len(candidates))]
     free = untilted(positions, np.ones(12, bool))
     values = amount * card + 3.0 * positions @ rng.standard_normal(3) + 5.0
-    found = best_card(free @ values, free, candidates)
+    power = np.einsum("rm,mn,rn->r", candidates, free, candidates)
+    found = best_card(free @ values, power, candidates)
     assert found.channels.tolist() == (card > 0.0).tolist()
     assert found.amount == pytest.approx(amount, rel=1e-6)
 

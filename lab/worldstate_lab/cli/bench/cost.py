@@ -2,7 +2,8 @@
 
 56 channels, 47,998 Hz, nfft 512, half overlap, BLAS pinned to one thread. Milliseconds are the median over
 rounds of the median (and 99th percentile) over hops. The sound is a broadband source and an engine line in
-noise as loud as the source. --files prints the files of the library that one hop of the whole chain executes.
+noise as loud as the source. --files prints the files of the library that one hop of the whole chain
+executes, and how many calls it makes.
 
 example: worldstate-lab bench
 """
@@ -94,7 +95,7 @@ SETTINGS = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
-    parser.add_argument("--files", action="store_true", help="list the files of one hop, time nothing")
+    parser.add_argument("--files", action="store_true", help="list the files of one hop and count its calls")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -104,10 +105,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     street = rng.standard_normal((SECONDS * RATE_HZ, 56), dtype=np.float32)
     street += np.tile(_source(rng), (SECONDS // 2, 1))
     if arguments.files:
-        files = executed_files(street)
-        return CommandResult(
-            {"n_files": len(files), "files": files}, table={}, lines=[f"{len(files)}", *files]
-        )
+        files, calls = executed_files(street)
+        told = {"n_files": len(files), "n_calls": calls, "files": files}
+        return CommandResult(told, table={}, lines=[f"{len(files)} files, {calls} calls", *files])
     runs: list[Mapping[str, Milliseconds]] = []
     with threadpool_limits(1), progress_bar("timing", rounds, quiet=arguments.json) as bar:
         kernels = tuple(_kernel(info) for info in threadpool_info())
@@ -214,26 +214,31 @@ def live_times(hops: Sequence[Float32Array]) -> Milliseconds:
     return times[WARM_UP_HOPS:]
 
 
-def executed_files(street: Float32Array) -> list[str]:
-    """Return the files of the library that a hop executes: the most of the last ten, with a box in view."""
+def executed_files(street: Float32Array) -> tuple[list[str], int]:
+    """Return the files of the library that a hop executes, and the calls that it makes, of Python and of C.
+
+    The most files of the last ten hops and the median of their calls, sound to JSON, with a box in view.
+    """
     listener = Listener(open_source("microphones", array=ovad_array()), RATE_HZ)
     box = DetectionFrame(np.array([[700.0, 500.0, 900.0, 700.0]]), np.array([0.9]), ("car",))
-    passed = [set[str]() for _ in range(10)]
+    passed, calls = [set[str]() for _ in range(10)], [0] * 10
 
     def follow(frame: FrameType, event: str, _: object) -> None:
+        calls[0] += event in ("call", "c_call")
         module = str(frame.f_globals.get("__name__"))
         # Generated code, as that of dataclasses, stands in no file.
         if event == "call" and module.startswith("worldstate.") and frame.f_code.co_filename.endswith(".py"):
             passed[0].add(module.replace(".", "/") + ".py")
 
     for number, hop in enumerate(_hops(street), start=1):
-        passed = [set(), *passed[:-1]]
+        passed, calls = [set(), *passed[:-1]], [0, *calls[:-1]]
         listener.look(nanoseconds(0.1 * number - 0.05), box)
         sys.setprofile(follow)
-        listener.push(hop)
+        for state in listener.push(hop):
+            state.to_json()
         sys.setprofile(None)
     fullest = max(passed, key=len)
-    return sorted(fullest)
+    return sorted(fullest), int(np.median(calls))
 
 
 def _report(runs: list[Mapping[str, Milliseconds]], kernels: tuple[str, ...]) -> dict[str, Any]:
