@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, looming
+from worldstate.frontend.approach.looming import EnergyFloor
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, one_blas_thread
 from worldstate.frontend.direction.bearing import (
@@ -19,11 +19,11 @@ from worldstate.frontend.direction.bearing import (
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD, FEATURE_SEGMENTS
 from worldstate.frontend.spectra.sound_character import SoundCharacter
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power
-from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, nanoseconds
+from worldstate.ground import FloatArray, InvalidArgumentError, nanoseconds
 from worldstate.ground.checks import check_shape, freeze_arrays, in_range
 from worldstate.ground.typing import Float32Array
 
-from .hop_spectra import SILENCE, Hop, HopCutter, LevelMeter, hop_end, mean_square_per_bin
+from .hop_spectra import Hop, HopCutter, LevelMeter, hop_end, looming_of, mean_square_per_bin
 from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
 from .stream import CHARACTER_IS_OFF, AcousticFrame
 
@@ -177,6 +177,7 @@ class SpectrumFrontEnd:
         spectrum, azimuths = about_the_peak(newest, self.spectra.azimuths_rad)
         peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
         bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
+        times_s = np.asarray((np.arange(-len(self._energies), 0) + 0.5) / HOP_RATE_HZ, np.float64)
         halves = self._published[window][each - 1 :: each].reshape(FEATURE_SEGMENTS, HALF_HOPS // each, -1)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
@@ -189,18 +190,9 @@ class SpectrumFrontEnd:
             least_prominence=floor,
             peaks=peaks,
             band_log_energy=levels,
-            looming=self._looming(),
+            looming=looming_of(times_s, np.array(self._energies), self._floor),
             feature=halves.mean(axis=1).ravel(),
             bearing_age_s=0.5 * max(BEARING_HOPS, each) / HOP_RATE_HZ,
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
             heard=None,
         )
-
-    def _looming(self) -> Looming | NotUsable:
-        energies = np.array(self._energies)
-        if len(energies) < MIN_POINTS or energies.min() <= SILENCE:
-            return NotUsable("silence within the window")
-        times_s = (np.arange(-len(energies), 0) + 0.5) / HOP_RATE_HZ
-        low, high = LOOMING_BAND_HZ
-        scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
-        return looming(times_s, np.log(energies), scatter, *self._floor.read(float(energies.min()), scatter))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, approach_rate
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.direction.bearing import steered_power
@@ -31,6 +32,7 @@ from worldstate.ground import (
     FloatArray,
     IntArray,
     InvalidArgumentError,
+    NotUsable,
     falling,
     mean,
 )
@@ -198,6 +200,16 @@ class HopSpectra:
 
 # Mean square below which a band is silent, far below 24-bit quantisation; keeps the logarithm finite.
 SILENCE = 1e-20
+
+
+def looming_of(times_s: FloatArray, energies: FloatArray, floor: EnergyFloor) -> Looming | NotUsable:
+    """Return the approach rate at time 0 by the energies of hops, (n,), in the noise of half a minute."""
+    lowest = min(energies.tolist(), default=0.0)
+    if len(times_s) < MIN_POINTS or lowest <= SILENCE:
+        return NotUsable("silence within the window")
+    low, high = LOOMING_BAND_HZ
+    scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
+    return approach_rate(times_s, np.log(energies), scatter, *floor.read(lowest, scatter))
 
 
 def band_edges(bins: range, n_bands: int) -> IntArray:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, approach_rate
+from worldstate.frontend.approach.looming import EnergyFloor, Looming
 from worldstate.frontend.approach.tone import ToneReading, ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import one_blas_thread
@@ -31,8 +31,8 @@ from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, mean,
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.typing import BoolArray, Complex128Array, Float32Array, IndexArray
 
-from .hop_spectra import BANDS, HopSpectra, HopSums, LevelMeter, NoiseMeter, hop_window, push_hop
-from .settings import BEARING_HOPS, HOP_RATE_HZ, LOOMING_BAND_HZ, WINDOW_HOPS, FrontEndSettings
+from .hop_spectra import BANDS, HopSpectra, HopSums, LevelMeter, NoiseMeter, hop_window, looming_of, push_hop
+from .settings import BEARING_HOPS, HOP_RATE_HZ, WINDOW_HOPS, FrontEndSettings
 
 _NOT_MONITORED = NotUsable("microphones were not monitored")
 CHARACTER_IS_OFF = NotUsable("the character is off: see FrontEndSettings.character")
@@ -433,16 +433,7 @@ class FrontEnd:
     def _looming(self, end: int) -> Looming | NotUsable:
         window = self._window
         hops = (window["n_frames"] >= _LEAST_OF_HOP * np.maximum(window["n_new"], 1)).nonzero()[0]
-        if len(hops) < MIN_POINTS:
-            return NotUsable("silence within the window")
         # The same microphones in the whole window: one that fails within it must not look like a step of
         # level.
-        energies = mean(window["energies"][hops][:, self._used], 1)
-        lowest = float(np.minimum.reduce(energies))
-        if lowest <= SILENCE:
-            return NotUsable("silence within the window")
-        times = (window["centre"][hops] - end) / self.heard_rate_hz
-        low, high = LOOMING_BAND_HZ
-        scatter = ((high - low) / HOP_RATE_HZ) ** -0.5
-        noise = self._energy_floor.read(lowest, scatter)
-        return approach_rate(times, np.log(energies), scatter, *noise)
+        energies = mean(window["energies"][:, self._used], 1)[hops]
+        return looming_of((window["centre"][hops] - end) / self.heard_rate_hz, energies, self._energy_floor)

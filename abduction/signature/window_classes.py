@@ -10,7 +10,6 @@ so that a direct sound moves no explanation against another: its side is that of
 """
 
 from functools import lru_cache
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +28,6 @@ SMALLEST_PROBABILITY = 1e-7
 
 BOTH, DIRECT = "both", "direct"
 WINDOW_CLASSES = (*CLASSES, BOTH, DIRECT)
-_Six: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]  # Of the four, of both, of direct
 _MIRRORED = {LEFT: RIGHT, RIGHT: LEFT}
 _IS_SIDE = np.isin(range(len(CLASSES)), (LEFT, RIGHT)).astype(float)
 
@@ -96,11 +94,7 @@ def explained(shares: FloatArray, classes: tuple[str, ...], prior: FloatArray) -
     array([[0.  , 0.75, 0.  , 0.25],
            [0.2 , 0.3 , 0.2 , 0.3 ]])
     """
-    return _explained(_six(shares, classes), _six(prior[None], classes))
-
-
-def _explained(shares: _Six, prior: _Six) -> FloatArray:
-    (four, both, direct), (known, known_both, _) = shares, prior
+    (four, both, direct), (known, known_both, _) = _six(shares, classes), _six(prior[None], classes)
     usual = (known + 0.5 * known_both * _IS_SIDE)[0]
     return np.asarray(four + 0.5 * both * _IS_SIDE + direct * (usual / np.add.reduce(usual)))
 
@@ -121,11 +115,8 @@ def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatAr
     >>> side_ratios(window, WINDOW_CLASSES, np.full(6, 1 / 6)).round(2)
     array([[1.45, 1.45]])
     """
-    return _side_ratios(_six(posteriors, classes), _six(prior[None], classes))
-
-
-def _side_ratios(posteriors: _Six, prior: _Six) -> FloatArray:
-    (four, both, direct), (known, known_both, known_direct) = posteriors, prior
+    (four, both, direct), of_prior = _six(posteriors, classes), _six(prior[None], classes)
+    known, known_both, known_direct = of_prior
     told = 1.0 - known_direct
     sides = (four[:, [LEFT, RIGHT]] + both) / (known[:, [LEFT, RIGHT]] + known_both)
     rest = four[:, [FRONT, NONE]] / known[:, [FRONT, NONE]] * told + direct
@@ -160,11 +151,12 @@ def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: Flo
     >>> sides.both, sides.direct, sides.log_ratios[0] > sides.log_ratios[1]
     (0.1, 0.1, True)
     """
-    six, of_prior = _six(posteriors, classes), _six(prior[None], classes)
-    left, right = _side_ratios(six, of_prior)[0].tolist()
-    visible, (_, both, direct) = visible_ratios(posteriors, prior).item(), six
+    seen, known = [explained(one, classes, prior) for one in (posteriors, prior[None])]
+    left, right = side_ratios(posteriors, classes, prior)[0].tolist()
+    visible = visible_ratios(posteriors, prior).item()
+    _, both, direct = _six(posteriors, classes)
     sides = SideEvidence(DIRECTIONS, (left, right), both.item(), direct.item(), visible)
-    return evidence_of(_explained(six, of_prior), _explained(of_prior, of_prior)[0], sides)
+    return evidence_of(seen, known[0], sides)
 
 
 @lru_cache
@@ -172,7 +164,7 @@ def _columns(classes: tuple[str, ...]) -> list[int]:
     return [WINDOW_CLASSES.index(name) for name in classes]
 
 
-def _six(shares: FloatArray, classes: tuple[str, ...]) -> _Six:
+def _six(shares: FloatArray, classes: tuple[str, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return shares of the four, of both and of direct; zero where a model does not know one."""
     every = np.zeros((len(shares), len(WINDOW_CLASSES)))
     every[:, _columns(classes)] = shares
