@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from worldstate.frontend.spectra.resampling import Resampler
+from worldstate.frontend.spectra.resampling import Decimator, Resampler
 from worldstate.ground.typing import Float32Array
 
 # What converters give, and what some cards call so.
@@ -55,6 +55,23 @@ def test_blocks_of_any_length_give_the_same_to_the_bit(
     edges = [0, *sorted(set(cuts)), len(sound)]
     parts = [in_blocks.push(sound[start:end]) for start, end in pairwise(edges)]
     np.testing.assert_array_equal(np.concatenate(parts), at_once.push(sound))
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.sampled_from([12_000, 16_000, 47_998]), st.lists(st.integers(1, 8_999), max_size=9), SEEDS)
+def test_a_decimated_channel_is_what_scipy_makes_of_it_to_the_bit_in_any_blocks(
+    rate: int, cuts: list[int], seed: int
+) -> None:
+    sound = np.random.default_rng(seed).standard_normal(9_000)
+    at_once, in_blocks = Decimator(rate, 1000.0), Decimator(rate, 1000.0)
+    parts = [in_blocks.push(part) for part in np.split(sound, sorted(cuts))]
+    found = at_once.push(sound)
+    np.testing.assert_array_equal(np.concatenate(parts), found)
+    taps, _ = signal.kaiserord(80.0, (at_once.rate_hz - 2000.0) / (0.5 * rate))
+    beta = signal.kaiser_beta(80.0)
+    low_pass = signal.firwin(taps | 1, 0.5 * at_once.rate_hz, window=("kaiser", beta), fs=rate)
+    expected = np.convolve(sound, low_pass, "valid")[:: at_once.factor]
+    np.testing.assert_allclose(found, expected, atol=1e-13)
 
 
 @pytest.mark.parametrize(("rate", "wanted"), RATES)
