@@ -110,9 +110,14 @@ class StreetPrior:
         return reduce(np.multiply.outer, every)
 
     @cached_property
+    def joint(self) -> "JointBelief":
+        """The belief that holds nothing else, whose marginals are computed once."""
+        return JointBelief(self.weights)
+
+    @property
     def by_part(self) -> FloatArray:
         """The joint of the hidden parts and of whether anything is in view, shape (parts, ..., parts, 2)."""
-        return _by_part(self.weights)
+        return self.joint.by_part
 
     def carry(self, every: Sequence[FloatArray], street: StreetModel, step_ns: int) -> FloatArray:
         """Return some distributions a step later, in their order."""

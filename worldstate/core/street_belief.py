@@ -254,7 +254,7 @@ class StreetBelief:
         By a sequence model it is that a vehicle comes into view from a side within three seconds, else that
         one is hidden on any side, as the paper's statistic is. The last piece is `alarm_nats`.
         """
-        before = self._log_odds(JointBelief(self.prior(street).weights))
+        before = self._log_odds(self.prior(street).joint)
         pieces, last, kind = {"prior": before}, before, "sequence" if self.has_times else "window"
         for source, one in sorted(self.joint.alone.items()):
             last = last + (self._log_odds(JointBelief(one)) - before)
