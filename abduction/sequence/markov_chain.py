@@ -72,12 +72,21 @@ def balanced(chain: FloatArray, share: FloatArray, rounds: int = 2000) -> FloatA
     return np.asarray(flows / flows.sum(axis=1, keepdims=True))
 
 
-# At any rate above .01/s a chain is in equilibrium by then; a larger exponent of expm only costs digits.
+# At any rate above .01/s a chain is in equilibrium by then; a larger exponent only costs digits.
 LONGEST_STEP_S = 1000.0
+_MOST_JUMPS = 20  # Of which one is expected: more have less than 1e-18
 
 
 def transitions(rates_hz: FloatArray, step_ns: int) -> FloatArray:
     r"""Return exp(Q dt), read-only, rows sum to one; shapes (states, states).
+
+    .. math:: e^{Q t} = \Big( \sum_n e^{-m} \frac{m^n}{n!} J^n \Big)^{2^h}, \qquad
+              J = I + \frac{Q t}{2^h m}, \quad m = \frac{\max_i -Q_{ii} t}{2^h} \le 1
+
+    As no term is negative, all have their digits.
+
+    Source: A. Jensen, "Markoff chains as an aid in the study of Markoff processes", Scand. Actuar. J., 1953
+    (uniformisation). By numpy: scipy.linalg takes longer to import than numpy.
 
     Examples
     --------
@@ -85,11 +94,17 @@ def transitions(rates_hz: FloatArray, step_ns: int) -> FloatArray:
     array([[0.368, 0.632],
            [0.   , 1.   ]])
     """
-    # Imported where it is needed: scipy.linalg takes as long to import as numpy.
-    from scipy.linalg import expm
-
     step_s = min(step_ns / NANOSECONDS_PER_SECOND, LONGEST_STEP_S)
-    matrix: FloatArray = np.maximum(expm(rates_hz * step_s), 0.0)
+    jumps = max(float(-rates_hz.diagonal().min()) * step_s, TINY)
+    halvings = max(math.ceil(math.log2(jumps)), 0)
+    mean, one = jumps / 2.0**halvings, np.eye(len(rates_hz))
+    jump, term = one + rates_hz * (step_s / jumps), math.exp(-mean) * one
+    matrix = term.copy()
+    for count in range(1, _MOST_JUMPS + 1):
+        term = term @ jump * (mean / count)
+        matrix += term
+    for _ in range(halvings):
+        matrix = matrix @ matrix
     matrix /= matrix.sum(axis=1, keepdims=True)
     matrix.flags.writeable = False
     return matrix

@@ -3,6 +3,7 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from worldstate.abduction.sequence.markov_chain import at_prior, balanced, transitions
 
@@ -18,6 +19,16 @@ def test_a_balanced_chain_keeps_its_distribution_and_two_steps_are_one(seed: int
     np.testing.assert_allclose(first @ second, both, atol=1e-9)
     np.testing.assert_allclose(share @ both, share, atol=1e-7)
     np.testing.assert_allclose(np.eye(5)[0] @ transitions(rates_hz, 10**12), share, atol=1e-4)
+
+
+@given(SEEDS, st.integers(1, 22), st.floats(-4.0, 2.0), st.integers(1, 10**10))
+def test_a_step_is_the_matrix_exponential_of_its_rates(
+    seed: int, states: int, scale: float, step_ns: int
+) -> None:
+    rates_hz = np.random.default_rng(seed).exponential(10.0**scale, (states, states))
+    np.fill_diagonal(rates_hz, 0.0)
+    np.fill_diagonal(rates_hz, -rates_hz.sum(axis=1))
+    np.testing.assert_allclose(transitions(rates_hz, step_ns), expm(rates_hz * (step_ns / 1e9)), atol=1e-11)
 
 
 @given(SEEDS)
