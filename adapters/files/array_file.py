@@ -10,7 +10,6 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
-from xml.sax.saxutils import quoteattr
 
 import defusedxml.ElementTree as SafeElementTree
 import numpy as np
@@ -214,6 +213,8 @@ def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array
         f'    <pos Name="Point {number}" x="{x!r}" y="{y!r}" z="{z!r}" />'
         for number, (x, y, z) in enumerate(in_file.tolist(), start=1)
     ]
+    from xml.sax.saxutils import quoteattr  # Imports an HTTP client
+
     head = f'<?xml version="1.0" encoding="utf-8"?>\n<MicArray name={quoteattr(name)}>'
     write_text(path, "\n".join([head, *rows, "</MicArray>", ""]))
 

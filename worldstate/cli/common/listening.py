@@ -138,14 +138,17 @@ def open_given(
     from dataclasses import replace
 
     from worldstate.adapters.files.context_file import read_context
-    from worldstate.operations.labelling.street_passes import read_street
-    from worldstate.smoothing.learned_street import context_of
 
     arguments = given.arguments
     if None not in (arguments.street, arguments.context):
         raise InvalidArgumentError("--street: expected it without --context, both say what stands there")
-    street = None if arguments.street is None else read_street(arguments.street)
-    context = None if arguments.context is None else read_context(arguments.context)
+    context, street = None if arguments.context is None else read_context(arguments.context), None
+    if arguments.street is not None:  # Imported here: it takes a tenth of the start of a run without one
+        from worldstate.operations.labelling.street_passes import read_street
+        from worldstate.smoothing.learned_street import context_of
+
+        street = read_street(arguments.street)
+        context = context_of(street)
     settings = replace(
         search_of(arguments),
         budget=arguments.budget,
@@ -166,7 +169,7 @@ def open_given(
         camera=given.camera,
         miss_rates=given.miss_rates,
         model=given.model,
-        context=context if street is None else context_of(street),
+        context=context,
         sides=None if street is None else street.patterns,
         settings=settings,
         **own,
