@@ -304,6 +304,13 @@ class ListenerParts(_Parts, total=False):
     moving_ego: bool
 
 
+class CorpusParts(_Parts, total=False):
+    """What `open_source` takes of all recordings of a corpus alike."""
+
+    array: Path | str | MicrophoneArray | None
+    sides: SidePatterns | None
+
+
 def open_source(
     path: SoundInput | str | Sequence[str],
     *,

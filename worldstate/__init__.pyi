@@ -24,6 +24,7 @@ from .measurement.measurement import Sighting as Sighting
 from .measurement.odometry import Odometry as Odometry
 from .measurement.position import Position as Position
 from .measurement.position import PositionScan as PositionScan
+from .operations.corpus.corpus_run import hear as hear
 from .state.context import Context as Context
 from .state.context import corner_at as corner_at
 from .state.entity import Entity as Entity

@@ -28,11 +28,11 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.ground import InputFileError, InvalidArgumentError, in_range
 from worldstate.ground.checks import check_ranges
 from worldstate.ground.extras import check_extra, optional
+from worldstate.ground.parallel import deferred_signals, in_processes
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
 from worldstate.simulation.camera.street_view import View, paint_street
 from worldstate.simulation.camera.vehicle_view import PAINTS, Car, add_car, with_parked_car
-from worldstate.simulation.parallel import deferred_signals, in_processes
 from worldstate.simulation.scene.junction import MOVING_SITES, PLACES, SITES, Site, place, place_of
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.presets import DEFAULT_PRESET, preset

@@ -14,10 +14,10 @@ import scipy
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.emitters.placed_sound import WEATHER, add_signal, add_sound, add_vehicle
 from worldstate.simulation.emitters.weather import add_rain
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.presets import Ambience, Preset, recording_ambience, site_ambience

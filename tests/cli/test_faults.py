@@ -366,7 +366,7 @@ def interrupted(words: list[str], begun, number: int) -> int:
 CODES = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
 LATE = """
 import os, signal, sys
-from worldstate.simulation.parallel import deferred_signals
+from worldstate.ground.parallel import deferred_signals
 def end(number, frame): raise SystemExit(128 + number)
 for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, end)
 with deferred_signals():

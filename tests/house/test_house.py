@@ -149,7 +149,8 @@ def test_every_exported_name_is_the_one_of_its_home():
             home = sys.modules[getattr(value, "__module__", None) or name]
             assert getattr(home, exported, value) is value
     assert sum(len(package.__all__) for package in packages.values()) <= 250
-    assert 20 <= len(packages["worldstate"].__all__) <= 30
+    # Thirty, and `hear`, which a program over a corpus begins with.
+    assert 20 <= len(packages["worldstate"].__all__) <= 31
 
 
 def test_everything_can_be_imported_at_once():

@@ -18,7 +18,7 @@ from worldstate.ground.errors import InvalidArgumentError
 # A group is a folder, a command is a module in it, with `add_options` and `run` and a docstring that ends in
 # examples; each keeps its heavy imports inside `run`.
 COMMANDS = (
-    *("demo", "run", "live", "explain"),
+    *("demo", "run", "live", "hear", "explain"),
     *("array check", "array bounds", "array bearings", "array align", "array list"),
     *("model make", "model fit", "model threshold", "model features", "model detector"),
     *("model show", "model list"),

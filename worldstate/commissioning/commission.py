@@ -23,11 +23,11 @@ from worldstate.adapters.files.model_file import DataSource, Model, RealFigure, 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.stream.settings import StreamSettings
 
 from .alarm_curve import LEAST_ONSETS, UNREACHED, advised, alarm_levels, measured_curve, stream_states

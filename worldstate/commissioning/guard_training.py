@@ -18,10 +18,10 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES, SoundCharacter
 from worldstate.ground.extras import optional
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.ground.values import NotUsable, significant
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.kinds import KINDS
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SimulationSettings, with_sounds
 from worldstate.simulation.sound.ego_sound import ego_noise

@@ -14,9 +14,9 @@ from worldstate.abduction.road_users import UNKNOWN, RoadUserModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, EDGES_HZ, HOPS_A_SECOND, MEASURES
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import significant
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.sound.receiver import standing_m
 from worldstate.simulation.stream.arrivals import VehicleEvent

@@ -22,10 +22,10 @@ from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.operations.training.site_references import simulated_beside, with_site_references
 from worldstate.operations.training.training import fit_ensemble
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import open_road
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS

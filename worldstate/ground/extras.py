@@ -9,6 +9,7 @@ from .errors import MissingExtraError
 # Import name: name on the package index, and the extra that brings it.
 EXTRAS = {
     "cv2": ("opencv-python-headless", "vision"),
+    "distributed": ("distributed", "dask"),
     "filterpy": ("filterpy", "smoothing"),
     "foxglove": ("foxglove-sdk", "foxglove"),
     "gtsam": ("gtsam", "gtsam"),
@@ -18,6 +19,7 @@ EXTRAS = {
     "networkx": ("networkx", "graph"),
     "onnxruntime": ("onnxruntime", "onnx"),
     "osi3": ("osi-python", "osi"),
+    "pyarrow": ("pyarrow", "corpus"),
     "rerun": ("rerun-sdk", "rerun"),
     "rich": ("rich", "cli"),
     "rosbags": ("rosbags", "ros"),

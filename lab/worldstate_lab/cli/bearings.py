@@ -36,11 +36,11 @@ from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import MissingExtraError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import Figures
 from worldstate.operations.recordings.hop_table import HOP_S
-from worldstate.simulation.parallel import in_processes
 from worldstate_lab.report.table import figure_lines
 
 RATE_HZ, LASTS_S = 24_000, 3.0  # At which nothing is resampled

@@ -30,7 +30,7 @@ from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.stream_exam import ExaminedStream, exam_figures, with_exam
 from worldstate.frontend import ovad_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation.parallel import in_processes
+from worldstate.ground.parallel import in_processes
 from worldstate_lab.cli.main import read_results
 
 ROOF = "a real car's roof (OVAD)"

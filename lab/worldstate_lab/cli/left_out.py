@@ -58,9 +58,9 @@ from worldstate.commissioning.heard_stream import (
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import ExaminedStream, alarm_outcomes, examine
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, Figures, caution, mean_of
-from worldstate.simulation.parallel import in_processes
 from worldstate_lab.report.table import figure_lines
 
 NEEDS = ("sklearn",)

@@ -23,7 +23,7 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import track
 from worldstate.ground.checks import in_range
-from worldstate.simulation.parallel import in_processes
+from worldstate.ground.parallel import in_processes
 from worldstate_lab.planner.encounters import FROM_STANDING, BelievedStream, EgoVehicle, believed_stream
 from worldstate_lab.planner.planner_exam import (
     THRESHOLDS,

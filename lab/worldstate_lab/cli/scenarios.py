@@ -31,9 +31,9 @@ from worldstate.commissioning.commission import parts_of
 from worldstate.commissioning.heard_stream import hear_stream, junction_named
 from worldstate.commissioning.stream_exam import approach_table
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray
 from worldstate.operations.metrics.approach_table import Figures, mean_of
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.stream.arrivals import draw_sounds
 from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.writing import SOUNDS

@@ -45,11 +45,11 @@ from worldstate.commissioning.commission import levels_of, parts_of, with_curve
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import SECONDS_PER_HOUR
 from worldstate.operations.metrics.approach_table import ApproachTable, Figures
 from worldstate.operations.recordings.hop_table import HOP_S
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import standing_name
 from worldstate_lab.passes.budget_days import budget_days
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream

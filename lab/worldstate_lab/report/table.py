@@ -21,8 +21,8 @@ import numpy as np
 
 from worldstate.adapters.files.file_io import check_target
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.parallel import deferred_signals
 from worldstate.operations.figure_style import figure_file
-from worldstate.simulation.parallel import deferred_signals
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -9,6 +9,7 @@ import numpy as np
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.acoustic import Grounding
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.approach_table import (
     ApproachTable,
@@ -18,7 +19,6 @@ from worldstate.operations.metrics.approach_table import (
     rising_edges,
 )
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.simulation.parallel import in_processes
 from worldstate_lab.evaluation.ablation_rows import (
     AblationRow,
     AblationSwitches,

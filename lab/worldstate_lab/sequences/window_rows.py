@@ -18,9 +18,9 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel
 from worldstate.cli.common.progress import track
 from worldstate.core.filter import WorldFilter
+from worldstate.ground.parallel import in_processes
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.simulation.parallel import in_processes
 from worldstate_lab.report.table import Table, Value
 from worldstate_lab.trials.trial import Trial
 

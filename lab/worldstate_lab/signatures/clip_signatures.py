@@ -16,9 +16,9 @@ from worldstate.frontend.hop_spectra import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.operations.figure_style import legend_beside
-from worldstate.simulation.parallel import in_processes
 
 from .traffic_clips import BACKGROUND, ClipLabels, TrafficClip, read_clip
 

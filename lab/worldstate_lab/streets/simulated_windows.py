@@ -20,10 +20,10 @@ from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.feature import FEATURE_RATE_HZ, published_feature
 from worldstate.ground.checks import in_range
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, TextArray
 from worldstate.operations.metrics.approach_table import auroc
 from worldstate.simulation.dataset.recording import simulate_recording
-from worldstate.simulation.parallel import in_processes
 from worldstate.simulation.scene.junction import SITES
 from worldstate.simulation.scene.presets import Preset, preset
 from worldstate.simulation.scene.settings import SimulationSettings, draw_settings

@@ -21,9 +21,9 @@ from worldstate.adapters.files.file_io import write_text
 from worldstate.adapters.files.model_file import read_model
 from worldstate.frontend.array.steering import one_blas_thread
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, WorldstateError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.serialisation import encode
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, load_named, save_named
-from worldstate.simulation.parallel import in_processes
 
 from .listening import (
     VERSION,

@@ -124,22 +124,14 @@ def array_of_model(
         return None  # what reads the whole file says what is wrong with it
 
 
-def open_given(
-    given: GivenSensors,
-    sound: "SoundInput | LiveSound",
-    *,
-    boxes: "adapters.DetectionFilter",
-    mask_dead: bool,
-    ego: "OdometryLog | None" = None,
-    moving_ego: bool = False,
-    **own: Any,
-) -> "adapters.Source":
-    """Return what is listened to, as the options say; `own` are further arguments of `open_source`."""
+def place_and_settings(
+    arguments: argparse.Namespace, boxes: "adapters.DetectionFilter", mask_dead: bool
+) -> dict[str, Any]:
+    """Return context, sides and settings of `open_source`, as the options of a command name them."""
     from dataclasses import replace
 
     from worldstate.adapters.files.context_file import read_context
 
-    arguments = given.arguments
     if None not in (arguments.street, arguments.context):
         raise InvalidArgumentError("--street: expected it without --context, both say what stands there")
     context, street = None if arguments.context is None else read_context(arguments.context), None
@@ -160,6 +152,21 @@ def open_given(
         boxes=boxes,
         mask_dead=mask_dead,
     )
+    return {"context": context, "sides": None if street is None else street.patterns, "settings": settings}
+
+
+def open_given(
+    given: GivenSensors,
+    sound: "SoundInput | LiveSound",
+    *,
+    boxes: "adapters.DetectionFilter",
+    mask_dead: bool,
+    ego: "OdometryLog | None" = None,
+    moving_ego: bool = False,
+    **own: Any,
+) -> "adapters.Source":
+    """Return what is listened to, as the options say; `own` are further arguments of `open_source`."""
+    parts = place_and_settings(given.arguments, boxes, mask_dead)
     if given.model is None and (moving_ego or (ego is not None and ego.moves)):
         say("the model of a moving ego is used, as odometry is given")
     source = adapters.open_source(
@@ -169,9 +176,7 @@ def open_given(
         camera=given.camera,
         miss_rates=given.miss_rates,
         model=given.model,
-        context=context,
-        sides=None if street is None else street.patterns,
-        settings=settings,
+        **parts,
         **own,
     )
     if source.street is None:

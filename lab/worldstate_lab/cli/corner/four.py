@@ -41,10 +41,10 @@ from worldstate.adapters.source import open_source
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import seconds
 from worldstate.operations.metrics.approach_table import Figures, auroc, mean_of, share_interval
-from worldstate.simulation.parallel import in_processes
 from worldstate_lab.metrics.intervals import highest_share, stratified_draws
 from worldstate_lab.report.table import MISSING, Table, Value, cell_text
 

@@ -29,7 +29,7 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation.parallel import in_processes
+from worldstate.ground.parallel import in_processes
 from worldstate_lab.evaluation.figures import paper_value
 from worldstate_lab.evaluation.protocols import (
     FIXED,

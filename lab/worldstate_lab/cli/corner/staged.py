@@ -33,8 +33,8 @@ from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.parallel import in_processes
 from worldstate.operations.figure_style import figure_file
-from worldstate.simulation.parallel import in_processes
 from worldstate_lab.degradation.beta_curves import BetaCurves
 from worldstate_lab.degradation.conditions import FAMILIES, at_level
 from worldstate_lab.evaluation.report.recording_panels import approach_figure, approach_images

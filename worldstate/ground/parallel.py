@@ -7,12 +7,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import TypeVar
 
-from worldstate.ground.errors import WorldstateError
+from .errors import WorldstateError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -51,6 +51,27 @@ def in_processes(
             for worker in set(multiprocessing.active_children()) - others:
                 worker.terminate()
             raise
+
+
+def in_executor(
+    executor: Executor, work: Callable[[Item], Result], items: Sequence[Item]
+) -> Generator[Result, None, None]:
+    """Yield ``work(item)`` of any executor for every item, in the order of the items.
+
+    Examples
+    --------
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> with ThreadPoolExecutor(2) as threads:
+    ...     list(in_executor(threads, abs, [-2, 1]))
+    [2, 1]
+    """
+    waiting = deque(executor.submit(work, item) for item in items)
+    try:
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for one in waiting:
+            one.cancel()
 
 
 def _begin() -> None:

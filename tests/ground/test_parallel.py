@@ -11,7 +11,7 @@ import pytest
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InputFileError, MissingExtraError, SchemaVersionError, WorldstateError
-from worldstate.simulation.parallel import in_processes
+from worldstate.ground.parallel import in_processes
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
@@ -43,7 +43,7 @@ def test_the_end_of_a_worker_is_an_error():
 
 SLEEPERS = """
 import time
-from worldstate.simulation.parallel import in_processes
+from worldstate.ground.parallel import in_processes
 for _ in in_processes(time.sleep, [0.0, 0.0, 60.0, 60.0], 2): print("one", flush=True)
 """
 
@@ -52,7 +52,7 @@ DEAF = """
 import signal, time
 from functools import partial
 from operator import call
-from worldstate.simulation.parallel import in_processes
+from worldstate.ground.parallel import in_processes
 items = [partial(signal.signal, signal.SIGTERM, signal.SIG_IGN)] * 2 + [partial(time.sleep, 60.0)] * 2
 for _ in in_processes(call, items, 2): print("one", flush=True)
 """

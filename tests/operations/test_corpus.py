@@ -1,0 +1,261 @@
+"""A corpus heard: its tables, the same bytes for any workers and after kills, and what a second run does."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import soundfile
+from hypothesis import given
+from hypothesis import strategies as st
+from scripted_states import scripted_states
+
+from worldstate import ListenSettings, WorldState, hear
+from worldstate.adapters import open_source
+from worldstate.cli.main import main
+from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds
+from worldstate.operations import run_recording
+from worldstate.operations.corpus.approach_meter import ApproachMeter
+from worldstate.operations.corpus.corpus_inputs import find_corpus
+from worldstate.operations.corpus.corpus_tables import TABLES, read_rows
+from worldstate.operations.recordings.evidence_report import told_advisories
+from worldstate.operations.recordings.recording_report import WarningMeter
+from worldstate.state import Advisory, Context, RiskCue
+
+pytest.importorskip("pyarrow")
+
+
+@pytest.fixture(scope="module")
+def corpus(street, tmp_path_factory) -> Path:
+    """Return a folder with sound of two sites, a log of snapshots, and a file that is no sound."""
+    folder = tmp_path_factory.mktemp("corpus")
+    for name in ("north/a.wav", "north/b.wav", "south/c.wav"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(street / "street.wav", folder / name)
+    (folder / "south" / "broken.wav").write_text("no sound")
+    lines = [state.to_json() for state in scripted_states()]
+    (folder / "south" / "log.jsonl").write_text("\n".join([*lines, ""]))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def options(street) -> dict[str, object]:
+    return {"array": street / "mics.csv", "settings": ListenSettings(uncalibrated=True)}
+
+
+@pytest.fixture(scope="module")
+def heard(corpus, options, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("heard") / "out"
+    found = hear(corpus, out, **options)
+    assert [one.status for one in found] == ["heard", "heard", "failed", "heard", "heard"]
+    assert sum(one.sound_s for one in found) == pytest.approx(0.1 * (3 * 11 + 6))
+    return out
+
+
+def rows(out: Path, table: str) -> list:
+    return [row for path in sorted((out / table).glob("*.parquet")) for row in read_rows(path, TABLES[table])]
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {
+        str(one.relative_to(out)): one.read_bytes()
+        for one in out.rglob("*")
+        if one.is_file() and not one.name.startswith(".")
+    }
+
+
+def test_a_recording_gives_the_advisories_of_run_and_the_vehicle_that_was_seen(approach, tmp_path):
+    hear(approach.folder, tmp_path, hops=True)
+    report = run_recording(open_source(approach.folder), states_path=tmp_path / "states.jsonl")
+    (recording,), approaches = rows(tmp_path, "recordings"), rows(tmp_path, "approaches")
+    assert (recording.hops, recording.failure) == (report.hops, None)
+    assert recording.onsets == len(report.warning.advisory_onsets_s)
+    assert {one.time_s for one in approaches} >= {*report.warning.advisory_onsets_s}
+    # The demo's van comes from the right, and its camera finds it.
+    (van,) = (one for one in approaches if one.seen)
+    assert van.side == "right" and van.label == "car"
+    assert van.lead_s == pytest.approx(van.seen_s - van.time_s) and 1.0 < van.lead_s < 5.0
+    snapshots = [row.snapshot for row in rows(tmp_path, "hops")]
+    assert snapshots == (tmp_path / "states.jsonl").read_text().splitlines()
+
+
+def test_what_cannot_be_heard_is_a_row_with_its_failure(heard):
+    failed = [row for row in rows(heard, "recordings") if row.failure]
+    assert [(row.recording, row.site, row.hops) for row in failed] == [("south/broken.wav", "south", 0)]
+    assert failed[0].failure.startswith("south/broken.wav: expected WAV")
+
+
+def test_a_log_of_snapshots_is_counted_as_it_stands(heard, corpus):
+    logged = [row for row in rows(heard, "hours") if row.recording == "south/log.jsonl"]
+    states = [
+        WorldState.from_json(line) for line in (corpus / "south" / "log.jsonl").read_text().splitlines()
+    ]
+    assert sum(row.hops for row in logged) == len(states)
+
+
+WAYS = {
+    "two processes": {"jobs": 2},
+    "threads": {"executor": ThreadPoolExecutor(3)},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_tables_are_the_same_bytes_however_many_work(way, corpus, options, heard, tmp_path):
+    hear(corpus, tmp_path, **options, **WAYS[way])
+    assert contents(tmp_path) == contents(heard)
+
+
+def test_shares_of_several_machines_make_up_the_whole(corpus, options, heard, tmp_path):
+    shares = [hear(corpus, tmp_path, shard=(number, 3), **options) for number in (1, 2, 3)]
+    assert sorted(one.recording for share in shares for one in share) == [
+        one.name for one in find_corpus(corpus)
+    ]
+    assert contents(tmp_path) == contents(heard)
+
+
+def test_the_same_corpus_elsewhere_has_the_same_tables(corpus, options, heard, tmp_path):
+    shutil.copytree(corpus, tmp_path / "moved")
+    hear(tmp_path / "moved", tmp_path / "out", **options)
+    assert contents(tmp_path / "out") == contents(heard)
+
+
+def test_a_second_run_hears_what_is_new_or_changed_and_nothing_else(corpus, options, street, tmp_path):
+    shutil.copytree(corpus, tmp_path / "corpus")
+    hear(tmp_path / "corpus", tmp_path / "out", **options)
+    before = contents(tmp_path / "out")
+    again = hear(tmp_path / "corpus", tmp_path / "out", **options)
+    assert [one.status for one in again] == ["there"] * 5
+    assert contents(tmp_path / "out") == before
+    changed = tmp_path / "corpus" / "north" / "a.wav"
+    samples, rate_hz = soundfile.read(changed)
+    soundfile.write(changed, 0.5 * samples, rate_hz)
+    shutil.copy(street / "street.wav", tmp_path / "corpus" / "d.wav")
+    third = hear(tmp_path / "corpus", tmp_path / "out", **options)
+    assert {one.recording for one in third if one.status == "heard"} == {"north/a.wav", "d.wav"}
+    # Of the changed one nothing else is left, so that no hour counts twice.
+    assert len([row for row in rows(tmp_path / "out", "recordings") if row.recording == "north/a.wav"]) == 1
+
+
+def test_a_failure_that_may_pass_is_tried_again(corpus, options, heard, tmp_path, monkeypatch):
+    from worldstate.operations.corpus import corpus_run
+
+    def fails(source: object) -> None:
+        raise OSError("the disk of the network is away")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(corpus_run, "listen_steps", fails)
+        assert [one.status for one in hear(corpus, tmp_path, **options)].count("failed") == 4
+    assert any("the disk of the network" in (row.failure or "") for row in rows(tmp_path, "recordings"))
+    assert [one.status for one in hear(corpus, tmp_path, **options)].count("heard") == 3
+    assert contents(tmp_path) == contents(heard)
+
+
+OTHERS = {
+    "{'hops': True}": {"hops": True},
+    "other options": {"settings": ListenSettings(uncalibrated=True, budget=3.0)},
+    "{'array': 'uma-8', 'model': 'uma-8.json.gz'}": {"array": "uma-8"},
+}
+
+
+@pytest.mark.parametrize("named", OTHERS)
+def test_a_folder_that_was_begun_in_another_way_is_refused(named, corpus, options, heard):
+    with pytest.raises(InputFileError, match=f"begun with, got {named}: another --out"):
+        hear(corpus, heard, **options | OTHERS[named])
+
+
+def test_a_manifest_names_sites_and_what_belongs_to_a_recording(corpus, tmp_path):
+    (corpus / "list.csv").write_text(
+        "path,site,detections\nsouth/c.wav,elm street,\nnorth/a.wav,,boxes.json\n"
+    )
+    first, second = find_corpus(corpus / "list.csv")
+    assert (first.name, first.site, first.detections) == ("north/a.wav", "", corpus / "boxes.json")
+    assert (second.path, second.site, second.detections) == (corpus / "south/c.wav", "elm street", None)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [("file\na.wav\n", "missing path"), ("path\na.wav\na.wav\n", "a.wav twice"), ("path\n", "got none")],
+)
+def test_a_manifest_that_means_nothing_is_refused(text, problem, tmp_path):
+    (tmp_path / "list.csv").write_text(text)
+    with pytest.raises(InputFileError, match=problem):
+        find_corpus(tmp_path / "list.csv")
+
+
+def test_a_share_that_is_none_is_refused(corpus, options, tmp_path):
+    with pytest.raises(InvalidArgumentError, match="shard: expected"):
+        hear(corpus, tmp_path, shard=(4, 3), **options)
+
+
+def states_of(raised: list[set[str]]) -> list[WorldState]:
+    """Return a state a hop with an advisory of each side that is named, from its onset on."""
+    states, since = [], dict[str, int]()
+    for hop, sides in enumerate(raised, start=1):
+        stamp_ns = nanoseconds(0.1 * hop)
+        since = {side: since.get(side, stamp_ns) for side in sides}
+        cues = [
+            RiskCue(
+                side, 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, None,
+                Advisory(since[side], stamp_ns) if side in since else None,
+            )
+            for side in ("left", "right")
+        ]  # fmt: skip
+        states.append(WorldState(stamp_ns, hop, context=Context(), cues=tuple(cues)))
+    return states
+
+
+@given(st.lists(st.sets(st.sampled_from(["left", "right"])), min_size=1, max_size=30))
+def test_approaches_and_onsets_are_those_that_explain_and_run_count(raised):
+    states = states_of(raised)
+    meter, warnings = ApproachMeter("a", ""), WarningMeter(None)
+    for state in states:
+        meter.update(state)
+        warnings.update(state)
+    told, _ = told_advisories(states)
+    found = {(one.side, nanoseconds(one.time_s), nanoseconds(one.end_s)) for one in meter.approaches()}
+    assert found == {(one.direction, one.since_ns, one.last_ns) for one in told}
+    assert meter.recording("").onsets == len(warnings.summary().advisory_onsets_s)
+    assert sum(row.hops for row in meter.hours()) == len(states)
+
+
+def test_a_vehicle_that_nothing_announced_is_an_approach_too():
+    *_, in_view, _ = scripted_states()
+    meter = ApproachMeter("a", "")
+    meter.update(replace(in_view, cues=()))
+    (missed,) = meter.approaches()
+    assert (missed.side, missed.time_s, missed.seen, missed.lead_s) == ("left", None, True, None)
+
+
+@pytest.mark.long
+def test_tables_are_the_same_bytes_after_ten_kills(corpus, street, heard, tmp_path):
+    words = [
+        "hear",
+        str(corpus),
+        "--array",
+        str(street / "mics.csv"),
+        "--uncalibrated",
+        "--out",
+        str(tmp_path),
+    ]
+    finished = 0
+    for kill in range(10):
+        jobs = ["--jobs", "2"] if kill in (4, 7) else []
+        with subprocess.Popen([sys.executable, "-m", "worldstate", *words, *jobs]) as run:
+            deadline = time.monotonic() + 60.0
+            # Further into the run with each kill: before the first file, between files, within one.
+            while run.poll() is None and time.monotonic() < deadline:
+                if len([*tmp_path.glob("*/*.parquet")]) >= kill:
+                    run.send_signal(signal.SIGKILL if kill % 2 else signal.SIGTERM)
+                    break
+                time.sleep(0.002)
+        finished += run.returncode == 0
+    assert finished < 10
+    assert main([*words, "--json"]) == 0
+    assert contents(tmp_path) == contents(heard)
+    assert json.loads((tmp_path / "corpus.json").read_text())["array"] == "mics.csv"

@@ -1,0 +1,105 @@
+"""`worldstate hear`: many recordings in, tables of approaches out.
+
+Hear every recording of a corpus and write its approaches as Parquet: time, side, lead, chance, and whether a
+vehicle was seen. A second run hears only what is missing, after a kill as well, and the tables are the same
+bytes for any number of processes or machines.
+
+CORPUS is a folder of sound files, bags of ROS 2, recording folders in the OVAD layout and logs of snapshots
+(JSON lines, MCAP), or a manifest: CSV with the column path, relative to its own folder, and optionally site,
+detections (of the camera) and odometry. Below a folder the first folder of a path is its site.
+
+DIR receives the folders recordings, approaches and hours, with one Parquet file a recording, named by its
+content, the array, the model, the options and the version. What cannot be heard is a row of recordings with
+its failure. Every file of a table can be read at once, as by pandas.read_parquet("DIR/approaches").
+
+Examples
+--------
+  worldstate hear drives --array mics.csv --model mine.json --out heard --jobs 8
+  worldstate hear drives.csv --array uma-8 --out heard --hops
+  worldstate hear drives --array uma-8 --out heard --shard $SLURM_ARRAY_TASK_ID/64
+"""
+
+import argparse
+import re
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common import inputs, listening, output, progress, sensors
+from worldstate.ground.errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from worldstate.operations.corpus.corpus_run import HeardShard
+
+NEEDS = ("pyarrow",)
+FIRST_OPTIONS = (
+    "--out",
+    "--array",
+    "--model",
+    "--budget",
+    "--alpha",
+    "--uncalibrated",
+    "--hops",
+    "--jobs",
+    "--shard",
+)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("corpus", type=Path, metavar="CORPUS", help="folder of recordings, or a manifest (CSV)")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder of the tables")
+    inputs.add_array_options(parser)
+    inputs.add_channel_option(parser)
+    sensors.add_car_option(parser)
+    sensors.add_lens_options(parser, parser.add_argument_group("camera"))
+    # The manifest names what each recording has of these.
+    parser.set_defaults(detections=[], images=None, image_rate=None, detector=None)
+    inputs.add_search_options(parser)
+    listening.add_listen_options(parser)
+    add("--mask-dead", action="store_true", help="leave silent channels out instead of failing")
+    add("--hops", action="store_true", help="write a row for each hop as well, its snapshot included")
+    add("--shard", default="1/1", metavar="I/N", help="the I-th of N shares, as of a SLURM array (from 1)")
+    add("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+
+
+def run(arguments: argparse.Namespace) -> output.CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.operations.corpus.corpus_inputs import find_corpus
+    from worldstate.operations.corpus.corpus_run import hear
+
+    given = sensors.given_sensors(arguments)
+    parts = listening.place_and_settings(arguments, given.setup.boxes, arguments.mask_dead)
+    begun_s, count = time.perf_counter(), len(find_corpus(arguments.corpus))
+    with progress.progress_bar("hearing", count) as bar:
+
+        def told(shard: "HeardShard") -> None:
+            if shard.failure is not None:
+                output.say(f"not heard: {shard.failure}")
+            bar.advance()
+
+        heard = hear(
+            arguments.corpus,
+            arguments.out,
+            jobs=arguments.jobs,
+            shard=_share(arguments.shard),
+            hops=arguments.hops,
+            on_recording=told,
+            array=given.car.array,
+            camera=given.camera,
+            miss_rates=given.miss_rates,
+            model=given.model,
+            **parts,
+        )
+    statuses, sound_s = Counter(one.status for one in heard), sum(one.sound_s for one in heard)
+    counts = {status: statuses[status] for status in ("heard", "there", "failed")}
+    speed = sound_s / (time.perf_counter() - begun_s)
+    return output.CommandResult(counts | {"sound_s": sound_s, "realtime_factor": speed})
+
+
+def _share(text: str) -> tuple[int, int]:
+    if (found := re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)) is None:
+        raise InvalidArgumentError(f"--shard: expected such as 3/8, got {text!r:.40}")
+    return int(found[1]), int(found[2])

@@ -1,0 +1,1 @@
+"""Many recordings: heard over processes or machines, kept as Parquet, counted."""

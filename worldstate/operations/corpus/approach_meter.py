@@ -1,0 +1,136 @@
+"""States of one recording in, its approaches and its hours by the state of the sensors out."""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+
+from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.ground.values import LEAST_HEARD, nanoseconds, seconds
+from worldstate.state import Entity, RiskCue, WorldState
+
+from .corpus_tables import HeardApproach, HeardRecording, StateHours
+
+# An advisory says that a vehicle comes into view within the risk's horizon.
+_HORIZON_S = COMING_S[-1]
+_LOOKED_NS = nanoseconds(0.5)  # An older look was not at this hop
+
+
+@dataclass(slots=True)
+class ApproachMeter:
+    """Counts what goes by and keeps a row for each approach, none of the states.
+
+    Examples
+    --------
+    >>> meter = ApproachMeter("a.wav", "elm street")
+    >>> meter.update(WorldState(stamp_ns=1_000_000_000, seq=1))
+    >>> meter.recording("").hops, [one.unheard for one in meter.hours()], meter.approaches()
+    (1, [None], [])
+    """
+
+    name: str
+    site: str
+    clock: str = "media"
+    first_ns: int | None = None
+    last_ns: int = 0
+    usable: int = 0
+    _raised: bool = False
+    _hops: Counter[tuple[str, str | None]] = field(default_factory=Counter)
+    _onsets: Counter[tuple[str, str | None]] = field(default_factory=Counter)
+    _rows: list[HeardApproach] = field(default_factory=list)
+    _standing: dict[str | None, int] = field(default_factory=dict)  # Rows of advisories that stand, by side
+    _in_view: dict[str, int] = field(default_factory=dict)  # Rows of vehicles that came into view
+
+    def update(self, state: WorldState) -> None:
+        """Take in the next state."""
+        self.first_ns = state.stamp_ns if self.first_ns is None else self.first_ns
+        self.last_ns, self.clock = state.stamp_ns, state.clock
+        self.usable += bool(state.cues) and all(cue.usable for cue in state.cues)
+        raised = [cue for cue in state.cues if cue.advisory is not None]
+        key = sensors_of(state), _unheard(state)
+        self._hops[key] += 1
+        self._onsets[key] += bool(raised) and not self._raised
+        self._raised = bool(raised)
+        self._advise(state, raised)
+        for entity in state.entities:
+            if entity.status == "visible" and entity.moving:
+                self._see(entity, seconds(state.stamp_ns))
+
+    def _advise(self, state: WorldState, raised: list[RiskCue]) -> None:
+        now_s, before, self._standing = seconds(state.stamp_ns), self._standing, {}
+        looked = any(state.stamp_ns - one.stamp_ns <= _LOOKED_NS for one in state.searched)
+        for cue in raised:
+            at = before.get(cue.direction, len(self._rows))
+            if at == len(self._rows):
+                expected_s = None if cue.time_to_visible_s is None else cue.time_to_visible_s[1]
+                begun = HeardApproach(self.name, self.site, cue.direction, now_s, chance=cue.risk)
+                self._rows.append(replace(begun, expected_s=expected_s, usable=cue.usable))
+            self._standing[cue.direction], row = at, self._rows[at]
+            self._rows[at] = replace(row, end_s=now_s, seen=False if looked and not row.seen else row.seen)
+
+    def _see(self, entity: Entity, now_s: float) -> None:
+        if (at := self._in_view.get(entity.id)) is None:
+            at = self._in_view[entity.id] = self._announced(entity.direction, now_s)
+            began_s = self._rows[at].time_s
+            lead_s = None if began_s is None else now_s - began_s
+            self._rows[at] = replace(self._rows[at], seen=True, seen_s=now_s, lead_s=lead_s)
+        likeliest = max(entity.classification or (), key=lambda one: one.probability, default=None)
+        label = self._rows[at].label if likeliest is None else likeliest.label
+        self._rows[at] = replace(self._rows[at], gone_s=now_s, label=label)
+
+    def _announced(self, side: str | None, now_s: float) -> int:
+        """Return the row of the advisory that announced a vehicle from this side, else a new one."""
+        for at, one in reversed([*enumerate(self._rows)]):
+            if one.side == side and one.seen_s is None and one.end_s is not None:
+                if now_s - one.end_s <= _HORIZON_S:
+                    return at
+                break
+        self._rows.append(HeardApproach(self.name, self.site, side))
+        return len(self._rows) - 1
+
+    def recording(self, content: str) -> HeardRecording:
+        """Return the row of the recording."""
+        begun = HeardRecording(self.name, self.site, content, self.clock)
+        if self.first_ns is None:
+            return begun
+        return replace(
+            begun,
+            start_s=seconds(self.first_ns),
+            end_s=seconds(self.last_ns),
+            hops=self._hops.total(),
+            heard=sum(hops for (_, unheard), hops in self._hops.items() if unheard is None),
+            usable=self.usable,
+            onsets=self._onsets.total(),
+        )
+
+    def approaches(self) -> list[HeardApproach]:
+        """Return the approaches in the order in which they began."""
+        return self._rows
+
+    def hours(self) -> list[StateHours]:
+        """Return the hops by state of the sensors."""
+        day = None
+        if self.clock == "unix" and self.first_ns is not None:
+            day = datetime.fromtimestamp(seconds(self.first_ns), UTC).date().isoformat()
+        return [
+            StateHours(self.name, self.site, day, *key, hops, self._onsets[key])
+            for key, hops in sorted(self._hops.items(), key=lambda one: (one[0][0], one[0][1] or ""))
+        ]
+
+
+def sensors_of(state: WorldState) -> str:
+    """Return the condition of every sensor in words.
+
+    Examples
+    --------
+    >>> from worldstate.state import SensorHealth
+    >>> sensors_of(WorldState(0, 1, sensors=(SensorHealth("acoustic", "working", 0),)))
+    'acoustic working'
+    """
+    return ", ".join(f"{one.sensor} {one.condition}" for one in state.sensors)
+
+
+def _unheard(state: WorldState) -> str | None:
+    """Return why no source could hear, None if one could, or if none states it."""
+    if not state.heard or any(one.share >= LEAST_HEARD for one in state.heard):
+        return None
+    return state.heard[0].reason or "unheard"

@@ -1,0 +1,266 @@
+"""A corpus heard: each recording once, by any number of processes or machines, into Parquet."""
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+
+from worldstate.adapters.audio.sound_file import SoundInput
+from worldstate.adapters.camera.detections import DetectionLog
+from worldstate.adapters.files.array_file import file_of_model, read_array
+from worldstate.adapters.files.file_io import read_json, write_json
+from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.adapters.files.odometry_file import read_odometry
+from worldstate.adapters.listener import listen_steps
+from worldstate.adapters.ros.bag_input import is_bag, needed_array, read_bag
+from worldstate.adapters.source import CorpusParts, Source, open_source
+from worldstate.adapters.state_log import is_own_mcap, read_log
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground import InputFileError, MissingExtraError, WorldstateError, in_range, seconds
+from worldstate.ground.extras import check_extra
+from worldstate.ground.parallel import in_executor, in_processes
+from worldstate.ground.version import __version__
+from worldstate.measurement.measurement import Measurement
+from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, hop_stream
+from worldstate.state import WorldState
+
+from .approach_meter import ApproachMeter
+from .corpus_inputs import LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
+from .corpus_tables import SUFFIX, TABLES, HeardHop, HeardRecording, row_writer
+
+CARD_NAME = "corpus.json"
+
+
+@dataclass(frozen=True, slots=True)
+class HeardShard:
+    """What became of one recording in a run."""
+
+    recording: str
+    shard: str  # Name of its file in every table, without the suffix
+    status: str  # "heard"; "there" since another run; "failed"
+    sound_s: float = 0.0
+    failure: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class HearPlan:
+    """How every recording of a corpus is heard, and where its tables go."""
+
+    out: Path
+    array: MicrophoneArray | None
+    model: Path | None
+    others: dict[str, Any]  # Further arguments of `open_source`
+    card: dict[str, Any]  # Of the folder; its digest is of all that decides the tables beside the recordings
+
+    @classmethod
+    def begun(cls, out: Path, hops: bool, parts: CorpusParts) -> "HearPlan":
+        """Make the folder and return the plan; refuse a folder in which recordings were heard otherwise."""
+        others: dict[str, Any] = {name: one for name, one in parts.items() if one is not None}
+        array, model = others.pop("array", None), others.pop("model", None)
+        array = read_array(array) if isinstance(array, Path | str) else array
+        for name in others.keys() & {"camera", "miss_rates"}:
+            if isinstance(others[name], str | Path):
+                others[name] = Path(others[name]).absolute()
+        read_model(model, array=array)  # A wrong one is refused before the work
+        file = file_of_model(model, array)
+        # Whatever the file of an array is called, its microphones decide.
+        decides = [__version__, hops, array and (array.positions_m, array.channels), file, others]
+        text = json.dumps(decides, sort_keys=True, default=_plain)
+        card = {"version": __version__, "array": array and Path(array.name).name, "model": file.name}
+        card |= {"hops": hops, "digest": hashlib.sha256(text.encode()).hexdigest()}
+        for table in TABLES:
+            (out / table).mkdir(parents=True, exist_ok=True)
+        if not (out / CARD_NAME).exists():
+            write_json(out / CARD_NAME, card, indent=1)
+        elif (known := read_json(out / CARD_NAME, "the card of a corpus")) != card:
+            held = known if isinstance(known, dict) else {}
+            other = {name: one for name, one in card.items() if held.get(name) != one and name != "digest"}
+            problem = f"expected what it was begun with, got {other or 'other options'}: another --out"
+            raise InputFileError(out / CARD_NAME, problem)
+        return cls(out, array, model and file.absolute(), others, card)
+
+    def shard(self, one: CorpusInput, content: str) -> str:
+        """Return the name of the files of a recording, by all that decides their bytes."""
+        whole = hashlib.sha256(f"{self.card['digest']} {content}".encode()).hexdigest()[:32]
+        # Without a content it could not be read, for a reason that may pass: the next run tries again.
+        return f"{one.key}-{whole if content else 'unread'}"
+
+    def file(self, table: str, shard: str) -> Path:
+        """Return the file of a shard in a table."""
+        return self.out / table / f"{shard}{SUFFIX}"
+
+
+def _plain(value: Any) -> Any:
+    """Return what stands for a value in the text that a digest is made of."""
+    if is_dataclass(value):
+        return [type(value).__name__, *(getattr(value, one.name) for one in fields(value))]
+    if isinstance(value, Path):
+        return file_digest(value).hex()
+    return sorted(value) if isinstance(value, frozenset) else np.asarray(value).tolist()
+
+
+def hear(
+    corpus: Path | str,
+    out: Path | str,
+    *,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    shard: tuple[int, int] = (1, 1),
+    hops: bool = False,
+    on_recording: Callable[[HeardShard], object] = lambda shard: None,
+    **parts: Unpack[CorpusParts],
+) -> list[HeardShard]:
+    """Hear every recording of a corpus and write its approaches as Parquet.
+
+    A recording that was heard before is not heard again. Its files are named by a digest of its content, the
+    array, the model, the options and the version, and written whole or not at all; they are the same bytes
+    for any number of workers.
+
+    Parameters
+    ----------
+    corpus : path
+        Folder of sound files, bags, recording folders and logs of snapshots, or a manifest (CSV: path, site,
+        detections, odometry).
+    out : path
+        Folder of the tables ``recordings``, ``approaches``, ``hours`` and, if asked, ``hops``.
+    jobs : int
+        Processes.
+    executor : Executor, optional
+        Works in place of processes: any of `concurrent.futures`, or Dask's ``client.get_executor()``; its
+        workers need the same files and the same folder `out`.
+    shard : (int, int)
+        Which of how many shares is heard, from 1, as one of several machines without an executor.
+    hops : bool
+        Write a row for each hop as well, its snapshot included.
+    on_recording : callable
+        Called after each recording, for progress.
+    **parts
+        As `open_source` takes them: `array`, `camera`, `miss_rates`, `model`, `context`, `sides`, `budget`
+        or `alpha`, `settings`.
+
+    Returns
+    -------
+    list of HeardShard
+        What became of each recording, in the order of their names; one that could not be heard is a row of
+        ``recordings`` with its failure.
+
+    Raises
+    ------
+    InputFileError
+        If there is no recording, or `out` was begun in another way.
+    MissingExtraError
+        Without pyarrow, which the extra ``corpus`` brings.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     soundfile.write(f"{folder}/noise.wav", noise, 48_000)
+    ...     [hear(folder, f"{folder}/heard")[0].status for run in range(2)]
+    ['heard', 'there']
+    """
+    check_extra("pyarrow")
+    in_range("shard", shard[0], 1, in_range("shard", shard[1], 1, 1_000_000))
+    inputs = share_of(find_corpus(Path(corpus).absolute()), *shard)
+    plan = HearPlan.begun(Path(out).absolute(), hops, parts)
+    former = defaultdict[str, list[Path]](list)
+    for path in plan.out.glob(f"*/*-*{SUFFIX}"):
+        former[path.name.partition("-")[0]].append(path)
+    work, shards = partial(hear_recording, plan), []
+    working = in_processes(work, inputs, jobs) if executor is None else in_executor(executor, work, inputs)
+    for one, found in zip(inputs, working, strict=True):
+        # Of what a recording held before, no hour counts.
+        for path in former[one.key]:
+            if path.stem != found.shard:
+                path.unlink(missing_ok=True)
+        shards.append(found)
+        on_recording(found)
+    return shards
+
+
+def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
+    """Hear one recording unless its files are there; its row in ``recordings`` is written last."""
+    content, row = "", None
+    try:
+        content = one.digest()
+        if plan.file("recordings", plan.shard(one, content)).exists():
+            return HeardShard(one.name, plan.shard(one, content), "there")
+        row = _hear(plan, one, content)
+    except MissingExtraError:
+        raise
+    except Exception as error:  # One of thousands: its failure is a row
+        known = isinstance(error, WorldstateError)
+        content = content if known else ""
+        text = str(error) if known else f"{type(error).__name__}: {error}"
+        # In the same words wherever the corpus lies.
+        failure = " ".join(text.replace(str(one.path), one.name).split())
+        row = HeardRecording(one.name, one.site, content, "media", failure=failure)
+    shard = plan.shard(one, content)
+    with row_writer(plan.file("recordings", shard), HeardRecording) as write:
+        write(row)
+    status = "failed" if row.failure else "heard"
+    return HeardShard(one.name, shard, status, row.hops * HOP_S, row.failure)
+
+
+def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
+    """Hear one recording and write its tables; return its row."""
+    meter, shard = ApproachMeter(one.name, one.site), plan.shard(one, content)
+    tables = [name for name in TABLES if name != "recordings" and (plan.card["hops"] or name != "hops")]
+    with ExitStack() as files:
+        write = {
+            name: files.enter_context(row_writer(plan.file(name, shard), TABLES[name])) for name in tables
+        }
+        for state, measurement in _heard(plan, one):
+            meter.update(state)
+            if "hops" in write:
+                write["hops"](_hop(one, state, measurement))
+        for approach in meter.approaches():
+            write["approaches"](approach)
+        for hours in meter.hours():
+            write["hours"](hours)
+    return meter.recording(content)
+
+
+def _heard(plan: HearPlan, one: CorpusInput) -> Iterator[tuple[WorldState, Measurement | None]]:
+    """Yield the states of a recording, of sound with what was measured."""
+    if one.path.suffix == LOG_SUFFIX or is_own_mcap(one.path):
+        return ((state, None) for _, state in read_log(one.path))
+    return ((step.state, step.measurement) for step in listen_steps(_source(plan, one)))
+
+
+def _hop(one: CorpusInput, state: WorldState, measurement: Measurement | None) -> HeardHop:
+    row = HeardHop(one.name, one.site, seconds(state.stamp_ns), state.risk, state.to_json())
+    if measurement is None:
+        return row
+    columns = hop_stream([measurement], name=one.name).columns
+    # No reference says what was in view beside what was seen.
+    return replace(row, **{name: columns[name][0].tolist() for name in STREAM_COLUMNS if name != "there"})
+
+
+def _source(plan: HearPlan, one: CorpusInput) -> Source:
+    sound: SoundInput = one.path
+    detections: Path | DetectionLog | None = one.detections
+    array, ego = plan.array, None if one.odometry is None else read_odometry(one.odometry)
+    if is_bag(one.path):
+        held = read_bag(one.path)
+        array, sound = needed_array(held.sound, array or held.array), held.sound
+        detections, ego = detections or held.detections, ego or held.ego
+    model = None if plan.model is None else _model(plan.model)
+    return open_source(sound, array=array, model=model, detections=detections, ego=ego, **plan.others)
+
+
+@cache
+def _model(path: Path) -> Model:
+    """Read a model once a process."""
+    return read_model(path)

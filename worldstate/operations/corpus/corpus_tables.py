@@ -1,0 +1,153 @@
+"""The tables of a corpus: typed rows, a Parquet file for each recording and table, written whole.
+
+Files hold neither the time of writing nor the name of a machine, and the same rows are the same bytes with
+one release of pyarrow.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from worldstate.adapters.files.file_io import atomic_path
+from worldstate.ground import InputFileError
+from worldstate.ground.extras import optional
+
+Row = TypeVar("Row")
+SUFFIX = ".parquet"
+_BATCH_ROWS = 4096  # A row of hops has some 5 kB: 20 MB at a time
+
+
+@dataclass(frozen=True, slots=True)
+class HeardRecording:
+    """A recording that was heard, or why it could not be: table ``recordings``."""
+
+    recording: str  # Name in the corpus
+    site: str
+    content: str  # Digest of its bytes, name and site
+    clock: str  # Of all its times: "media" counts from its first sample, "unix" from 1970
+    start_s: float | None = None  # End of the first window, and of the last
+    end_s: float | None = None
+    hops: int = 0
+    heard: int = 0  # Hops in which a hidden vehicle would have been noticed
+    usable: int = 0  # Hops in which every cue may be acted on
+    onsets: int = 0  # Times an advisory of any side began while none stood
+    failure: str | None = None  # Why it could not be heard
+
+
+@dataclass(frozen=True, slots=True)
+class StateHours:
+    """Hops in one state of the sensors: table ``hours``."""
+
+    recording: str
+    site: str
+    day: str | None  # Of the first hop, UTC, if the clock counts from 1970
+    sensors: str  # Condition of every sensor
+    unheard: str | None  # Why nothing could be heard; None if it could
+    hops: int
+    onsets: int
+
+
+@dataclass(frozen=True, slots=True)
+class HeardApproach:
+    """An advisory, or a vehicle that came into view without one: table ``approaches``."""
+
+    recording: str
+    site: str
+    side: str | None
+    time_s: float | None = None  # When the advisory began; None without one
+    end_s: float | None = None  # Its last hop
+    chance: float | None = None  # That a vehicle comes into view within 8 s, as stated when it began
+    expected_s: float | None = None  # Time to visible, as stated then
+    seen: bool | None = None  # Whether a vehicle came into view; None if no camera looked
+    seen_s: float | None = None  # When
+    gone_s: float | None = None  # Last hop in which it was in view
+    lead_s: float | None = None  # From the advisory to its coming into view
+    label: str | None = None  # Likeliest class of the vehicle
+    usable: bool = False  # Whether the advisory could be acted on when it began
+
+
+@dataclass(frozen=True, slots=True)
+class HeardHop:
+    """A hop: table ``hops``, on request. The columns from `log_likelihoods` on are those of hop streams.
+
+    They are null if a log of snapshots was read and no sound was heard.
+    """
+
+    recording: str
+    site: str
+    time_s: float
+    risk: float | None
+    snapshot: str  # JSON
+    log_likelihoods: tuple[float, ...] | None = None
+    answer: int | None = None
+    miss_rate: float | None = None
+    clutter_rate: float | None = None
+    approach: float | None = None
+    seen: bool | None = None
+
+
+TABLES: Mapping[str, type] = {
+    # The last is written last: a recording counts as heard once it is there.
+    "hops": HeardHop,
+    "approaches": HeardApproach,
+    "hours": StateHours,
+    "recordings": HeardRecording,
+}
+_ARROW = {str: "string", float: "double", int: "int64", bool: "bool"}
+
+
+@contextmanager
+def row_writer(path: Path, kind: type) -> Iterator[Callable[[Any], None]]:
+    """Lend a function that takes the rows of one file, which is written whole or not at all."""
+    arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
+    rows, schema = list[dict[str, Any]](), _schema(kind)
+    with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, compression="zstd") as file:
+
+        def flush() -> None:
+            file.write_table(arrow.Table.from_pylist(rows, schema=schema))
+            rows.clear()
+
+        def write(row: Any) -> None:
+            rows.append(asdict(row))
+            if len(rows) == _BATCH_ROWS:
+                flush()
+
+        yield write
+        flush()
+
+
+def read_rows(path: Path, kind: type[Row]) -> Iterator[Row]:
+    """Yield the rows of a file of one table.
+
+    Raises
+    ------
+    InputFileError
+        If it is damaged or holds other columns.
+    """
+    arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
+    schema = _schema(kind)
+    try:
+        with parquet.ParquetFile(path) as file:
+            if not file.schema_arrow.equals(schema):
+                raise InputFileError(path, f"expected the columns {', '.join(schema.names)}")
+            for batch in file.iter_batches(_BATCH_ROWS):
+                yield from (kind(**row) for row in batch.to_pylist())
+    except (OSError, arrow.ArrowException) as error:
+        raise InputFileError(path, f"expected a Parquet file of a corpus ({error})") from error
+
+
+def _schema(kind: type) -> Any:
+    hints = get_type_hints(kind)
+    return optional("pyarrow").schema([_field(one.name, hints[one.name]) for one in fields(kind)])
+
+
+def _field(name: str, hint: Any) -> Any:
+    arrow = optional("pyarrow")
+    # Of "float | None" the first is the type of the values.
+    first = get_args(hint)[0] if isinstance(hint, UnionType) else hint
+    of_list = get_origin(first) is tuple
+    plain = arrow.type_for_alias(_ARROW[get_args(first)[0] if of_list else first])
+    return arrow.field(name, arrow.list_(plain) if of_list else plain, nullable=isinstance(hint, UnionType))
