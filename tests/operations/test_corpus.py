@@ -232,6 +232,22 @@ def test_a_vehicle_that_nothing_announced_is_an_approach_too():
     assert (missed.side, missed.time_s, missed.seen, missed.lead_s) == ("left", None, True, None)
 
 
+def test_shadow_hours_are_those_of_all_recordings_heard_to_their_end(corpus, heard, street, tmp_path, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(heard, out)
+    words = ["hear", str(corpus), "--array", str(street / "mics.csv"), "--uncalibrated", "--out", str(out)]
+    # As a kill leaves it: tables are there, the row of the recording is not.
+    killed = next(iter((out / "recordings").glob("*.parquet")))
+    (out / "hours" / killed.name).with_stem("f" * 16 + "-left").write_bytes(b"")
+    assert main([*words, "--shadow", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    (everything,) = report["hours"]["all"]
+    hops = sum(row.hops for row in rows(heard, "recordings"))
+    assert everything["heard_hours"] + everything["unheard_hours"] == pytest.approx(hops / 36_000)
+    assert {one["name"] for one in report["hours"]["site"]} == {"north", "south"}
+    assert "north" in (out / "shadow.html").read_text()
+
+
 @pytest.mark.long
 def test_tables_are_the_same_bytes_after_ten_kills(corpus, street, heard, tmp_path):
     words = [

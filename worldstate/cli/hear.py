@@ -12,6 +12,10 @@ DIR receives the folders recordings, approaches and hours, with one Parquet file
 content, the array, the model, the options and the version. What cannot be heard is a row of recordings with
 its failure. Every file of a table can be read at once, as by pandas.read_parquet("DIR/approaches").
 
+--shadow counts every recording of DIR as free of hazards: hours heard and unheard, onsets an hour with their
+exact interval by site, day and state of the sensors, and how many more hours would show that the alarm keeps
+its budget.
+
 Examples
 --------
   worldstate hear drives --array mics.csv --model mine.json --out heard --jobs 8
@@ -23,6 +27,7 @@ import argparse
 import re
 import time
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +66,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     listening.add_listen_options(parser)
     add("--mask-dead", action="store_true", help="leave silent channels out instead of failing")
     add("--hops", action="store_true", help="write a row for each hop as well, its snapshot included")
+    told = "count every advisory as false: onsets an hour by site and state of the sensors, DIR/shadow.html"
+    add("--shadow", action="store_true", help=told)
     add("--shard", default="1/1", metavar="I/N", help="the I-th of N shares, as of a SLURM array (from 1)")
     add("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
 
@@ -94,9 +101,26 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
             **parts,
         )
     statuses, sound_s = Counter(one.status for one in heard), sum(one.sound_s for one in heard)
-    counts = {status: statuses[status] for status in ("heard", "there", "failed")}
+    counts: dict[str, object] = {status: statuses[status] for status in ("heard", "there", "failed")}
     speed = sound_s / (time.perf_counter() - begun_s)
-    return output.CommandResult(counts | {"sound_s": sound_s, "realtime_factor": speed})
+    found = counts | {"sound_s": sound_s, "realtime_factor": speed}
+    return _shadow(arguments.out, found) if arguments.shadow else output.CommandResult(found)
+
+
+def _shadow(out: Path, found: dict[str, object]) -> output.CommandResult:
+    """Return hours and onsets of the whole corpus, and write their page."""
+    from worldstate.operations.corpus import corpus_tables, shadow
+
+    recordings = corpus_tables.corpus_rows(out, corpus_tables.HeardRecording)
+    budget = next((one.budget for one in recordings if one.budget is not None), None)
+    week = shadow.shadow_hours(corpus_tables.corpus_rows(out, corpus_tables.StateHours), budget)
+    shadow.write_shadow_page(out / "shadow.html", week, f"Shadow hours of {out.name}")
+    everything = {group: [asdict(row) for row in rows] for group, rows in week.items()}
+    table = found | {"page": str(out / "shadow.html"), "budget": budget}
+    if all_hours := week["all"]:
+        table["more_hours_for_budget"] = all_hours[0].more_hours
+    lines = [str(row) for rows in week.values() for row in rows]
+    return output.CommandResult(table | {"hours": everything}, table=table, lines=lines)
 
 
 def _share(text: str) -> tuple[int, int]:

@@ -33,6 +33,7 @@ class ApproachMeter:
     first_ns: int | None = None
     last_ns: int = 0
     usable: int = 0
+    budget: float | None = None
     _raised: bool = False
     _hops: Counter[tuple[str, str | None]] = field(default_factory=Counter)
     _onsets: Counter[tuple[str, str | None]] = field(default_factory=Counter)
@@ -45,6 +46,7 @@ class ApproachMeter:
         self.first_ns = state.stamp_ns if self.first_ns is None else self.first_ns
         self.last_ns, self.clock = state.stamp_ns, state.clock
         self.usable += bool(state.cues) and all(cue.usable for cue in state.cues)
+        self.budget = None if state.budget is None else state.budget.onsets_per_hour
         raised = [cue for cue in state.cues if cue.advisory is not None]
         key = sensors_of(state), _unheard(state)
         self._hops[key] += 1
@@ -100,6 +102,7 @@ class ApproachMeter:
             heard=sum(hops for (_, unheard), hops in self._hops.items() if unheard is None),
             usable=self.usable,
             onsets=self._onsets.total(),
+            budget=self.budget,
         )
 
     def approaches(self) -> list[HeardApproach]:

@@ -34,6 +34,7 @@ class HeardRecording:
     heard: int = 0  # Hops in which a hidden vehicle would have been noticed
     usable: int = 0  # Hops in which every cue may be acted on
     onsets: int = 0  # Times an advisory of any side began while none stood
+    budget: float | None = None  # Onsets an hour that the alarm was set to; None if none is stated
     failure: str | None = None  # Why it could not be heard
 
 
@@ -117,6 +118,23 @@ def row_writer(path: Path, kind: type) -> Iterator[Callable[[Any], None]]:
 
         yield write
         flush()
+
+
+def corpus_rows(out: Path, kind: type[Row]) -> Iterator[Row]:
+    """Yield the rows of a table of a corpus, of recordings that were heard to their end.
+
+    Raises
+    ------
+    InputFileError
+        If it is no corpus, or a file is damaged or holds other columns.
+    """
+    table = next(name for name, one in TABLES.items() if one is kind)
+    paths = sorted((out / "recordings").glob(f"[!.]*{SUFFIX}"))
+    if not paths:
+        raise InputFileError(out, "expected the folder that `worldstate hear --out` wrote")
+    for path in paths:
+        if (held := out / table / path.name).exists():  # A failure has no other table
+            yield from read_rows(held, kind)
 
 
 def read_rows(path: Path, kind: type[Row]) -> Iterator[Row]:

@@ -311,7 +311,7 @@ def caution(count: int, what: str = "recordings") -> str | None:
     return f"{count} {what}: figures from fewer than {FEWEST_RECORDINGS} cannot be read"
 
 
-def poisson_interval(count: int, exposure: float, confidence: float = 0.95) -> tuple[float, float]:
+def poisson_interval(count: float, exposure: float, confidence: float = 0.95) -> tuple[float, float]:
     r"""Return the exact interval of a Poisson rate, alarms an hour if the exposure is in hours.
 
     .. math:: \left[\chi^2_{\alpha/2}(2n),\ \chi^2_{1-\alpha/2}(2n + 2)\right] / 2T
