@@ -249,6 +249,24 @@ def test_shadow_hours_are_those_of_all_recordings_heard_to_their_end(corpus, hea
 
 
 @pytest.mark.long
+def test_tables_are_the_same_bytes_with_two_workers_of_dask(corpus, street, heard, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    words = ["hear", str(corpus), "--array", str(street / "mics.csv"), "--uncalibrated"]
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        assert main([*words, "--out", str(tmp_path), "--scheduler", address]) == 0
+        assert contents(tmp_path) == contents(heard)
+
+
+def test_a_scheduler_that_is_none_is_named(corpus, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("worldstate.cli.hear._CONNECT_S", 0.1)
+    words = ["hear", str(corpus), "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
+    assert main(words) == 2
+    assert "--scheduler: expected a Dask scheduler, tcp://127.0.0.1:9: " in capsys.readouterr().err
+
+
+@pytest.mark.long
 def test_tables_are_the_same_bytes_after_ten_kills(corpus, street, heard, tmp_path):
     words = [
         "hear",

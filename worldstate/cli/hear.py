@@ -20,6 +20,7 @@ Examples
 --------
   worldstate hear drives --array mics.csv --model mine.json --out heard --jobs 8
   worldstate hear drives.csv --array uma-8 --out heard --hops
+  worldstate hear drives --array uma-8 --out heard --scheduler tcp://10.0.0.5:8786
   worldstate hear drives --array uma-8 --out heard --shard $SLURM_ARRAY_TASK_ID/64
 """
 
@@ -27,17 +28,23 @@ import argparse
 import re
 import time
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common import inputs, listening, output, progress, sensors
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import check_extra
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from concurrent.futures import Executor
+
     from worldstate.operations.corpus.corpus_run import HeardShard
 
 NEEDS = ("pyarrow",)
+_CONNECT_S = 10.0
 FIRST_OPTIONS = (
     "--out",
     "--array",
@@ -69,6 +76,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     told = "count every advisory as false: onsets an hour by site and state of the sensors, DIR/shadow.html"
     add("--shadow", action="store_true", help=told)
     add("--shard", default="1/1", metavar="I/N", help="the I-th of N shares, as of a SLURM array (from 1)")
+    dask = "Dask: its workers hear in place of processes, and see the same files (extra dask)"
+    add("--scheduler", metavar="ADDRESS", help=dask)
     add("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
 
 
@@ -80,7 +89,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     given = sensors.given_sensors(arguments)
     parts = listening.place_and_settings(arguments, given.setup.boxes, arguments.mask_dead)
     begun_s, count = time.perf_counter(), len(find_corpus(arguments.corpus))
-    with progress.progress_bar("hearing", count) as bar:
+    with _executor(arguments.scheduler) as executor, progress.progress_bar("hearing", count) as bar:
 
         def told(shard: "HeardShard") -> None:
             if shard.failure is not None:
@@ -91,6 +100,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
             arguments.corpus,
             arguments.out,
             jobs=arguments.jobs,
+            executor=executor,
             shard=_share(arguments.shard),
             hops=arguments.hops,
             on_recording=told,
@@ -121,6 +131,23 @@ def _shadow(out: Path, found: dict[str, object]) -> output.CommandResult:
         table["more_hours_for_budget"] = all_hours[0].more_hours
     lines = [str(row) for rows in week.values() for row in rows]
     return output.CommandResult(table | {"hours": everything}, table=table, lines=lines)
+
+
+@contextmanager
+def _executor(address: str | None) -> "Iterator[Executor | None]":
+    """Lend the workers of a Dask scheduler, None without an address."""
+    if address is None:
+        yield None
+        return
+    check_extra("distributed")
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=_CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise InvalidArgumentError(f"--scheduler: expected a Dask scheduler, {address}: {error}") from error
+    with client:
+        yield client.get_executor()
 
 
 def _share(text: str) -> tuple[int, int]:
