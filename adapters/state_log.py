@@ -1,4 +1,4 @@
-"""Snapshots of a log in any form: JSON lines of `worldstate run --out`, MCAP, or a bag of ROS 2."""
+"""Snapshots of a log in any form: JSON lines of `run --out`, MCAP, a bag of ROS 2, hops of `hear`."""
 
 import logging
 from collections.abc import Iterator
@@ -20,6 +20,7 @@ from worldstate.adapters.files.file_io import plain_file, refused_as_file
 from worldstate.adapters.ros.bag_input import is_bag
 from worldstate.adapters.ros.bag_writer import bag_snapshot_lines
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds, seconds
+from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import MOST_CHARACTERS, decode, decode_json
 from worldstate.state import WorldState
 from worldstate.state.world_state import is_former
@@ -29,6 +30,7 @@ _LOG = logging.getLogger(__name__)
 _SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
 _HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
+HOPS_SUFFIX, _BATCH = ".parquet", 4096
 _PACKED = b"\x1f\x8b"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
@@ -71,9 +73,22 @@ def upgraded_messages(path: Path) -> Iterator[LogMessage]:
 
 
 def _lines(path: Path) -> Iterator[str]:
+    if path.suffix == HOPS_SUFFIX:
+        return _snapshots(path)
     if is_own_mcap(path):
         return (text for _, _, text in read_messages(path, SNAPSHOT_TOPIC))
     return bag_snapshot_lines(path) if is_bag(path) else _json_lines(path)
+
+
+def _snapshots(path: Path) -> Iterator[str]:
+    """Yield the snapshots of a Parquet file that `worldstate hear --hops` wrote."""
+    arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
+    try:
+        with parquet.ParquetFile(path) as file:
+            for batch in file.iter_batches(_BATCH, columns=["snapshot"]):
+                yield from map(str, batch.column("snapshot").to_pylist())
+    except (OSError, KeyError, arrow.ArrowException) as error:
+        raise InputFileError(path, f"expected a table of hops with snapshots ({error})") from error
 
 
 def is_own_mcap(path: Path) -> bool:

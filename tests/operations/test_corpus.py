@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import soundfile
 from hypothesis import given
@@ -17,15 +18,19 @@ from hypothesis import strategies as st
 from scripted_states import scripted_states
 
 from worldstate import ListenSettings, WorldState, hear
-from worldstate.adapters import open_source
+from worldstate.adapters import open_source, read_model
 from worldstate.cli.main import main
+from worldstate.commissioning.alarm_curve import raised_at
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds
 from worldstate.operations import run_recording
+from worldstate.operations.calibration.cueing_calibration import hop_streams
 from worldstate.operations.corpus.approach_meter import ApproachMeter
 from worldstate.operations.corpus.corpus_inputs import find_corpus
 from worldstate.operations.corpus.corpus_tables import TABLES, read_rows
+from worldstate.operations.metrics.approach_table import rising_edges
 from worldstate.operations.recordings.evidence_report import told_advisories
-from worldstate.operations.recordings.recording_report import WarningMeter
+from worldstate.operations.recordings.hop_table import HopTable, hop_stream
+from worldstate.operations.recordings.recording_report import RecordingReport, WarningMeter
 from worldstate.state import Advisory, Context, RiskCue
 
 pytest.importorskip("pyarrow")
@@ -70,10 +75,22 @@ def contents(out: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_recording_gives_the_advisories_of_run_and_the_vehicle_that_was_seen(approach, tmp_path):
-    hear(approach.folder, tmp_path, hops=True)
-    report = run_recording(open_source(approach.folder), states_path=tmp_path / "states.jsonl")
-    (recording,), approaches = rows(tmp_path, "recordings"), rows(tmp_path, "approaches")
+@pytest.fixture(scope="module")
+def demo(approach, tmp_path_factory) -> tuple[Path, RecordingReport, HopTable]:
+    """Return the demo's approach heard with its hops, and the report and the hop stream of `run`."""
+    folder, measured = tmp_path_factory.mktemp("demo"), []
+    hear(approach.folder, folder / "heard", hops=True)
+    report = run_recording(
+        open_source(approach.folder),
+        states_path=folder / "states.jsonl",
+        on_hop=lambda step: measured.append(step.measurement),
+    )
+    return folder, report, hop_stream(measured, name="demo")
+
+
+def test_a_recording_gives_the_advisories_of_run_and_the_vehicle_that_was_seen(demo):
+    folder, report, _ = demo
+    (recording,), approaches = rows(folder / "heard", "recordings"), rows(folder / "heard", "approaches")
     assert (recording.hops, recording.failure) == (report.hops, None)
     assert recording.onsets == len(report.warning.advisory_onsets_s)
     assert {one.time_s for one in approaches} >= {*report.warning.advisory_onsets_s}
@@ -81,8 +98,47 @@ def test_a_recording_gives_the_advisories_of_run_and_the_vehicle_that_was_seen(a
     (van,) = (one for one in approaches if one.seen)
     assert van.side == "right" and van.label == "car"
     assert van.lead_s == pytest.approx(van.seen_s - van.time_s) and 1.0 < van.lead_s < 5.0
-    snapshots = [row.snapshot for row in rows(tmp_path, "hops")]
-    assert snapshots == (tmp_path / "states.jsonl").read_text().splitlines()
+
+
+def test_logs_are_read_from_the_hops_of_a_recording_as_from_the_log_of_run(demo, capsys):
+    folder, _, _ = demo
+    (hops,) = (folder / "heard" / "hops").glob("*.parquet")
+    printed = [
+        (main(["explain", str(log)]), capsys.readouterr().out) for log in (hops, folder / "states.jsonl")
+    ]
+    assert printed[0] == printed[1] and printed[0][0] == 0
+    assert main(["log", "replay", str(hops), "--out", str(folder / "again.jsonl")]) == 0
+    assert (folder / "again.jsonl").read_text() == (folder / "states.jsonl").read_text()
+
+
+def test_a_file_that_is_no_table_of_hops_is_refused(demo, tmp_path, capsys):
+    (tmp_path / "a.parquet").write_text("no table")
+    (recording,) = (demo[0] / "heard" / "recordings").glob("*.parquet")
+    for log in (tmp_path / "a.parquet", recording):
+        assert main(["explain", str(log)]) == 2
+        assert "expected a table of hops with snapshots" in capsys.readouterr().err
+
+
+def test_thresholds_are_set_on_hops_as_on_the_sound_itself(demo, tmp_path, capsys):
+    folder, report, stream = demo
+    (heard,) = hop_streams(folder / "heard")
+    for name, column in stream.columns.items():
+        np.testing.assert_array_equal(heard.columns[name], column)
+    # At the threshold of the run the curve has the onsets that the filter raised.
+    model = read_model()
+    levels = np.nan_to_num(np.column_stack([heard.level_left, heard.level_right]), nan=-np.inf)
+    raised = raised_at(levels, model.sequence.alarm.threshold_nats)
+    assert rising_edges(raised).size == len(report.warning.advisory_onsets_s)
+    words = ["model", "threshold", str(folder / "heard"), "--out", str(tmp_path / "mine.json")]
+    assert main(words) == 2
+    assert "budget: expected 0.1 hours for 30 onsets an hour, got 0.0025" in capsys.readouterr().err
+    assert main([*words, "--budget", "1200"]) == 0
+    assert read_model(tmp_path / "mine.json").sequence.curve.hours == pytest.approx(report.hops / 36_000)
+
+
+def test_thresholds_of_a_corpus_without_hops_say_how_to_write_them(heard, tmp_path, capsys):
+    assert main(["model", "threshold", str(heard), "--out", str(tmp_path / "mine.json")]) == 2
+    assert "expected hops of sound: `worldstate hear --hops` writes them" in capsys.readouterr().err
 
 
 def test_what_cannot_be_heard_is_a_row_with_its_failure(heard):

@@ -32,6 +32,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import SECONDS_PER_HOUR, NotUsable, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
+from worldstate.operations.corpus.approach_meter import alarm_level
 from worldstate.operations.metrics.approach_table import poisson_interval, rising_edges
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.state import WorldState
@@ -141,16 +142,8 @@ def alarm_levels(states: Iterable[WorldState], street: StreetModel | None = None
     raises its threshold just then; minus infinity if too little was heard or the risk denies an alarm.
     """
     denied = (street or StreetModel()).death
-    return np.array([[_level(state, side, denied) for side in SIDES] for state in states])
-
-
-def _level(state: WorldState, side: str, denied: float) -> float:
-    own = (cue for cue in state.cues if cue.direction == side)
-    cue = next((cue for cue in own if (cue.risk or 0.0) >= denied), None)
-    terms = None if cue is None or state.no_sequence is not None else cue.evidence
-    if terms is None or terms.hypothesis != "coming":
-        return -np.inf
-    return terms.compared_nats - terms.threshold_nats + UNREACHED.threshold_nats
+    levels = [[alarm_level(state, side, denied, UNREACHED) for side in SIDES] for state in states]
+    return np.array([[-np.inf if one is None else one for one in hop] for hop in levels])
 
 
 def raised_at(levels: FloatArray, threshold_nats: float) -> BoolArray:

@@ -2,23 +2,32 @@
 
 Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
 
-INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, or hop streams
-that --save-streams wrote with the same signature. Recordings labelled none and sound files count as
-hazard-free. Approaches with a T0, where there are some, give the risk map (Platt for few, isotonic for many);
-without them the model's own is kept. If few false alarms were counted, a warning names the hours that would
-count enough.
+INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, hop streams
+that --save-streams wrote with the same signature, or the folder that `hear --hops` wrote. Recordings
+labelled none, sound files and the recordings of `hear` count as hazard-free. Approaches with a T0, where
+there are some, give the risk map (Platt for few, isotonic for many); without them the model's own is kept.
+If few false alarms were counted, a warning names the hours that would count enough.
+
+Of what `hear` wrote, the curve from a budget of onsets an hour to the threshold of a model with a sequence
+is measured as well, and --budget chooses the one that is taken if none is asked for.
 
 Examples
 --------
   worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
+  worldstate model threshold heard --model mine.json --budget 10 --out my_model.json
   worldstate model threshold my_dataset --alpha 0.01 0.05 --out my_model.json
 """
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from worldstate import adapters, operations
 from worldstate.cli.common import inputs, listening, output
+from worldstate.ground.errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 NEEDS = ("sklearn",)
 
@@ -32,6 +41,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
     budgets = "budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)"
     add("--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A", help=budgets)
+    own = "onsets an hour that the alarm is set to, of a corpus (default: the model's own)"
+    add("--budget", type=float, metavar="ONSETS", help=own)
     add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
     add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
 
@@ -55,10 +66,38 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     done = operations.calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
     figures = dict(model.provenance.figures or {}) | {"calibration_hours": done.hours}
     provenance = replace(model.provenance, figures=figures)
-    adapters.save_model(arguments.out, replace(model, policies=done.policies, provenance=provenance))
+    made = replace(model, policies=done.policies, provenance=provenance)
+    if any("level_left" in stream.columns for stream in streams):
+        made = _with_curve(made, streams, arguments.budget)
+    elif arguments.budget is not None:
+        raise InvalidArgumentError("--budget: expected a corpus as INPUT, of `hear --hops`")
+    adapters.save_model(arguments.out, made)
     for warning in done.warnings:
         output.say(f"warning: {warning}")
     return _result(arguments, done)
+
+
+def _with_curve(
+    model: "adapters.Model", streams: "Sequence[operations.HopTable]", budget: float | None
+) -> "adapters.Model":
+    """Return a model with the curve that is measured on a corpus; one without a sequence as it is."""
+    import numpy as np
+
+    from worldstate.commissioning.alarm_curve import LEAST_ONSETS, measured_curve
+    from worldstate.commissioning.commission import with_curve
+
+    if model.sequence is None or model.sequence.alarm is None:
+        return model
+    quiet: dict[str, list[np.ndarray]] = {}
+    for stream in streams:
+        if "level_left" in stream.columns:
+            levels = np.column_stack([stream.level_left, stream.level_right])
+            quiet.setdefault(stream.about["site"], []).append(np.nan_to_num(levels, nan=-np.inf))
+    curve, onsets = measured_curve(quiet), budget or model.sequence.alarm.onsets_per_hour
+    if curve.hours * onsets < LEAST_ONSETS:
+        expected = f"expected {LEAST_ONSETS / onsets:.2g} hours for {onsets:g} onsets an hour"
+        raise InvalidArgumentError(f"budget: {expected}, got {curve.hours:.2g}: more sound, or more onsets")
+    return with_curve(model, curve, onsets)
 
 
 def _result(arguments: argparse.Namespace, done: "operations.CueingCalibration") -> output.CommandResult:

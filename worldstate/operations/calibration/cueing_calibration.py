@@ -3,11 +3,11 @@
 They come from data sets, recordings, sound files or hop streams that were saved.
 """
 
-import json
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,10 +22,17 @@ from worldstate.adapters.source import open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.errors import InputFileError, OutOfDomainError
-from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
+from worldstate.operations.corpus.corpus_tables import HeardHop, corpus_rows
 from worldstate.operations.metrics.approach_table import ApproachTable, caution, poisson_interval
-from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream, load_streams
+from worldstate.operations.recordings.hop_table import (
+    HOP_S,
+    STREAM_COLUMNS,
+    HopTable,
+    hop_stream,
+    load_streams,
+    signature_checksum,
+)
 from worldstate.operations.training.training import MISS_RATES
 
 # Of the recording-level folds that the achieved rate is measured by.
@@ -280,6 +287,29 @@ def _warnings(budgets: list[BudgetReport], recordings: int) -> Iterator[str]:
             )
 
 
+def hop_streams(corpus: Path) -> Iterator[HopTable]:
+    """Yield the hop streams of a corpus, every recording as hazard-free, with the levels of the alarm.
+
+    Raises
+    ------
+    InputFileError
+        If it holds no hops of sound.
+    """
+    names = [name for name in (*STREAM_COLUMNS, "level_left", "level_right") if name != "there"]
+    rows = (row for row in corpus_rows(corpus, HeardHop) if row.log_likelihoods is not None)
+    empty = True
+    for (name, *about), hops in itertools.groupby(rows, key=attrgetter("recording", "site", "signature")):
+        columns = zip(*map(attrgetter(*names), hops), strict=True)
+        table = dict(zip(names, map(np.array, columns), strict=True))
+        # Of a hop without a level the column holds None.
+        levels = {side: table[side].astype(float) for side in names[-2:]}
+        beside = dict(zip(("site", "signature"), about, strict=True))
+        yield HopTable(table | levels | {"there": table["seen"]}, name=name, about=beside)
+        empty = False
+    if empty:
+        raise InputFileError(corpus, "expected hops of sound: `worldstate hear --hops` writes them")
+
+
 def find_inputs(path: Path) -> list[Path]:
     """Return the recordings of a data set, or the file or recording folder itself."""
     if not path.exists():
@@ -295,10 +325,10 @@ def read_input(
     """Listen to a recording or read streams; a sound file counts as hazard-free."""
     chosen = read_model(model, array=array)
     # What was heard are this signature's scores: another one's thresholds cannot be set on them.
-    about = {"signature": crc32(json.dumps(encode(chosen.signature)).encode())}
-    if path.suffix == ".npz":
-        streams = load_streams(path)
-        if any({**about, **stream.about} != about for stream in streams):
+    about = {"signature": signature_checksum(chosen.signature)}
+    if path.suffix == ".npz" or (path / "hops").is_dir():
+        streams = load_streams(path) if path.is_file() else list(hop_streams(path))
+        if any(stream.about.get("signature", about["signature"]) != about["signature"] for stream in streams):
             raise OutOfDomainError(f"{path}: heard with another model's signature; listen to the sound again")
         return streams
     source = open_source(path, array=array, model=chosen)

@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
-from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.abduction.sequence.sequence_model import COMING_S, SequenceAlarm
 from worldstate.ground.values import LEAST_HEARD, nanoseconds, seconds
 from worldstate.state import Entity, RiskCue, WorldState
 
@@ -137,3 +137,17 @@ def _unheard(state: WorldState) -> str | None:
     if not state.heard or any(one.share >= LEAST_HEARD for one in state.heard):
         return None
     return state.heard[0].reason or "unheard"
+
+
+def alarm_level(state: WorldState, side: str, denied: float, alarm: SequenceAlarm) -> float | None:
+    """Return the threshold up to which the alarm of a side is raised; None if too little was heard or below.
+
+    It is what the filter compares, less what raises its threshold just then; below the risk `denied` no
+    threshold raises one.
+    """
+    own = (cue for cue in state.cues if cue.direction == side)
+    cue = next((cue for cue in own if (cue.risk or 0.0) >= denied), None)
+    terms = None if cue is None or state.no_sequence is not None else cue.evidence
+    if terms is None or terms.hypothesis != "coming":
+        return None
+    return terms.compared_nats - terms.threshold_nats + alarm.threshold_nats

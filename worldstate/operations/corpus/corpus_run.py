@@ -13,6 +13,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.adapters.audio.sound_file import SoundInput
 from worldstate.adapters.camera.detections import DetectionLog
 from worldstate.adapters.files.array_file import file_of_model, read_array
@@ -23,16 +24,17 @@ from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.ros.bag_input import is_bag, needed_array, read_bag
 from worldstate.adapters.source import CorpusParts, Source, open_source
 from worldstate.adapters.state_log import is_own_mcap, read_log
+from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import InputFileError, MissingExtraError, WorldstateError, in_range, seconds
 from worldstate.ground.extras import check_extra
 from worldstate.ground.parallel import in_executor, in_processes
 from worldstate.ground.version import __version__
 from worldstate.measurement.measurement import Measurement
-from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, hop_stream
+from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, hop_stream, signature_checksum
 from worldstate.state import WorldState
 
-from .approach_meter import ApproachMeter
+from .approach_meter import ApproachMeter, alarm_level
 from .corpus_inputs import LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
 from .corpus_tables import SUFFIX, TABLES, HeardHop, HeardRecording, row_writer
 
@@ -221,10 +223,12 @@ def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
         write = {
             name: files.enter_context(row_writer(plan.file(name, shard), TABLES[name])) for name in tables
         }
-        for state, measurement in _heard(plan, one):
+        source = None if _is_log(one.path) else _source(plan, one)
+        hop = _hop_of(one, source) if "hops" in write else None
+        for state, measurement in _heard(one, source):
             meter.update(state)
-            if "hops" in write:
-                write["hops"](_hop(one, state, measurement))
+            if hop is not None:
+                write["hops"](hop(state, measurement))
         for approach in meter.approaches():
             write["approaches"](approach)
         for hours in meter.hours():
@@ -232,20 +236,35 @@ def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
     return meter.recording(content)
 
 
-def _heard(plan: HearPlan, one: CorpusInput) -> Iterator[tuple[WorldState, Measurement | None]]:
+def _is_log(path: Path) -> bool:
+    return path.suffix == LOG_SUFFIX or is_own_mcap(path)
+
+
+def _heard(one: CorpusInput, source: Source | None) -> Iterator[tuple[WorldState, Measurement | None]]:
     """Yield the states of a recording, of sound with what was measured."""
-    if one.path.suffix == LOG_SUFFIX or is_own_mcap(one.path):
+    if source is None:
         return ((state, None) for _, state in read_log(one.path))
-    return ((step.state, step.measurement) for step in listen_steps(_source(plan, one)))
+    return ((step.state, step.measurement) for step in listen_steps(source))
 
 
-def _hop(one: CorpusInput, state: WorldState, measurement: Measurement | None) -> HeardHop:
-    row = HeardHop(one.name, one.site, seconds(state.stamp_ns), state.risk, state.to_json())
-    if measurement is None:
-        return row
-    columns = hop_stream([measurement], name=one.name).columns
-    # No reference says what was in view beside what was seen.
-    return replace(row, **{name: columns[name][0].tolist() for name in STREAM_COLUMNS if name != "there"})
+def _hop_of(one: CorpusInput, source: Source | None) -> Callable[[WorldState, Measurement | None], HeardHop]:
+    """Return what makes the row of a hop."""
+    alarm = getattr(source and source.sequence, "alarm", None)
+    signature = None if source is None else signature_checksum(source.model)
+    denied = ((source and source.street) or StreetModel()).death
+
+    def row(state: WorldState, measurement: Measurement | None) -> HeardHop:
+        plain = HeardHop(one.name, one.site, seconds(state.stamp_ns), state.risk, state.to_json(), signature)
+        if measurement is None:
+            return plain
+        columns = hop_stream([measurement], name=one.name).columns
+        # No reference says what was in view beside what was seen.
+        told = {name: columns[name][0].tolist() for name in STREAM_COLUMNS if name != "there"}
+        if alarm is not None:
+            told |= {f"level_{side}": alarm_level(state, side, denied, alarm) for side in SIDES}
+        return replace(plain, **told)
+
+    return row
 
 
 def _source(plan: HearPlan, one: CorpusInput) -> Source:

@@ -72,16 +72,17 @@ class HeardApproach:
 
 @dataclass(frozen=True, slots=True)
 class HeardHop:
-    """A hop: table ``hops``, on request. The columns from `log_likelihoods` on are those of hop streams.
-
-    They are null if a log of snapshots was read and no sound was heard.
-    """
+    """A hop: table ``hops``, on request; the columns below the snapshot are null of a log of snapshots."""
 
     recording: str
     site: str
     time_s: float
     risk: float | None
     snapshot: str  # JSON
+    signature: int | None = None  # Checksum of the window model whose scores follow
+    level_left: float | None = None  # Log-odds: the alarm is raised by thresholds up to it; null for none
+    level_right: float | None = None
+    # As of hop streams
     log_likelihoods: tuple[float, ...] | None = None
     answer: int | None = None
     miss_rate: float | None = None

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.adapters.files.file_io import load_npz, save_npz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, seconds
 from worldstate.ground.checks import check_shape, finite_array
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import AnyArray, BoolArray
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.metrics.approach_table import SLACK_S
@@ -262,3 +264,8 @@ def _measured(one: Measurement) -> tuple[Any, ...]:
     heard, approach = one.signature.log_likelihoods, one.approach
     rate = np.nan if isinstance(approach, NotUsable) else approach.inverse_tta_hz / approach.std_hz
     return seconds(one.stamp_ns), heard, *_answer(one.co_evidence), rate
+
+
+def signature_checksum(signature: object) -> int:
+    """Return a checksum of a window model, by which its scores are told from another one's."""
+    return crc32(json.dumps(encode(signature)).encode())
