@@ -19,6 +19,7 @@ from scripted_states import scripted_states
 
 from worldstate import ListenSettings, WorldState, hear
 from worldstate.adapters import open_source, read_model
+from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.cli.main import main
 from worldstate.commissioning.alarm_curve import raised_at
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds
@@ -134,6 +135,27 @@ def test_thresholds_are_set_on_hops_as_on_the_sound_itself(demo, tmp_path, capsy
     assert "budget: expected 0.1 hours for 30 onsets an hour, got 0.0025" in capsys.readouterr().err
     assert main([*words, "--budget", "1200"]) == 0
     assert read_model(tmp_path / "mine.json").sequence.curve.hours == pytest.approx(report.hops / 36_000)
+
+
+def test_windows_are_labelled_as_by_the_camera_s_own_tracks(demo, approach, tmp_path):
+    root = tmp_path / "root"
+    shutil.copytree(approach.folder, root / "SB1" / "right" / "demo")
+    recording = str(root / "SB1" / "right" / "demo")
+    words = ["street", "label", recording, "--environment", "SB1", "--out", str(tmp_path / "labels.json")]
+    assert main([*words, "--windows", str(root / "smoothed.csv")]) == 0
+    hear(root, tmp_path / "heard")
+    assert main(["street", "label", str(tmp_path / "heard"), "--windows", str(root / "heard.csv")]) == 0
+    smoothed, heard = (read_labels(root / name, root) for name in ("smoothed.csv", "heard.csv"))
+    assert [one.label for one in heard] == [one.label for one in smoothed] == ["right", "front", "none"]
+    for one, other in zip(heard, smoothed, strict=True):
+        assert one.end_s == pytest.approx(other.end_s, abs=0.3) and one.path == other.path
+
+
+def test_without_a_camera_no_window_counts_as_one_of_nothing(heard, tmp_path):
+    words = ["street", "label", str(heard), "--windows", str(tmp_path / "labels.csv")]
+    assert main(words) == 0
+    assert len((tmp_path / "labels.csv").read_text().splitlines()) == 1
+    assert main([*words, "--out", str(tmp_path / "labels.json")]) == 2
 
 
 def test_thresholds_of_a_corpus_without_hops_say_how_to_write_them(heard, tmp_path, capsys):

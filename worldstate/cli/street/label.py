@@ -8,10 +8,15 @@ standard deviation. For a standing ego.
 `model features --labels` and `model fit --labels` read: recordings of one's own become training data without
 marking by hand. It lies in the recording's folder or above it.
 
+The folder that `hear` wrote is an INPUT as well: --windows is then the list of all its recordings in which a
+camera looked, by when vehicles were handed over to it (some 0.2 s late), and no recording is read again. It
+belongs into the folder that was heard.
+
 Examples
 --------
   worldstate street label street.wav --detections boxes.json --camera camera.json --out labels.json
   worldstate street label ovad_dataset/SA1/left/1_00_0002 --out labels.json --windows ovad_dataset/labels.csv
+  worldstate street label heard --windows drives/labels.csv
   worldstate model fit features.csv --labels ovad_dataset/labels.csv --out model.json
 """
 
@@ -22,6 +27,7 @@ from typing import TYPE_CHECKING
 from worldstate import adapters
 from worldstate.cli.common import inputs, output, progress, sensors
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.corpus.corpus_inputs import CARD_NAME
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_sound_options(parser)
     sensors.add_sensor_options(parser)
     add = parser.add_argument_group("output").add_argument
-    add("--out", type=Path, required=True, metavar="JSON", help="trajectories and T0, OpenLABEL")
+    add("--out", type=Path, metavar="JSON", help="trajectories and T0, OpenLABEL; needed of a recording")
     add("--windows", type=Path, metavar="CSV", help="labelled seconds for `model fit --labels`")
     add("--figure", type=Path, metavar="PNG", help="draw the passes as seen from above")
     site = "name of the place, S.. (default: S and the name of the recording's folder)"
@@ -50,6 +56,10 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.operations.labelling import label_files, pass_labels, street_figure
 
     output.check_outputs(arguments, "out", "windows", figures=("figure",))
+    if (arguments.input[0] / CARD_NAME).is_file():
+        return _of_corpus(arguments)
+    if arguments.out is None:
+        raise InvalidArgumentError("--out: expected it, of a recording")
     if arguments.windows is not None and inputs.bag_of(arguments) is not None:
         raise InvalidArgumentError("--windows: expected none of a bag, which `model features` does not read")
     source, detections = sensors.camera_source(arguments, inputs.sound_of(arguments))
@@ -73,6 +83,18 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         for one in passes
     ]
     return output.CommandResult(summary, lines=lines)
+
+
+def _of_corpus(arguments: argparse.Namespace) -> output.CommandResult:
+    """List the windows of a corpus that was heard."""
+    from worldstate.adapters.files.file_io import write_rows
+    from worldstate.operations.labelling.label_files import COLUMNS, corpus_windows
+
+    if arguments.windows is None or arguments.out is not None or len(arguments.input) > 1:
+        raise InvalidArgumentError("--windows: expected it, of what `hear` wrote, and no --out")
+    rows = list(corpus_windows(arguments.input[0]))
+    write_rows(arguments.windows, COLUMNS, rows)
+    return output.CommandResult({"windows": str(arguments.windows), "n_windows": len(rows)})
 
 
 def _windows(

@@ -8,7 +8,7 @@ from worldstate.abduction.sequence.sequence_model import COMING_S, SequenceAlarm
 from worldstate.ground.values import LEAST_HEARD, nanoseconds, seconds
 from worldstate.state import Entity, RiskCue, WorldState
 
-from .corpus_tables import HeardApproach, HeardRecording, StateHours
+from .corpus_tables import SINCE_1970_S, HeardApproach, HeardRecording, StateHours
 
 # An advisory says that a vehicle comes into view within the risk's horizon.
 _HORIZON_S = COMING_S[-1]
@@ -29,9 +29,9 @@ class ApproachMeter:
 
     name: str
     site: str
-    clock: str = "media"
     first_ns: int | None = None
     last_ns: int = 0
+    looked: int = 0
     usable: int = 0
     budget: float | None = None
     _raised: bool = False
@@ -44,7 +44,7 @@ class ApproachMeter:
     def update(self, state: WorldState) -> None:
         """Take in the next state."""
         self.first_ns = state.stamp_ns if self.first_ns is None else self.first_ns
-        self.last_ns, self.clock = state.stamp_ns, state.clock
+        self.last_ns = state.stamp_ns
         self.usable += bool(state.cues) and all(cue.usable for cue in state.cues)
         self.budget = None if state.budget is None else state.budget.onsets_per_hour
         raised = [cue for cue in state.cues if cue.advisory is not None]
@@ -52,14 +52,15 @@ class ApproachMeter:
         self._hops[key] += 1
         self._onsets[key] += bool(raised) and not self._raised
         self._raised = bool(raised)
-        self._advise(state, raised)
+        looked = any(state.stamp_ns - one.stamp_ns <= _LOOKED_NS for one in state.searched)
+        self.looked += looked
+        self._advise(state, raised, looked)
         for entity in state.entities:
             if entity.status == "visible" and entity.moving:
                 self._see(entity, seconds(state.stamp_ns))
 
-    def _advise(self, state: WorldState, raised: list[RiskCue]) -> None:
+    def _advise(self, state: WorldState, raised: list[RiskCue], looked: bool) -> None:
         now_s, before, self._standing = seconds(state.stamp_ns), self._standing, {}
-        looked = any(state.stamp_ns - one.stamp_ns <= _LOOKED_NS for one in state.searched)
         for cue in raised:
             at = before.get(cue.direction, len(self._rows))
             if at == len(self._rows):
@@ -91,7 +92,7 @@ class ApproachMeter:
 
     def recording(self, content: str) -> HeardRecording:
         """Return the row of the recording."""
-        begun = HeardRecording(self.name, self.site, content, self.clock)
+        begun = HeardRecording(self.name, self.site, content)
         if self.first_ns is None:
             return begun
         return replace(
@@ -100,6 +101,7 @@ class ApproachMeter:
             end_s=seconds(self.last_ns),
             hops=self._hops.total(),
             heard=sum(hops for (_, unheard), hops in self._hops.items() if unheard is None),
+            looked=self.looked,
             usable=self.usable,
             onsets=self._onsets.total(),
             budget=self.budget,
@@ -112,7 +114,7 @@ class ApproachMeter:
     def hours(self) -> list[StateHours]:
         """Return the hops by state of the sensors."""
         day = None
-        if self.clock == "unix" and self.first_ns is not None:
+        if self.first_ns is not None and seconds(self.first_ns) >= SINCE_1970_S:
             day = datetime.fromtimestamp(seconds(self.first_ns), UTC).date().isoformat()
         return [
             StateHours(self.name, self.site, day, *key, hops, self._onsets[key])

@@ -13,6 +13,7 @@ from worldstate.adapters.files.file_io import plain_file, read_rows
 from worldstate.adapters.ros.bag_input import METADATA_NAME, STORAGE_SUFFIXES
 from worldstate.ground import InputFileError
 
+CARD_NAME = "corpus.json"  # In the folder that `hear` wrote
 LOG_SUFFIX = ".jsonl"  # Snapshots of `worldstate run` or `live`
 _SUFFIXES = {".wav", ".rf64", ".w64", ".flac", LOG_SUFFIX, *STORAGE_SUFFIXES}
 

@@ -35,10 +35,8 @@ from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, ho
 from worldstate.state import WorldState
 
 from .approach_meter import ApproachMeter, alarm_level
-from .corpus_inputs import LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
+from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
 from .corpus_tables import SUFFIX, TABLES, HeardHop, HeardRecording, row_writer
-
-CARD_NAME = "corpus.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +205,7 @@ def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
         text = str(error) if known else f"{type(error).__name__}: {error}"
         # In the same words wherever the corpus lies.
         failure = " ".join(text.replace(str(one.path), one.name).split())
-        row = HeardRecording(one.name, one.site, content, "media", failure=failure)
+        row = HeardRecording(one.name, one.site, content, failure=failure)
     shard = plan.shard(one, content)
     with row_writer(plan.file("recordings", shard), HeardRecording) as write:
         write(row)

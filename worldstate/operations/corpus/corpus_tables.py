@@ -17,6 +17,7 @@ from worldstate.ground.extras import optional
 
 Row = TypeVar("Row")
 SUFFIX = ".parquet"
+SINCE_1970_S = 1e9  # A stamp above it is no time since a first sample
 _BATCH_ROWS = 4096  # A row of hops has some 5 kB: 20 MB at a time
 
 
@@ -27,11 +28,12 @@ class HeardRecording:
     recording: str  # Name in the corpus
     site: str
     content: str  # Digest of its bytes, name and site
-    clock: str  # Of all its times: "media" counts from its first sample, "unix" from 1970
-    start_s: float | None = None  # End of the first window, and of the last
+    # End of the first window, and of the last: from the first sample on, or of a bag from 1970 on.
+    start_s: float | None = None
     end_s: float | None = None
     hops: int = 0
     heard: int = 0  # Hops in which a hidden vehicle would have been noticed
+    looked: int = 0  # Hops in which a camera had looked
     usable: int = 0  # Hops in which every cue may be acted on
     onsets: int = 0  # Times an advisory of any side began while none stood
     budget: float | None = None  # Onsets an hour that the alarm was set to; None if none is stated
@@ -44,7 +46,7 @@ class StateHours:
 
     recording: str
     site: str
-    day: str | None  # Of the first hop, UTC, if the clock counts from 1970
+    day: str | None  # Of the first hop, UTC; None if times count from the first sample
     sensors: str  # Condition of every sensor
     unheard: str | None  # Why nothing could be heard; None if it could
     hops: int

@@ -1,16 +1,27 @@
 """Files of labels: trajectories in the layout of ASAM OpenLABEL, windows as `train --labels` reads them."""
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.adapters.datasets.feature_extraction import FRONT, window_ends_s
-from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
+from worldstate.adapters.datasets.ovad import AUDIO_NAME, ENVIRONMENT, FRAME_RATE_HZ
+from worldstate.adapters.ros.bag_input import STORAGE_SUFFIXES
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.version import __version__
+from worldstate.operations.corpus.corpus_inputs import LOG_SUFFIX
+from worldstate.operations.corpus.corpus_tables import (
+    SINCE_1970_S,
+    HeardApproach,
+    HeardRecording,
+    corpus_rows,
+)
+from worldstate.smoothing.observations import FirstSight
 
 from .pass_labels import PassLabel
 
@@ -18,6 +29,10 @@ from .pass_labels import PassLabel
 COLUMNS = ("ID", "Class", "Environment", "Recording ID", "File", "End", "T0", "T0 std")
 # A window a second before T0 that is half a second off holds what the next class sounds like.
 SUREST_STD_S = 0.3
+# Of a hand-over for T0: 0.16 s late in the demo, an image and a hop.
+HANDED_OVER_STD_S = 0.2
+_NO_FILES = {LOG_SUFFIX, *STORAGE_SUFFIXES}  # Logs hold no sound, and `model features` reads no bags
+_LOOKED = 0.9  # Share of the hops of a recording: without a camera no window is known to be one of nothing
 # As in streams: no vehicle comes for so long, and what was in view is gone for a second.
 CALM_S, GONE_S, NONE_EVERY_S, TOGETHER_S = 5.0, 2.0, 10.0, 2.5
 
@@ -56,8 +71,40 @@ def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
     }
 
 
+class SeenPass(NamedTuple):
+    """A vehicle that came into view out of an arm."""
+
+    arm: str
+    t0: FirstSight
+
+
+def corpus_windows(corpus: Path) -> Iterator[tuple[object, ...]]:
+    """Yield the windows of a corpus, of recordings in which a camera looked, by when it saw vehicles."""
+    seen = defaultdict[str, list[HeardApproach]](list)
+    for row in corpus_rows(corpus, HeardApproach):
+        seen[row.recording] += [row] if row.seen else []
+    for one in corpus_rows(corpus, HeardRecording):
+        no_file = Path(one.recording).suffix in _NO_FILES or (one.start_s or 0.0) >= SINCE_1970_S
+        if no_file or not one.hops or one.looked < _LOOKED * one.hops:
+            continue
+        time_s = np.arange(10, round(10.0 * (one.end_s or 0.0)) + 1) / 10.0
+        in_view, passes = np.zeros(len(time_s), np.bool_), list[SeenPass]()
+        for row in seen[one.recording]:
+            first_s, last_s = row.seen_s or 0.0, row.gone_s or 0.0
+            in_view |= (time_s >= first_s - 0.05) & (time_s <= last_s + 0.05)
+            if row.side in SIDES:
+                passes.append(SeenPass(row.side, FirstSight(first_s, HANDED_OVER_STD_S)))
+        file = one.recording if Path(one.recording).suffix else f"{one.recording}/{AUDIO_NAME}"
+        site = one.site if ENVIRONMENT.fullmatch(one.site) else f"S{one.site}"
+        yield from window_rows(passes, in_view, time_s, site, file)
+
+
 def window_rows(
-    passes: Sequence[PassLabel], in_view: BoolArray, time_s: FloatArray, environment: str, file: str
+    passes: Sequence[SeenPass | PassLabel],
+    in_view: BoolArray,
+    time_s: FloatArray,
+    environment: str,
+    file: str,
 ) -> list[tuple[object, ...]]:
     """Return the windows of one recording: of every arm at T0, in view after it, and where no vehicle comes.
 
