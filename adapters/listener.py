@@ -30,7 +30,7 @@ from worldstate.frontend.settings import HOP_RATE_HZ
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground import InvalidArgumentError, WorldstateError
 from worldstate.ground.checks import in_range, one_of
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import BoolArray, Float32Array
 from worldstate.ground.values import integer_ns, nanoseconds, replaced, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.measurement.odometry import Odometry
@@ -473,13 +473,15 @@ def listen(path: SoundInput | str | Sequence[str], **parts: Unpack[SourceParts])
     yield from (step.state for step in listen_steps(open_source(path, **parts)))
 
 
-def listen_steps(source: Source) -> Iterator[Step]:
+def listen_steps(source: Source, kept: BoolArray | None = None) -> Iterator[Step]:
     """Yield every hop of `source` with what was heard and measured.
 
     Parameters
     ----------
     source : Source
         From `open_source`.
+    kept : ndarray of bool, optional
+        Which seconds are heard, shape (n,); the others are skipped as `Listener.skip` does. All if not given.
 
     Yields
     ------
@@ -504,7 +506,7 @@ def listen_steps(source: Source) -> Iterator[Step]:
     ...     [step.frame.feature.shape for step in listen_steps(open_source(path))]
     [(60,), (60,), (60,)]
     """
-    for listener, block in listened(source):
+    for listener, block in listened(source, kept):
         yield from listener.steps(block)
 
 
@@ -543,15 +545,19 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
         yield from listener.measured(block)
 
 
-def listened(source: Source) -> Iterator[tuple[Listener, Float32Array | None]]:
+def listened(source: Source, kept: BoolArray | None = None) -> Iterator[tuple[Listener, Float32Array | None]]:
     """Yield the sound of `source` block by block, None last, each beside the one listener to take it."""
     strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
     with open_sound(source.sound, n_microphones, channels=source.array.channels, strict=strict) as audio:
         endless = isinstance(source.sound, RawPcm | Audio)
         check_clocks(source, None if endless else audio.duration_s)
         listener = Listener(source, audio.sample_rate_hz)
-        for block in audio.blocks(max(audio.sample_rate_hz // PARTS_PER_SECOND, 1)):
-            yield listener, block
+        per_second = 1 if kept is not None else PARTS_PER_SECOND
+        for number, block in enumerate(audio.blocks(max(audio.sample_rate_hz // per_second, 1))):
+            if kept is None or kept[number]:
+                yield listener, block
+            else:
+                listener.skip(nanoseconds(len(block) / audio.sample_rate_hz))
         yield listener, None
 
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter, defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +26,10 @@ from worldstate.commissioning.alarm_curve import raised_at
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds
 from worldstate.operations import run_recording
 from worldstate.operations.calibration.cueing_calibration import hop_streams
-from worldstate.operations.corpus.approach_meter import ApproachMeter
-from worldstate.operations.corpus.corpus_inputs import find_corpus
-from worldstate.operations.corpus.corpus_tables import TABLES, read_rows
+from worldstate.operations.corpus.approach_meter import LEFT_OUT, ApproachMeter
+from worldstate.operations.corpus.cascade import AFTER_S, BEFORE_S, SAMPLED, kept_seconds
+from worldstate.operations.corpus.corpus_inputs import CorpusInput, find_corpus
+from worldstate.operations.corpus.corpus_tables import TABLES, corpus_rows
 from worldstate.operations.metrics.approach_table import rising_edges
 from worldstate.operations.recordings.evidence_report import told_advisories
 from worldstate.operations.recordings.hop_table import HopTable, hop_stream
@@ -65,7 +67,7 @@ def heard(corpus, options, tmp_path_factory) -> Path:
 
 
 def rows(out: Path, table: str) -> list:
-    return [row for path in sorted((out / table).glob("*.parquet")) for row in read_rows(path, TABLES[table])]
+    return list(corpus_rows(out, TABLES[table]))
 
 
 def contents(out: Path) -> dict[str, bytes]:
@@ -223,7 +225,7 @@ def test_a_second_run_hears_what_is_new_or_changed_and_nothing_else(corpus, opti
 def test_a_failure_that_may_pass_is_tried_again(corpus, options, heard, tmp_path, monkeypatch):
     from worldstate.operations.corpus import corpus_run
 
-    def fails(source: object) -> None:
+    def fails(*given: object) -> None:
         raise OSError("the disk of the network is away")
 
     with monkeypatch.context() as patched:
@@ -324,6 +326,48 @@ def test_shadow_hours_are_those_of_all_recordings_heard_to_their_end(corpus, hea
     assert everything["heard_hours"] + everything["unheard_hours"] == pytest.approx(hops / 36_000)
     assert {one["name"] for one in report["hours"]["site"]} == {"north", "south"}
     assert "north" in (out / "shadow.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def quiet(street, tmp_path_factory) -> Path:
+    """Return a folder with twice 30 s of each microphone's own noise in which a common sound lasts 3 s."""
+    folder = tmp_path_factory.mktemp("quiet")
+    sound = np.random.default_rng(1).normal(0.0, 0.01, (240_000, 4))
+    sound[120_000:144_000] += np.random.default_rng(2).normal(0.0, 0.02, (24_000, 1))
+    whole = next(name for name in map("{}.wav".format, range(999)) if sampled(name))
+    for name in ("part.wav", whole):
+        soundfile.write(folder / name, sound, 8_000, subtype="PCM_24")
+    assert not sampled("part.wav")
+    return folder
+
+
+def sampled(name: str) -> bool:
+    return int(CorpusInput(name, Path(name), "").key, 16) % SAMPLED == 0
+
+
+def test_a_cascade_hears_what_is_louder_and_what_lies_around_it(quiet, options, tmp_path):
+    part = open_source(quiet / "part.wav", **options)
+    assert np.flatnonzero(kept_seconds(part)).tolist() == [*range(15 - BEFORE_S, 18 + AFTER_S)]
+    hear(quiet, tmp_path, cascade=True, **options)
+    hops = defaultdict(Counter)
+    for row in rows(tmp_path, "hours"):
+        hops[row.recording][row.unheard] += row.hops
+    whole = next(name for name in hops if sampled(name))
+    assert hops["part.wav"][LEFT_OUT] == 10 * (30 - 3 - BEFORE_S - AFTER_S)
+    assert hops["part.wav"].total() == pytest.approx(hops[whole].total(), abs=10)
+    assert LEFT_OUT not in hops[whole]
+
+
+def test_the_recall_of_a_cascade_is_that_of_recordings_heard_whole(quiet, options, tmp_path, capsys):
+    meter = ApproachMeter("a", "")
+    for state in states_of([{"left"} if hop in (50, 150) else set() for hop in range(200)]):
+        meter.update(state)
+    kept = np.zeros(21, np.bool_)
+    kept[16] = True
+    meter.cascaded(kept, sampled=True)
+    assert [(round(one.time_s, 1), one.kept) for one in meter.approaches()] == [(5.1, False), (15.1, True)]
+    with pytest.raises(InvalidArgumentError, match="cascade: expected it without hops"):
+        hear(quiet, tmp_path, cascade=True, hops=True, **options)
 
 
 @pytest.mark.long

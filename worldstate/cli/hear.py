@@ -12,6 +12,9 @@ DIR receives the folders recordings, approaches and hours, with one Parquet file
 content, the array, the model, the options and the version. What cannot be heard is a row of recordings with
 its failure. Every file of a table can be read at once, as by pandas.read_parquet("DIR/approaches").
 
+--cascade hears four microphones first, and all of them only around seconds whose level or coherence exceeds
+the usual of the recording. One recording in twenty is heard whole, by which the recall is stated.
+
 --shadow counts every recording of DIR as free of hazards: hours heard and unheard, onsets an hour with their
 exact interval by site, day and state of the sensors, and how many more hours would show that the alarm keeps
 its budget.
@@ -73,6 +76,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     listening.add_listen_options(parser)
     add("--mask-dead", action="store_true", help="leave silent channels out instead of failing")
     add("--hops", action="store_true", help="write a row for each hop as well, its snapshot included")
+    quick = "hear only seconds that are louder or more coherent than usual; states its recall"
+    add("--cascade", action="store_true", help=quick)
     told = "count every advisory as false: onsets an hour by site and state of the sensors, DIR/shadow.html"
     add("--shadow", action="store_true", help=told)
     add("--shard", default="1/1", metavar="I/N", help="the I-th of N shares, as of a SLURM array (from 1)")
@@ -103,6 +108,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
             executor=executor,
             shard=_share(arguments.shard),
             hops=arguments.hops,
+            cascade=arguments.cascade,
             on_recording=told,
             array=given.car.array,
             camera=given.camera,
@@ -114,7 +120,21 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     counts: dict[str, object] = {status: statuses[status] for status in ("heard", "there", "failed")}
     speed = sound_s / (time.perf_counter() - begun_s)
     found = counts | {"sound_s": sound_s, "realtime_factor": speed}
+    if arguments.cascade:
+        found["cascade_recall"] = _recall(arguments.out)
     return _shadow(arguments.out, found) if arguments.shadow else output.CommandResult(found)
+
+
+def _recall(out: Path) -> str:
+    """Return the share of approaches that the cascade kept, of recordings that were heard whole as well."""
+    from worldstate.operations.corpus.corpus_tables import HeardApproach, corpus_rows
+    from worldstate.operations.metrics.approach_table import share_interval
+
+    kept = [one.kept for one in corpus_rows(out, HeardApproach) if one.kept is not None]
+    if not kept:
+        return "not known: no approach in the recordings that are heard whole, one in twenty"
+    low, high = share_interval(sum(kept), len(kept))
+    return f"{sum(kept)} of {len(kept)} onsets ({low:.2f} to {high:.2f}), in one recording of twenty"
 
 
 def _shadow(out: Path, found: dict[str, object]) -> output.CommandResult:

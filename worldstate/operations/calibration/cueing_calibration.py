@@ -293,21 +293,17 @@ def hop_streams(corpus: Path) -> Iterator[HopTable]:
     Raises
     ------
     InputFileError
-        If it holds no hops of sound.
+        If `hear` wrote no hops of it.
     """
     names = [name for name in (*STREAM_COLUMNS, "level_left", "level_right") if name != "there"]
-    rows = (row for row in corpus_rows(corpus, HeardHop) if row.log_likelihoods is not None)
-    empty = True
-    for (name, *about), hops in itertools.groupby(rows, key=attrgetter("recording", "site", "signature")):
+    rows, about_of = corpus_rows(corpus, HeardHop), attrgetter("recording", "site", "signature")
+    for (name, site, signature), hops in itertools.groupby(rows, key=about_of):
         columns = zip(*map(attrgetter(*names), hops), strict=True)
         table = dict(zip(names, map(np.array, columns), strict=True))
         # Of a hop without a level the column holds None.
         levels = {side: table[side].astype(float) for side in names[-2:]}
-        beside = dict(zip(("site", "signature"), about, strict=True))
-        yield HopTable(table | levels | {"there": table["seen"]}, name=name, about=beside)
-        empty = False
-    if empty:
-        raise InputFileError(corpus, "expected hops of sound: `worldstate hear --hops` writes them")
+        about = {"site": site, "signature": signature}
+        yield HopTable(table | levels | {"there": table["seen"]}, name=name, about=about)
 
 
 def find_inputs(path: Path) -> list[Path]:
@@ -328,6 +324,8 @@ def read_input(
     about = {"signature": signature_checksum(chosen.signature)}
     if path.suffix == ".npz" or (path / "hops").is_dir():
         streams = load_streams(path) if path.is_file() else list(hop_streams(path))
+        if not streams:
+            raise InputFileError(path, "expected hops of sound: `worldstate hear --hops` writes them")
         if any(stream.about.get("signature", about["signature"]) != about["signature"] for stream in streams):
             raise OutOfDomainError(f"{path}: heard with another model's signature; listen to the sound again")
         return streams

@@ -5,13 +5,16 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, SequenceAlarm
+from worldstate.ground.typing import BoolArray
 from worldstate.ground.values import LEAST_HEARD, nanoseconds, seconds
+from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.state import Entity, RiskCue, WorldState
 
 from .corpus_tables import SINCE_1970_S, HeardApproach, HeardRecording, StateHours
 
 # An advisory says that a vehicle comes into view within the risk's horizon.
 _HORIZON_S = COMING_S[-1]
+LEFT_OUT = "left out by the cascade"
 _LOOKED_NS = nanoseconds(0.5)  # An older look was not at this hop
 
 
@@ -89,6 +92,16 @@ class ApproachMeter:
                 break
         self._rows.append(HeardApproach(self.name, self.site, side))
         return len(self._rows) - 1
+
+    def cascaded(self, kept: BoolArray, sampled: bool) -> None:
+        """Count the hops that a cascade left out or, of a recording heard whole, which approaches it kept."""
+        if not sampled:
+            self._hops["", LEFT_OUT] += round(float((~kept).sum()) / HOP_S)
+            return
+        for at, row in enumerate(self._rows):
+            if row.time_s is not None:
+                second = min(int(row.time_s - seconds(self.first_ns or 0) + 1.0), len(kept) - 1)
+                self._rows[at] = replace(row, kept=bool(kept[second]))
 
     def recording(self, content: str) -> HeardRecording:
         """Return the row of the recording."""

@@ -5,8 +5,7 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import ExitStack
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Unpack
@@ -26,17 +25,22 @@ from worldstate.adapters.source import CorpusParts, Source, open_source
 from worldstate.adapters.state_log import is_own_mcap, read_log
 from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground import InputFileError, MissingExtraError, WorldstateError, in_range, seconds
+from worldstate.ground import (
+    InputFileError,
+    InvalidArgumentError,
+    MissingExtraError,
+    WorldstateError,
+    in_range,
+)
 from worldstate.ground.extras import check_extra
 from worldstate.ground.parallel import in_executor, in_processes
 from worldstate.ground.version import __version__
-from worldstate.measurement.measurement import Measurement
 from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, hop_stream, signature_checksum
-from worldstate.state import WorldState
 
 from .approach_meter import ApproachMeter, alarm_level
+from .cascade import SAMPLED, kept_seconds
 from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
-from .corpus_tables import SUFFIX, TABLES, HeardHop, HeardRecording, row_writer
+from .corpus_tables import SUFFIX, TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +65,7 @@ class HearPlan:
     card: dict[str, Any]  # Of the folder; its digest is of all that decides the tables beside the recordings
 
     @classmethod
-    def begun(cls, out: Path, hops: bool, parts: CorpusParts) -> "HearPlan":
+    def begun(cls, out: Path, hops: bool, cascade: bool, parts: CorpusParts) -> "HearPlan":
         """Make the folder and return the plan; refuse a folder in which recordings were heard otherwise."""
         others: dict[str, Any] = {name: one for name, one in parts.items() if one is not None}
         array, model = others.pop("array", None), others.pop("model", None)
@@ -72,10 +76,10 @@ class HearPlan:
         read_model(model, array=array)  # A wrong one is refused before the work
         file = file_of_model(model, array)
         # Whatever the file of an array is called, its microphones decide.
-        decides = [__version__, hops, array and (array.positions_m, array.channels), file, others]
+        decides = [__version__, hops, cascade, array and (array.positions_m, array.channels), file, others]
         text = json.dumps(decides, sort_keys=True, default=_plain)
         card = {"version": __version__, "array": array and Path(array.name).name, "model": file.name}
-        card |= {"hops": hops, "digest": hashlib.sha256(text.encode()).hexdigest()}
+        card |= {"hops": hops, "cascade": cascade, "digest": hashlib.sha256(text.encode()).hexdigest()}
         for table in TABLES:
             (out / table).mkdir(parents=True, exist_ok=True)
         if not (out / CARD_NAME).exists():
@@ -115,6 +119,7 @@ def hear(
     executor: Executor | None = None,
     shard: tuple[int, int] = (1, 1),
     hops: bool = False,
+    cascade: bool = False,
     on_recording: Callable[[HeardShard], object] = lambda shard: None,
     **parts: Unpack[CorpusParts],
 ) -> list[HeardShard]:
@@ -140,6 +145,10 @@ def hear(
         Which of how many shares is heard, from 1, as one of several machines without an executor.
     hops : bool
         Write a row for each hop as well, its snapshot included.
+    cascade : bool
+        Hear only the seconds in which level or coherence of four microphones is above the usual of the
+        recording, and those around them; one recording in twenty is heard whole, and the column ``kept`` of
+        its approaches gives the cascade's recall. Not with `hops`.
     on_recording : callable
         Called after each recording, for progress.
     **parts
@@ -171,9 +180,11 @@ def hear(
     ['heard', 'there']
     """
     check_extra("pyarrow")
+    if cascade and hops:
+        raise InvalidArgumentError("cascade: expected it without hops, it hears only some of them")
     in_range("shard", shard[0], 1, in_range("shard", shard[1], 1, 1_000_000))
     inputs = share_of(find_corpus(Path(corpus).absolute()), *shard)
-    plan = HearPlan.begun(Path(out).absolute(), hops, parts)
+    plan = HearPlan.begun(Path(out).absolute(), hops, cascade, parts)
     former = defaultdict[str, list[Path]](list)
     for path in plan.out.glob(f"*/*-*{SUFFIX}"):
         former[path.name.partition("-")[0]].append(path)
@@ -207,8 +218,7 @@ def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
         failure = " ".join(text.replace(str(one.path), one.name).split())
         row = HeardRecording(one.name, one.site, content, failure=failure)
     shard = plan.shard(one, content)
-    with row_writer(plan.file("recordings", shard), HeardRecording) as write:
-        write(row)
+    write_rows(plan.file("recordings", shard), HeardRecording, [row])
     status = "failed" if row.failure else "heard"
     return HeardShard(one.name, shard, status, row.hops * HOP_S, row.failure)
 
@@ -216,53 +226,36 @@ def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
 def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
     """Hear one recording and write its tables; return its row."""
     meter, shard = ApproachMeter(one.name, one.site), plan.shard(one, content)
-    tables = [name for name in TABLES if name != "recordings" and (plan.card["hops"] or name != "hops")]
-    with ExitStack() as files:
-        write = {
-            name: files.enter_context(row_writer(plan.file(name, shard), TABLES[name])) for name in tables
-        }
-        source = None if _is_log(one.path) else _source(plan, one)
-        hop = _hop_of(one, source) if "hops" in write else None
-        for state, measurement in _heard(one, source):
+    if one.path.suffix == LOG_SUFFIX or is_own_mcap(one.path):
+        for _, state in read_log(one.path):
             meter.update(state)
-            if hop is not None:
-                write["hops"](hop(state, measurement))
-        for approach in meter.approaches():
-            write["approaches"](approach)
-        for hours in meter.hours():
-            write["hours"](hours)
+    elif plan.card["hops"]:
+        write_rows(plan.file("hops", shard), HeardHop, _hops(_source(plan, one), meter))
+    else:
+        source = _source(plan, one)
+        kept = kept_seconds(source) if plan.card["cascade"] else None
+        sampled = int(one.key, 16) % SAMPLED == 0
+        for step in listen_steps(source, None if sampled else kept):
+            meter.update(step.state)
+        if kept is not None:
+            meter.cascaded(kept, sampled)
+    write_rows(plan.file("approaches", shard), HeardApproach, meter.approaches())
+    write_rows(plan.file("hours", shard), StateHours, meter.hours())
     return meter.recording(content)
 
 
-def _is_log(path: Path) -> bool:
-    return path.suffix == LOG_SUFFIX or is_own_mcap(path)
-
-
-def _heard(one: CorpusInput, source: Source | None) -> Iterator[tuple[WorldState, Measurement | None]]:
-    """Yield the states of a recording, of sound with what was measured."""
-    if source is None:
-        return ((state, None) for _, state in read_log(one.path))
-    return ((step.state, step.measurement) for step in listen_steps(source))
-
-
-def _hop_of(one: CorpusInput, source: Source | None) -> Callable[[WorldState, Measurement | None], HeardHop]:
-    """Return what makes the row of a hop."""
-    alarm = getattr(source and source.sequence, "alarm", None)
-    signature = None if source is None else signature_checksum(source.model)
-    denied = ((source and source.street) or StreetModel()).death
-
-    def row(state: WorldState, measurement: Measurement | None) -> HeardHop:
-        plain = HeardHop(one.name, one.site, seconds(state.stamp_ns), state.risk, state.to_json(), signature)
-        if measurement is None:
-            return plain
-        columns = hop_stream([measurement], name=one.name).columns
+def _hops(source: Source, meter: ApproachMeter) -> Iterator[HeardHop]:
+    """Yield the hops of a recording while the meter counts them."""
+    alarm, denied = getattr(source.sequence, "alarm", None), (source.street or StreetModel()).death
+    signature = signature_checksum(source.model)
+    for step in listen_steps(source):
+        meter.update(state := step.state)
+        levels = [alarm and alarm_level(state, side, denied, alarm) for side in SIDES]
+        columns = hop_stream([step.measurement], name=meter.name).columns
         # No reference says what was in view beside what was seen.
-        told = {name: columns[name][0].tolist() for name in STREAM_COLUMNS if name != "there"}
-        if alarm is not None:
-            told |= {f"level_{side}": alarm_level(state, side, denied, alarm) for side in SIDES}
-        return replace(plain, **told)
-
-    return row
+        heard = {name: columns[name][0].tolist() for name in STREAM_COLUMNS if name != "there"}
+        about = meter.name, meter.site, state.risk, state.to_json(), signature
+        yield HeardHop(*about, levels[0], levels[1], **heard)
 
 
 def _source(plan: HearPlan, one: CorpusInput) -> Source:

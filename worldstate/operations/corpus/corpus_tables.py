@@ -4,8 +4,8 @@ Files hold neither the time of writing nor the name of a machine, and the same r
 one release of pyarrow.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import UnionType
@@ -70,27 +70,28 @@ class HeardApproach:
     lead_s: float | None = None  # From the advisory to its coming into view
     label: str | None = None  # Likeliest class of the vehicle
     usable: bool = False  # Whether the advisory could be acted on when it began
+    kept: bool | None = None  # Whether a cascade would have heard its beginning; None if that was not asked
 
 
 @dataclass(frozen=True, slots=True)
 class HeardHop:
-    """A hop: table ``hops``, on request; the columns below the snapshot are null of a log of snapshots."""
+    """A hop of sound: table ``hops``, on request."""
 
     recording: str
     site: str
-    time_s: float
     risk: float | None
     snapshot: str  # JSON
-    signature: int | None = None  # Checksum of the window model whose scores follow
-    level_left: float | None = None  # Log-odds: the alarm is raised by thresholds up to it; null for none
-    level_right: float | None = None
+    signature: int  # Checksum of the window model whose scores follow
+    level_left: float | None  # Log-odds: the alarm is raised by thresholds up to it; None by no threshold
+    level_right: float | None
     # As of hop streams
-    log_likelihoods: tuple[float, ...] | None = None
-    answer: int | None = None
-    miss_rate: float | None = None
-    clutter_rate: float | None = None
-    approach: float | None = None
-    seen: bool | None = None
+    time_s: float
+    log_likelihoods: tuple[float, ...]
+    answer: int
+    miss_rate: float
+    clutter_rate: float
+    approach: float
+    seen: bool
 
 
 TABLES: Mapping[str, type] = {
@@ -103,24 +104,13 @@ TABLES: Mapping[str, type] = {
 _ARROW = {str: "string", float: "double", int: "int64", bool: "bool"}
 
 
-@contextmanager
-def row_writer(path: Path, kind: type) -> Iterator[Callable[[Any], None]]:
-    """Lend a function that takes the rows of one file, which is written whole or not at all."""
+def write_rows(path: Path, kind: type, rows: Iterable[Any]) -> None:
+    """Write one file of a table, whole or not at all."""
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
-    rows, schema = list[dict[str, Any]](), _schema(kind)
+    left, schema = map(asdict, rows), _schema(kind)
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, compression="zstd") as file:
-
-        def flush() -> None:
-            file.write_table(arrow.Table.from_pylist(rows, schema=schema))
-            rows.clear()
-
-        def write(row: Any) -> None:
-            rows.append(asdict(row))
-            if len(rows) == _BATCH_ROWS:
-                flush()
-
-        yield write
-        flush()
+        while batch := list(itertools.islice(left, _BATCH_ROWS)):
+            file.write_table(arrow.Table.from_pylist(batch, schema=schema))
 
 
 def corpus_rows(out: Path, kind: type[Row]) -> Iterator[Row]:
@@ -131,33 +121,21 @@ def corpus_rows(out: Path, kind: type[Row]) -> Iterator[Row]:
     InputFileError
         If it is no corpus, or a file is damaged or holds other columns.
     """
+    arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     table = next(name for name, one in TABLES.items() if one is kind)
     paths = sorted((out / "recordings").glob(f"[!.]*{SUFFIX}"))
     if not paths:
         raise InputFileError(out, "expected the folder that `worldstate hear --out` wrote")
-    for path in paths:
-        if (held := out / table / path.name).exists():  # A failure has no other table
-            yield from read_rows(held, kind)
-
-
-def read_rows(path: Path, kind: type[Row]) -> Iterator[Row]:
-    """Yield the rows of a file of one table.
-
-    Raises
-    ------
-    InputFileError
-        If it is damaged or holds other columns.
-    """
-    arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
-    schema = _schema(kind)
-    try:
-        with parquet.ParquetFile(path) as file:
-            if not file.schema_arrow.equals(schema):
-                raise InputFileError(path, f"expected the columns {', '.join(schema.names)}")
-            for batch in file.iter_batches(_BATCH_ROWS):
-                yield from (kind(**row) for row in batch.to_pylist())
-    except (OSError, arrow.ArrowException) as error:
-        raise InputFileError(path, f"expected a Parquet file of a corpus ({error})") from error
+    # What could not be heard has no other table.
+    for path in filter(Path.exists, (out / table / path.name for path in paths)):
+        try:
+            with parquet.ParquetFile(path) as file:
+                if not file.schema_arrow.equals(_schema(kind)):
+                    raise InputFileError(path, f"expected the columns {', '.join(_schema(kind).names)}")
+                for batch in file.iter_batches(_BATCH_ROWS):
+                    yield from (kind(**row) for row in batch.to_pylist())
+        except (OSError, arrow.ArrowException) as error:
+            raise InputFileError(path, f"expected a Parquet file of a corpus ({error})") from error
 
 
 def _schema(kind: type) -> Any:
