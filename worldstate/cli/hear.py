@@ -31,33 +31,23 @@ import argparse
 import re
 import time
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from worldstate.cli.common import inputs, listening, output, progress, sensors
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from concurrent.futures import Executor
-
     from worldstate.operations.corpus.corpus_run import HeardShard
 
 NEEDS = ("pyarrow",)
 _CONNECT_S = 10.0
 FIRST_OPTIONS = (
-    "--out",
-    "--array",
-    "--model",
-    "--budget",
-    "--alpha",
-    "--uncalibrated",
-    "--hops",
-    "--jobs",
-    "--shard",
+    *("--out", "--array", "--model", "--budget", "--alpha", "--uncalibrated"),
+    *("--hops", "--cascade", "--shadow", "--jobs", "--scheduler", "--shard"),
 )
 
 
@@ -88,56 +78,43 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.operations.corpus.corpus_inputs import find_corpus
+    from worldstate.operations.corpus.corpus_inputs import find_corpus, share_of
     from worldstate.operations.corpus.corpus_run import hear
 
-    given = sensors.given_sensors(arguments)
-    parts = listening.place_and_settings(arguments, given.setup.boxes, arguments.mask_dead)
-    begun_s, count = time.perf_counter(), len(find_corpus(arguments.corpus))
+    given, shard = sensors.given_sensors(arguments), _share(arguments.shard)
+    parts: dict[str, Any] = listening.place_and_settings(arguments, given.setup.boxes, arguments.mask_dead)
+    parts |= {"array": given.car.array, "model": given.model}
+    parts |= {"camera": given.camera, "miss_rates": given.miss_rates}
+    parts |= {"hops": arguments.hops, "cascade": arguments.cascade}
+    begun_s, count = time.perf_counter(), len(share_of(find_corpus(arguments.corpus), *shard))
     with _executor(arguments.scheduler) as executor, progress.progress_bar("hearing", count) as bar:
 
-        def told(shard: "HeardShard") -> None:
-            if shard.failure is not None:
-                output.say(f"not heard: {shard.failure}")
+        def told(found: "HeardShard") -> None:
+            if found.failure is not None:
+                output.say(f"not heard: {found.failure}")
             bar.advance()
 
-        heard = hear(
-            arguments.corpus,
-            arguments.out,
-            jobs=arguments.jobs,
-            executor=executor,
-            shard=_share(arguments.shard),
-            hops=arguments.hops,
-            cascade=arguments.cascade,
-            on_recording=told,
-            array=given.car.array,
-            camera=given.camera,
-            miss_rates=given.miss_rates,
-            model=given.model,
-            **parts,
-        )
+        work: dict[str, Any] = {"jobs": arguments.jobs, "executor": executor, "shard": shard}
+        heard = hear(arguments.corpus, arguments.out, on_recording=told, **work, **parts)
     statuses, sound_s = Counter(one.status for one in heard), sum(one.sound_s for one in heard)
-    counts: dict[str, object] = {status: statuses[status] for status in ("heard", "there", "failed")}
-    speed = sound_s / (time.perf_counter() - begun_s)
-    found = counts | {"sound_s": sound_s, "realtime_factor": speed}
+    found: dict[str, Any] = {status: statuses[status] for status in ("heard", "there", "failed")}
+    found |= {"sound_s": sound_s, "realtime_factor": sound_s / (time.perf_counter() - begun_s)}
     if arguments.cascade:
         found["cascade_recall"] = _recall(arguments.out)
     return _shadow(arguments.out, found) if arguments.shadow else output.CommandResult(found)
 
 
 def _recall(out: Path) -> str:
-    """Return the share of approaches that the cascade kept, of recordings that were heard whole as well."""
+    """Return the share of onsets that the cascade kept, of recordings that were heard whole as well."""
     from worldstate.operations.corpus.corpus_tables import HeardApproach, corpus_rows
     from worldstate.operations.metrics.approach_table import share_interval
 
     kept = [one.kept for one in corpus_rows(out, HeardApproach) if one.kept is not None]
-    if not kept:
-        return "not known: no approach in the recordings that are heard whole, one in twenty"
-    low, high = share_interval(sum(kept), len(kept))
-    return f"{sum(kept)} of {len(kept)} onsets ({low:.2f} to {high:.2f}), in one recording of twenty"
+    interval = "[{:.2f}, {:.2f}]".format(*share_interval(sum(kept), len(kept))) if kept else "not known"
+    return f"{sum(kept)} of {len(kept)} onsets, {interval}, in the recordings that were heard whole"
 
 
-def _shadow(out: Path, found: dict[str, object]) -> output.CommandResult:
+def _shadow(out: Path, found: dict[str, Any]) -> output.CommandResult:
     """Return hours and onsets of the whole corpus, and write their page."""
     from worldstate.operations.corpus import corpus_tables, shadow
 
@@ -145,29 +122,25 @@ def _shadow(out: Path, found: dict[str, object]) -> output.CommandResult:
     budget = next((one.budget for one in recordings if one.budget is not None), None)
     week = shadow.shadow_hours(corpus_tables.corpus_rows(out, corpus_tables.StateHours), budget)
     shadow.write_shadow_page(out / "shadow.html", week, f"Shadow hours of {out.name}")
+    more = week["all"][0].more_hours if week["all"] else None
+    told = {"page": str(out / "shadow.html"), "budget": budget, "more_hours_for_budget": more}
     everything = {group: [asdict(row) for row in rows] for group, rows in week.items()}
-    table = found | {"page": str(out / "shadow.html"), "budget": budget}
-    if all_hours := week["all"]:
-        table["more_hours_for_budget"] = all_hours[0].more_hours
     lines = [str(row) for rows in week.values() for row in rows]
-    return output.CommandResult(table | {"hours": everything}, table=table, lines=lines)
+    return output.CommandResult(found | told | {"hours": everything}, table=found | told, lines=lines)
 
 
-@contextmanager
-def _executor(address: str | None) -> "Iterator[Executor | None]":
-    """Lend the workers of a Dask scheduler, None without an address."""
+def _executor(address: str | None) -> AbstractContextManager[Any]:
+    """Return the workers of a Dask scheduler, None without an address."""
     if address is None:
-        yield None
-        return
+        return nullcontext()
     check_extra("distributed")
     from distributed import Client
 
     try:
-        client = Client(address, timeout=_CONNECT_S)
+        workers: AbstractContextManager[Any] = Client(address, timeout=_CONNECT_S).get_executor()
     except (OSError, ValueError) as error:
         raise InvalidArgumentError(f"--scheduler: expected a Dask scheduler, {address}: {error}") from error
-    with client:
-        yield client.get_executor()
+    return workers
 
 
 def _share(text: str) -> tuple[int, int]:

@@ -33,7 +33,7 @@ class ApproachMeter:
     name: str
     site: str
     first_ns: int | None = None
-    last_ns: int = 0
+    last_ns: int | None = None
     looked: int = 0
     usable: int = 0
     budget: float | None = None
@@ -105,20 +105,10 @@ class ApproachMeter:
 
     def recording(self, content: str) -> HeardRecording:
         """Return the row of the recording."""
-        begun = HeardRecording(self.name, self.site, content)
-        if self.first_ns is None:
-            return begun
-        return replace(
-            begun,
-            start_s=seconds(self.first_ns),
-            end_s=seconds(self.last_ns),
-            hops=self._hops.total(),
-            heard=sum(hops for (_, unheard), hops in self._hops.items() if unheard is None),
-            looked=self.looked,
-            usable=self.usable,
-            onsets=self._onsets.total(),
-            budget=self.budget,
-        )
+        first_s, last_s = (None if ns is None else seconds(ns) for ns in (self.first_ns, self.last_ns))
+        heard = sum(hops for (_, unheard), hops in self._hops.items() if unheard is None)
+        counts = self._hops.total(), heard, self.looked, self.usable, self._onsets.total()
+        return HeardRecording(self.name, self.site, content, first_s, last_s, *counts, self.budget)
 
     def approaches(self) -> list[HeardApproach]:
         """Return the approaches in the order in which they began."""

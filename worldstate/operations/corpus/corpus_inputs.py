@@ -11,7 +11,7 @@ from typing import Any, cast
 from worldstate.adapters.datasets.ovad import AUDIO_NAME, Recording, named_array
 from worldstate.adapters.files.file_io import plain_file, read_rows
 from worldstate.adapters.ros.bag_input import METADATA_NAME, STORAGE_SUFFIXES
-from worldstate.ground import InputFileError
+from worldstate.ground import InputFileError, in_range
 
 CARD_NAME = "corpus.json"  # In the folder that `hear` wrote
 LOG_SUFFIX = ".jsonl"  # Snapshots of `worldstate run` or `live`
@@ -126,4 +126,5 @@ def share_of(inputs: Iterable[CorpusInput], number: int, of: int) -> list[Corpus
     >>> [len(share_of(inputs, number, 2)) for number in (1, 2)]
     [4, 5]
     """
+    in_range("shard", number, 1, in_range("shard", of, 1, 1_000_000))
     return [one for one in inputs if int(one.key, 16) % of == number - 1]

@@ -30,7 +30,6 @@ from worldstate.ground import (
     InvalidArgumentError,
     MissingExtraError,
     WorldstateError,
-    in_range,
 )
 from worldstate.ground.extras import check_extra
 from worldstate.ground.parallel import in_executor, in_processes
@@ -67,12 +66,16 @@ class HearPlan:
     @classmethod
     def begun(cls, out: Path, hops: bool, cascade: bool, parts: CorpusParts) -> "HearPlan":
         """Make the folder and return the plan; refuse a folder in which recordings were heard otherwise."""
-        others: dict[str, Any] = {name: one for name, one in parts.items() if one is not None}
-        array, model = others.pop("array", None), others.pop("model", None)
+        others: dict[str, Any] = {
+            name: Path(one).absolute() if isinstance(one, Path | str) else one
+            for name, one in parts.items()
+            if one is not None and name not in ("array", "model")
+        }
+        array: Any = parts.get("array")
+        model: Any = parts.get("model")
+        if isinstance(model, Model):
+            raise InvalidArgumentError("model: expected a file or the name of one that ships")
         array = read_array(array) if isinstance(array, Path | str) else array
-        for name in others.keys() & {"camera", "miss_rates"}:
-            if isinstance(others[name], str | Path):
-                others[name] = Path(others[name]).absolute()
         read_model(model, array=array)  # A wrong one is refused before the work
         file = file_of_model(model, array)
         # Whatever the file of an array is called, its microphones decide.
@@ -182,7 +185,6 @@ def hear(
     check_extra("pyarrow")
     if cascade and hops:
         raise InvalidArgumentError("cascade: expected it without hops, it hears only some of them")
-    in_range("shard", shard[0], 1, in_range("shard", shard[1], 1, 1_000_000))
     inputs = share_of(find_corpus(Path(corpus).absolute()), *shard)
     plan = HearPlan.begun(Path(out).absolute(), hops, cascade, parts)
     former = defaultdict[str, list[Path]](list)
