@@ -1,6 +1,7 @@
 """A corpus heard: its tables, the same bytes for any workers and after kills, and what a second run does."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -8,7 +9,7 @@ import sys
 import time
 from collections import Counter, defaultdict
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ from scripted_states import scripted_states
 from worldstate import ListenSettings, WorldState, hear
 from worldstate.adapters import open_source, read_model
 from worldstate.adapters.datasets.feature_extraction import read_labels
+from worldstate.adapters.ros.bag_writer import bag_writer
+from worldstate.adapters.ros.message_types import AUDIO, header
 from worldstate.cli.main import main
 from worldstate.commissioning.alarm_curve import raised_at
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds
@@ -177,6 +180,37 @@ def test_a_log_of_snapshots_is_counted_as_it_stands(heard, corpus):
         WorldState.from_json(line) for line in (corpus / "south" / "log.jsonl").read_text().splitlines()
     ]
     assert sum(row.hops for row in logged) == len(states)
+
+
+def test_sound_and_its_bag_are_heard_alike(street, options, tmp_path):
+    pytest.importorskip("rosbags")
+    samples, rate_hz = soundfile.read(street / "street.wav", dtype="float32")
+    shutil.copy(street / "street.wav", tmp_path / "a.wav")
+    form = {"sample_rate": rate_hz, "channels": samples.shape[1], "layout": "interleaved"}
+    with bag_writer(tmp_path / "bag") as write:
+        for start in range(0, len(samples), rate_hz // 10):
+            stamp_ns = 1_764_000_000 * 10**9 + start * (10**9 // rate_hz)
+            data = samples[start : start + rate_hz // 10].ravel()
+            write("/mics", AUDIO, stamp_ns, {"header": header(stamp_ns), "data": data} | form)
+    (storage,) = (tmp_path / "bag").glob("*.mcap")
+    shutil.copy(storage, tmp_path / "alone.mcap")
+    hear(tmp_path, tmp_path / "heard", hops=True, **options)
+    scores = defaultdict(list)
+    for row in rows(tmp_path / "heard", "hops"):
+        scores[row.recording].append(row.log_likelihoods)
+    assert {*scores} == {"a.wav", "alone.mcap", "bag"}
+    assert scores["a.wav"] == scores["alone.mcap"] == scores["bag"]
+    # Only messages state the time of day.
+    days = {row.recording: row.day for row in rows(tmp_path / "heard", "hours")}
+    assert days == {"a.wav": None, "alone.mcap": "2025-11-24", "bag": "2025-11-24"}
+
+
+def test_the_reference_names_every_column_of_every_table():
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "viewer_formats.md").read_text("utf-8")
+    told = dict(re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| (.*) \|$", page, flags=re.M))
+    for table, kind in TABLES.items():
+        columns = {one.name for one in fields(kind)} - {"recording", "site"}
+        assert columns == set(re.findall(r"`(\w+)`", told[table]))
 
 
 WAYS = {

@@ -41,6 +41,9 @@ from .cascade import SAMPLED, kept_seconds
 from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
 from .corpus_tables import SUFFIX, TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_rows
 
+# Of the tables: a major version reads no other one's.
+_SCHEMA = {"name": "worldstate.Corpus", "version": "1.0.0"}
+
 
 @dataclass(frozen=True, slots=True)
 class HeardShard:
@@ -81,7 +84,12 @@ class HearPlan:
         # Whatever the file of an array is called, its microphones decide.
         decides = [__version__, hops, cascade, array and (array.positions_m, array.channels), file, others]
         text = json.dumps(decides, sort_keys=True, default=_plain)
-        card = {"version": __version__, "array": array and Path(array.name).name, "model": file.name}
+        card = {
+            "schema": _SCHEMA,
+            "version": __version__,
+            "array": array and Path(array.name).name,
+            "model": file.name,
+        }
         card |= {"hops": hops, "cascade": cascade, "digest": hashlib.sha256(text.encode()).hexdigest()}
         for table in TABLES:
             (out / table).mkdir(parents=True, exist_ok=True)
