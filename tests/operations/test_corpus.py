@@ -273,7 +273,7 @@ def test_a_failure_that_may_pass_is_tried_again(corpus, options, heard, tmp_path
 OTHERS = {
     "{'hops': True}": {"hops": True},
     "other options": {"settings": ListenSettings(uncalibrated=True, budget=3.0)},
-    "{'array': 'uma-8', 'model': 'uma-8.json.gz'}": {"array": "uma-8"},
+    "{'model': 'uma-8.json.gz', 'array': 'uma-8'}": {"array": "uma-8"},
 }
 
 

@@ -84,13 +84,9 @@ class HearPlan:
         # Whatever the file of an array is called, its microphones decide.
         decides = [__version__, hops, cascade, array and (array.positions_m, array.channels), file, others]
         text = json.dumps(decides, sort_keys=True, default=_plain)
-        card = {
-            "schema": _SCHEMA,
-            "version": __version__,
-            "array": array and Path(array.name).name,
-            "model": file.name,
-        }
-        card |= {"hops": hops, "cascade": cascade, "digest": hashlib.sha256(text.encode()).hexdigest()}
+        card: dict[str, Any] = {"schema": _SCHEMA, "version": __version__, "model": file.name}
+        card |= {"array": array and Path(array.name).name, "hops": hops, "cascade": cascade}
+        card["digest"] = hashlib.sha256(text.encode()).hexdigest()
         for table in TABLES:
             (out / table).mkdir(parents=True, exist_ok=True)
         if not (out / CARD_NAME).exists():
