@@ -18,6 +18,7 @@ from worldstate.operations.recordings.hop_table import HOP_S
 
 from .corpus_tables import StateHours
 
+_WHOLE = 1000.0  # Numbers from here on have no decimals, and no exponent
 # Rows of a table on the page; the others are in the tables of the corpus.
 _MOST_ROWS = 40
 _GROUPS: Mapping[str, Callable[[StateHours], str]] = {
@@ -46,8 +47,9 @@ class ShadowHours:
         """Return it in one line."""
         rate = "no hour heard"
         if self.onsets_per_hour is not None:
-            rate = f"{self.onsets_per_hour:.3g} onsets/h [{self.low:.3g}, {self.high:.3g}]"
-        return f"{self.name}: {self.heard_hours:.3g} h heard, {self.unheard_hours:.3g} h unheard, {rate}"
+            rate = f"{_cell(self.onsets_per_hour)} onsets/h [{_cell(self.low)}, {_cell(self.high)}]"
+        heard, unheard = _cell(self.heard_hours), _cell(self.unheard_hours)
+        return f"{self.name}: {heard} h heard, {unheard} h unheard, {rate}"
 
 
 def shadow_hours(rows: Iterable[StateHours], budget: float | None) -> dict[str, list[ShadowHours]]:
@@ -105,7 +107,7 @@ def hours_to_prove(onsets: int, hours: float, budget: float) -> float | None:
     return high - hours
 
 
-_HEADS = "", "hours heard", "unheard", "onsets", "an hour", "from", "to", "more hours"
+_HEADS = "", "h heard", "h unheard", "onsets", "per h", "from", "to", "more h"
 
 
 def write_shadow_page(path: Path, week: Mapping[str, list[ShadowHours]], title: str) -> None:
@@ -113,7 +115,9 @@ def write_shadow_page(path: Path, week: Mapping[str, list[ShadowHours]], title: 
     tables = []
     for group, rows in week.items():
         heads = "".join(f"<th>{escape(one or group)}</th>" for one in _HEADS)
-        cells = ("".join(f"<td>{_cell(one)}</td>" for one in astuple(row)) for row in rows[:_MOST_ROWS])
+        cells = (
+            "".join(f"<td>{escape(_cell(one))}</td>" for one in astuple(row)) for row in rows[:_MOST_ROWS]
+        )
         more = f"<caption>{len(rows) - _MOST_ROWS} more</caption>" * (len(rows) > _MOST_ROWS)
         lines = "".join(f"<tr>{row}</tr>\n" for row in cells)
         tables.append(f"<table>{more}<tr>{heads}</tr>\n{lines}</table>\n")
@@ -122,4 +126,6 @@ def write_shadow_page(path: Path, week: Mapping[str, list[ShadowHours]], title: 
 
 
 def _cell(value: object) -> str:
-    return "-" if value is None else escape(f"{value:.3g}" if isinstance(value, float) else str(value))
+    if not isinstance(value, float):
+        return "-" if value is None else str(value)
+    return f"{value:.3g}" if value < _WHOLE else f"{value:.0f}"
