@@ -146,6 +146,14 @@ def alarm_levels(states: Iterable[WorldState], street: StreetModel | None = None
     return np.array([[-np.inf if one is None else one for one in hop] for hop in levels])
 
 
+def check_hours(name: str, hours: float, onsets_per_hour: float) -> None:
+    """Refuse fewer hours than an alarm can be set on."""
+    if hours * onsets_per_hour < LEAST_ONSETS:
+        wanted = f"{LEAST_ONSETS / onsets_per_hour:.2f} hours for {onsets_per_hour:g} onsets an hour"
+        problem = f"expected {wanted}, got {hours:.2f}: more sound, or more onsets allowed"
+        raise InvalidArgumentError(f"{name}: {problem}")
+
+
 def raised_at(levels: FloatArray, threshold_nats: float) -> BoolArray:
     """Return whether an alarm of any side stands at every hop, for a second unless denied, shape (n,)."""
     sides = levels.reshape(len(levels), -1)

@@ -30,7 +30,7 @@ from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
 from worldstate.simulation.stream.settings import StreamSettings
 
-from .alarm_curve import LEAST_ONSETS, UNREACHED, advised, alarm_levels, measured_curve, stream_states
+from .alarm_curve import UNREACHED, advised, alarm_levels, check_hours, measured_curve, stream_states
 from .guard_training import CHOSEN_FOR_GUARD, CLIPS_EACH, SoundRows, close_rows, train_guard
 from .heard_stream import (
     CommissionSettings,
@@ -362,12 +362,7 @@ def quiet_streams(quiet: Sequence[Path], array: MicrophoneArray, onsets_per_hour
     """Hear recordings without vehicles; refuse fewer hours than an alarm can be set on."""
     heard = [hear_recording(path, array) for path in quiet]
     hours = sum(len(one.hops) for one in heard) * HOP_S / SECONDS_PER_HOUR
-    # Where fewer onsets than these are to be expected, a threshold is set by chance alone.
-    if hours * onsets_per_hour < LEAST_ONSETS:
-        raise InvalidArgumentError(
-            f"quiet: expected {LEAST_ONSETS / onsets_per_hour:.2f} hours for {onsets_per_hour:g} onsets an "
-            f"hour, got {hours:.2f}: more sound, or more onsets allowed"
-        )
+    check_hours("quiet", hours, onsets_per_hour)
     return heard
 
 

@@ -83,7 +83,7 @@ def _with_curve(
     """Return a model with the curve that is measured on a corpus; one without a sequence as it is."""
     import numpy as np
 
-    from worldstate.commissioning.alarm_curve import LEAST_ONSETS, measured_curve
+    from worldstate.commissioning.alarm_curve import check_hours, measured_curve
     from worldstate.commissioning.commission import with_curve
 
     if model.sequence is None or model.sequence.alarm is None:
@@ -94,9 +94,7 @@ def _with_curve(
             levels = np.column_stack([stream.level_left, stream.level_right])
             quiet.setdefault(stream.about["site"], []).append(np.nan_to_num(levels, nan=-np.inf))
     curve, onsets = measured_curve(quiet), budget or model.sequence.alarm.onsets_per_hour
-    if curve.hours * onsets < LEAST_ONSETS:
-        expected = f"expected {LEAST_ONSETS / onsets:.2g} hours for {onsets:g} onsets an hour"
-        raise InvalidArgumentError(f"budget: {expected}, got {curve.hours:.2g}: more sound, or more onsets")
+    check_hours("budget", curve.hours, onsets)
     return with_curve(model, curve, onsets)
 
 
