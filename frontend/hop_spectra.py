@@ -160,7 +160,7 @@ class HopSpectra:
         lost = lost[np.arange(len(samples)) * len(recorded) // len(samples)]
         spectra = self._stft.push(samples)
         heard = self._heard_frames(lost, len(spectra))
-        n_heard = int(np.count_nonzero(heard))
+        n_heard = int(np.add.reduce(heard))
         centre, spectra = self._centre(heard), spectra if n_heard == len(heard) else spectra[heard]
         powers = power(spectra)
         whitened = whiten(spectra, powers)
@@ -178,7 +178,7 @@ class HopSpectra:
         pairs = pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
         pairs = pairs * health.mask.pair_scale
         mean_square = energies.sum(axis=0) / max(n_heard, 1)
-        share = np.count_nonzero(lost) / len(lost)
+        share = float(np.add.reduce(lost)) / len(lost)
         reason = "lost samples" if share else None
         sums = srp, pairs, mean_square
         return HopSums(heard, share, 1.0 - share, reason, centre, *sums, health, n_heard, common)
@@ -294,10 +294,10 @@ class LevelMeter:
         """
         # Only the picked microphones that are kept (M,) are averaged, or all picked ones if none is.
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
-        if heard is not None and not heard.all():
+        if heard is not None and False in heard:
             powers = powers[heard]
         kept = None if keep is None else keep[self._channels]
-        if kept is not None and kept.any() and not kept.all():
+        if kept is not None and True in kept and False in kept:
             powers = powers[:, :, kept]
         return log_band_energy(mean_square_per_bin(powers, self._nfft), self._edges, self._bins.start)
 

@@ -147,8 +147,9 @@ def approach_rate(
     """Return what `looming` does, of arguments that it would take: nothing is checked."""
     level = float(mean(energies))
     scale = float(np.exp(-level))
-    exponential = _fit_line(times, energies - level, None)
-    source = _fit_source(times, np.exp(energies - level), noise_energy * scale)
+    design = np.array([np.ones(len(times)), times])
+    exponential = _fit_line(design, energies - level, None)
+    source = _fit_source(design, np.exp(energies - level), noise_energy * scale)
     if source is None:
         return NotUsable("range reaches zero within the window")
     if min(exponential.scatter, source.scatter) > MAX_LOG_STD:
@@ -175,13 +176,13 @@ class _Source:
     by_noise: FloatArray  # shape (2,): Derivative by the noise
 
 
-def _fit_source(times: FloatArray, energy: FloatArray, noise: float) -> _Source | None:
+def _fit_source(design: FloatArray, energy: FloatArray, noise: float) -> _Source | None:
     """Fit E = N + (a + b t)^-2 with errors in proportion to E; None if the range reaches zero."""
     # Gauss-Newton from the line through E^(-1/2).
     excess = np.log(np.maximum(energy - noise, _LEAST_EXCESS * energy))
     # Weights from the exponential fit, which is smooth: weights from the noisy values would bias the line.
-    smooth = _fit_line(times, excess, None)
-    line = _fit_line(times, np.exp(-0.5 * excess), np.exp(smooth.level + smooth.slope * times))
+    times, smooth = design[1], _fit_line(design, excess, None)
+    line = _fit_line(design, np.exp(-0.5 * excess), np.exp(smooth.level + smooth.slope * times))
     level, slope = line.level, line.slope
     for _ in range(_STEPS + 1):
         # A straight line is least at one end.
@@ -211,16 +212,16 @@ class _Line:
     scatter: float
 
 
-def _fit_line(times: FloatArray, values: FloatArray, weights: FloatArray | None) -> _Line:
-    """Fit a line in closed form: least squares, weighted by the reciprocal variances or none."""
-    design = np.array([np.ones(len(times)), times])
+def _fit_line(design: FloatArray, values: FloatArray, weights: FloatArray | None) -> _Line:
+    """Fit a line in closed form, by the rows of one and of the times: least squares, weighted if asked."""
     weighted = design if weights is None else design * weights
     (s0, s1), (_, s2) = (weighted @ design.T).tolist()
     v0, v1 = (weighted @ values).tolist()
     determinant = s0 * s2 - s1 * s1
     slope, level = (s0 * v1 - s1 * v0) / determinant, (s2 * v0 - s1 * v1) / determinant
-    squared = (values - level - slope * times) ** 2
-    scatter = math.sqrt((squared.sum() if weights is None else squared @ weights) / (len(times) - 2))
+    squared = (values - level - slope * design[1]) ** 2
+    total = np.add.reduce(squared) if weights is None else squared @ weights
+    scatter = math.sqrt(total / (len(values) - 2))
     return _Line(slope, level, scatter)
 
 

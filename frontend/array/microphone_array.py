@@ -326,12 +326,12 @@ class ChannelMask:
     @property
     def n_kept(self) -> int:
         """Number n of microphones kept."""
-        return int(np.count_nonzero(self.keep))
+        return int(np.add.reduce(self.keep))
 
     @property
     def is_whole(self) -> bool:
         """Whether all microphones are kept."""
-        return bool(self.keep.all())
+        return False not in self.keep
 
     @property
     def power_scale(self) -> float:

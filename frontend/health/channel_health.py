@@ -82,7 +82,7 @@ class DropoutFinder:
         first = self._n_seen
         self._n_seen += len(samples)
         change = sound[:, 1:] - sound[:, :-1]
-        still = np.asarray((change == 0.0).all(axis=0))
+        still = np.logical_and.reduce(change == 0.0)
         dropouts = self._still.push(still[-len(samples) :], self._n_seen)
         if len(sound) >= _MIN_SPLICE_CHANNELS:
             dropouts += find_splices(change, start + 1, still)
@@ -94,8 +94,8 @@ class DropoutFinder:
 
     def _picked(self, samples: Float32Array, alive: BoolArray) -> Float32Array:
         """Return a few live channels, shape (channels, n), the end of the last hop in front."""
-        every = max(-(-int(np.count_nonzero(alive)) // _PICKED), 1)
-        picks = slice(None, None, every) if alive.all() else np.flatnonzero(alive)[::every]
+        every = max(-(-int(np.add.reduce(alive)) // _PICKED), 1)
+        picks = slice(None, None, every) if False not in alive else np.flatnonzero(alive)[::every]
         return np.ascontiguousarray(np.concatenate([self._tail[:, picks], samples[:, picks]]).T)
 
 

@@ -117,7 +117,7 @@ class ChannelLevels:
 
     def push(self, powers: FloatArray, good: BoolArray) -> None:
         """Take the mean power of one hop per bin and channel, (K, M), and the channels that sound, (M,)."""
-        if good.any():
+        if True in good:
             level = 10.0 * np.log10(np.maximum(powers, _TINY))
             level -= median(level[:, good])[:, None]
             # A hop in which a channel breaks off says nothing of its level.
@@ -179,7 +179,7 @@ class ChannelActivity:
 
     def _remember(self, bad: BoolArray) -> BoolArray:
         self._bad.append(bad)
-        if bad.any() or self._share.any():
+        if True in bad or self._share.any():
             ordered = np.array(self._bad)
             count = ordered.sum(axis=0)
             stretches = (ordered[1:] & ~ordered[:-1]).sum(axis=0) + ordered[0]
@@ -278,21 +278,21 @@ class ChannelMonitor:
 
     def _silent(self, energies: FloatArray, alive: BoolArray) -> BoolArray:
         """Flag the channels that are silent in this hop or break off in it."""
-        if not alive.any():
+        if True not in alive:
             return ~alive
         typical = np.maximum(median(energies[:, alive]), _TINY)[:, None]
         level = mean(energies / typical, 0)
-        return np.asarray(~alive | (level < _SILENT) | (energies < _DROPPED * typical).any(axis=0))
+        return np.asarray(~alive | (level < _SILENT) | np.logical_or.reduce(energies < _DROPPED * typical))
 
     def _judge_hop(self, samples: Float32Array, span: Float32Array, silent: BoolArray) -> BoolArray:
         """Flag the channels that are silent or crackle in this hop."""
         alive = span > 0.0
-        if not alive.any():
+        if True not in alive:
             return self._activity.all_silent()
         bad = silent.copy()
         mean_span = self._means[0]
         known = alive & (mean_span > 0.0)
-        if known.any():
+        if True in known:
             growth = np.divide(span, mean_span, out=np.zeros(len(span)), where=known)
             bad |= growth > _CRACKLE * median(growth[known])
         share = np.full(len(samples), 1.0 / len(samples), np.float32)

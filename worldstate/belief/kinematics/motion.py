@@ -100,7 +100,7 @@ def conditioned(covariance: FloatArray, largest_std: float = LARGEST_STD) -> Flo
     """
     covariance = 0.5 * (covariance + covariance.mT)
     # A view of the diagonals.
-    variance = np.einsum("...ii->...i", covariance)
+    variance = covariance.reshape(*covariance.shape[:-2], -1)[..., :: covariance.shape[-1] + 1]
     largest = np.maximum.reduce(variance, -1)[..., None]
     if True in (largest > largest_std**2):
         scale = np.minimum(largest_std / np.sqrt(np.maximum(variance, LEAST_STD**2)), 1.0)
