@@ -82,8 +82,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         One microphone a channel.
     sample_rate_hz : float
         Of the blocks.
-    model : Signature
-        From the feature of a window to log-likelihoods.
+    model : Signature or None
+        From the feature of a window to log-likelihoods; without one nothing but bearings is measured.
     vision : CoEvidenceChannel, optional
         Asked once a hop; without one every answer is `Unqueried`.
     start_ns : int
@@ -139,7 +139,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self,
         array: MicrophoneArray,
         sample_rate_hz: float,
-        model: Signature,
+        model: Signature | None,
         vision: CoEvidenceChannel | None = None,
         *,
         start_ns: int = 0,
@@ -159,6 +159,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)
             front_end_settings = replaced(front_end_settings, feature_order=order)
+        if model is None:  # What begins to sound is what its bearings are of
+            front_end_settings = replaced(front_end_settings, mask_rises=False)
         if guard is not None and guard.measures != MEASURES:
             raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
         if road_users is not None and road_users.measures != (*MEASURES, *BANDS):
@@ -213,7 +215,9 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         half of the street the peak is in, not where the vehicle is: then the side is the signature's. Nothing
         is read of a hop that is `outside` of what the models learned, which is the reason why.
         """
-        self.last_frame, heard = frame, Heard(0.0, outside) if outside else heard_of(frame, self._kinds)
+        # Without a model a loud sound is no vehicle in view, which hides others.
+        loud = replaced(frame, peaks=()) if self._model is None else frame
+        self.last_frame, heard = frame, Heard(0.0, outside) if outside else heard_of(loud, self._kinds)
         told: dict[str, Any] = {"stamp_ns": frame.stamp_ns, "kinds": (), "heard": heard}
         told |= self._read(frame, heard) if heard.usable else self._unheard(heard)
         told |= _asked(told, self._vision)
@@ -234,6 +238,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
 
     def _read(self, frame: AcousticFrame, share: Heard) -> dict[str, Any]:
         """Return the parts of the measurement of a hop that the models read in it."""
+        if self._model is None:
+            return self._unheard(share) | {"bearing": _bearing(frame), "approach": _approach(frame)}
         heard = signature = self._model.evidence(frame.feature)
         self._directions = signature.directions
         bearing, approach = _bearing(frame), _approach(frame)
@@ -341,7 +347,7 @@ def _bearing(frame: AcousticFrame) -> Bearing | NotUsable:
     if frame.prominence <= frame.least_prominence:
         ratio = f"{frame.prominence:.2f}, not above {frame.least_prominence:.2f}"
         return NotUsable(f"peak-to-median ratio {ratio}")
-    return Bearing(wrap_angle(frame.bearing_rad), frame.bearing_std_rad, frame.prominence)
+    return Bearing(wrap_angle(frame.bearing_rad), frame.bearing_std_rad, frame.prominence, frame.at_edge)
 
 
 def _approach(frame: AcousticFrame) -> Approach | NotUsable:

@@ -527,6 +527,8 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
     ------
     InputFileError
         If the sound file is damaged or does not fit the array.
+    OutOfDomainError
+        If no model reads the sound.
 
     Examples
     --------
@@ -541,7 +543,7 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
     ...     [measurement.co_evidence.reason for _, measurement in measure_steps(open_source(path))]
     ['no detections file', 'no detections file', 'no detections file']
     """
-    for listener, block in listened(source):
+    for listener, block in listened(source.read_by_model()):
         yield from listener.measured(block)
 
 

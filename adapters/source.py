@@ -4,12 +4,12 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypedDict, TypeVar
+from typing import Self, TypedDict, TypeVar
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import Sector
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated_policy
 from worldstate.abduction.road_users import DomainGuard, RoadUserModel
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import SequenceModel
@@ -26,8 +26,9 @@ from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery, within_images
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, Recording, choose_array
-from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, heard_with, states_budget
+from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, check_array, heard_with, states_budget
 from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.array_match import TRAIN
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog
@@ -35,8 +36,15 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.frontend.settings import FrontEndSettings, default_band_hz
-from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, in_range, nanoseconds
+from worldstate.frontend.settings import FrontEndSettings, default_band_hz, default_span_deg
+from worldstate.ground import (
+    InputFileError,
+    InvalidArgumentError,
+    NotUsable,
+    OutOfDomainError,
+    in_range,
+    nanoseconds,
+)
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
 from worldstate.state import Context
@@ -61,8 +69,9 @@ class ListenSettings:
         one of its policies, 0.02 or its first one if none is given.
     band_hz : (float, float), optional
         Band of the spatial spectrum, Hz; it follows the spacing of the microphones where not given.
-    azimuth_span_deg : float
-        Width of the sector ahead that is searched, whole degrees: 180, or 360 for all round.
+    azimuth_span_deg : float, optional
+        Width of the sector ahead that is searched, whole degrees. Where not given, 180 if a sequence model
+        reads the bearing, else by the array: all round if it tells front from back.
     mask_dead : bool
         Listen without silent channels, as long as half of them are left, instead of refusing them.
     site_adaptation : bool
@@ -91,7 +100,7 @@ class ListenSettings:
     budget: float | None = None
     alpha: float | None = None
     band_hz: tuple[float, float] | None = None
-    azimuth_span_deg: float = 180.0
+    azimuth_span_deg: float | None = None
     mask_dead: bool = False
     site_adaptation: bool = True
     forgetting_s: float | None = None
@@ -100,14 +109,14 @@ class ListenSettings:
     uncalibrated: bool = False
 
     def __post_init__(self) -> None:
-        if in_range("azimuth_span_deg", self.azimuth_span_deg, 2.0, 360.0) % 1.0:
-            got = self.azimuth_span_deg
-            raise InvalidArgumentError(f"azimuth_span_deg: expected whole degrees, got {got}")
+        span_deg = self.azimuth_span_deg
+        if span_deg is not None and in_range("azimuth_span_deg", span_deg, 2.0, 360.0) % 1.0:
+            raise InvalidArgumentError(f"azimuth_span_deg: expected whole degrees, got {span_deg}")
         self.site()  # refuses a wrong time constant
 
     def front_end(self, array: MicrophoneArray, sample_rate_hz: float) -> FrontEndSettings:
         """Return the front-end's settings for an array and a sample rate."""
-        half_deg = 0.5 * self.azimuth_span_deg
+        half_deg = 0.5 * (self.azimuth_span_deg or default_span_deg(array, sample_rate_hz))
         return FrontEndSettings.heard_at(
             sample_rate_hz,
             azimuth_span_deg=(-half_deg, half_deg),
@@ -133,8 +142,8 @@ class Source:
         One microphone a channel, in the order of the channels.
     detections : DetectionLog or None
         What the camera reported, on the clock of the sound; None counts as not asked.
-    model : Signature
-        From features to likelihoods.
+    model : Signature or None
+        From features to likelihoods; None if no model was made for the array.
     policy : CueingPolicy
         Threshold and risk map.
     context : Context
@@ -193,7 +202,7 @@ class Source:
     sound: SoundInput
     array: MicrophoneArray
     detections: DetectionLog | None
-    model: Signature
+    model: Signature | None
     policy: CueingPolicy
     context: Context
     settings: ListenSettings = field(default_factory=ListenSettings)
@@ -216,15 +225,36 @@ class Source:
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
         if self.before is None:
-            return WorldFilter(self.context, self.policy, FilterSettings(street=self.street or StreetModel()))
-        return replace(self.before.world, policy=self.policy)
+            settings = FilterSettings(street=self.street or StreetModel())
+            return WorldFilter(self.context, self.policy, settings, no_model=self.no_model)
+        return replace(self.before.world, policy=self.policy, no_model=self.no_model)
+
+    @property
+    def no_model(self) -> NotUsable | None:
+        """Why no model reads the sound; None if one does."""
+        if self.model is not None:
+            return None
+        alike = ", which hears front as back" if self.array.ambiguity in ("cone", "front-back") else ""
+        return NotUsable(f"no model was made for this array of {self.array.n_microphones} microphones{alike}")
 
     @property
     def audio_path(self) -> Path:
         """The sound file; of several the first, and a pipe's name."""
         return path_of(self.sound)
 
-    def signature(self) -> Signature:
+    def read_by_model(self) -> Self:
+        """Return the source itself.
+
+        Raises
+        ------
+        OutOfDomainError
+            If no model reads the sound.
+        """
+        if self.no_model is not None:
+            raise OutOfDomainError(f"{self.array.name}: {self.no_model.reason}. {TRAIN}")
+        return self
+
+    def signature(self) -> Signature | None:
         """Return the model as it is at the start of the recording; one that learns its site learns anew."""
         site = self.settings.site()
         if site is None or not isinstance(self.model, EnsembleModel):
@@ -413,9 +443,14 @@ def open_source(
     told = moving_ego or (ego is not None and ego.moves)
     moves = bool(told or (recording and recording.moving_ego) or context.ego_speed_mps)
     given = _read(array, read_array)
-    known = model if isinstance(model, Model) else read_model(model, moving_ego=moves, array=given)
+    usual = model if isinstance(model, Model) else read_model(model, moving_ego=moves, array=given)
+    heard_by = _array_of(sound, usual, given, settings)
+    known = usual if model is not None or settings.uncalibrated else _shipped_for(heard_by, moves)
     sequence, policy = _alarm_of(known, settings, moves)
-    heard_by, policy = _array_and_policy(sound, known, policy, given, settings, moves)
+    if known is not None and (settings.uncalibrated or not states_budget(known, heard_by, moves)):
+        policy = replace(policy, alpha=0.0)
+    if isinstance(sequence, SequenceModel) and settings.azimuth_span_deg is None:
+        settings = replace(settings, azimuth_span_deg=_READ_SPAN_DEG)
     if camera is None and (detections, detector) != (None, None):
         check_mounting(heard_by)
     if not set(SIDES) & set(context.directions):
@@ -424,12 +459,12 @@ def open_source(
     first_ns = sound.start_ns if isinstance(sound, SoundStream) else 0
     start_ns = nanoseconds(in_range("start_s", start_s, 0.0, 1e10)) or first_ns
     t0_s = None if recording is None else recording.t0_s
-    shares = {one.kind: one.detected for one in known.provenance.kinds}
+    shares = {} if known is None else {one.kind: one.detected for one in known.provenance.kinds}
     source = Source(
         sound=sound if recording is None else recording.audio_path,
         array=heard_by,
         detections=None,
-        model=known.signature,
+        model=None if known is None else known.signature,
         policy=policy,
         context=context,
         settings=settings,
@@ -439,10 +474,10 @@ def open_source(
         miss_rates=_read(miss_rates, load_miss_rates),
         before=_read(resume, read_checkpoint),
         start_ns=start_ns,
-        guard=known.guard,
-        road_users=known.road_users,
+        guard=None if known is None else known.guard,
+        road_users=None if known is None else known.road_users,
         sequence=sequence,
-        street=known.street,
+        street=StreetModel() if known is None else known.street,
         sides=sides,
         others=tuple(others) if ego is None else (*others, ego.told.__iter__),
         kinds=shares if isinstance(sequence, SequenceModel) else None,
@@ -451,6 +486,9 @@ def open_source(
 
 
 _ALPHA = 0.02  # The paper's budget, of a model without a sequence
+# Half the plane ahead, in which the bearings were that sequence models have learned from.
+_READ_SPAN_DEG = 180.0
+_SOUND_ONLY = f"Bearings and tracks of sound are stated, and no side, class or risk. {TRAIN}"
 # Of a pipe or of microphones, whose end is not known, seconds.
 _ONE_DAY_S = 86_400.0
 # Stamps closer together are in another unit, and so are those of what begins with the sound and lasts so many
@@ -547,27 +585,35 @@ def _read(given: Path | str | T | None, reader: Callable[[Path | str], T]) -> T 
     return reader(given) if isinstance(given, Path | str) else given
 
 
-def _array_and_policy(
-    sound: SoundInput,
-    model: Model,
-    policy: CueingPolicy,
-    array: MicrophoneArray | None,
-    settings: ListenSettings,
-    moves: bool,
-) -> tuple[MicrophoneArray, CueingPolicy]:
-    """Return the array of the sound, and the policy, whose alpha is 0 if no budget can be stated."""
+def _array_of(
+    sound: SoundInput, model: Model, array: MicrophoneArray | None, settings: ListenSettings
+) -> MicrophoneArray:
+    """Return the array of the sound: the one that is given, that of its data set, or that of the model."""
     if array is None and isinstance(sound, SoundStream):
         raise InputFileError(sound.name, "expected --array: such a stream names no microphones")
     assumed = None if model.domain is None else array_of(model.domain)
-    heard_by = choose_array(path_of(sound), array, assumed=assumed, trust_given=settings.uncalibrated)
-    stated = not settings.uncalibrated and states_budget(model, heard_by, moves)
-    return heard_by, policy if stated else replace(policy, alpha=0.0)
+    return choose_array(path_of(sound), array, assumed=assumed, trust_given=settings.uncalibrated)
+
+
+def _shipped_for(array: MicrophoneArray, moves: bool) -> Model | None:
+    """Return the model that ships for an array; None if there is none, and a warning says so."""
+    model = read_model(moving_ego=moves, array=array)
+    try:
+        return model if model.domain is None or len(check_array(model.domain, array, _SOUND_ONLY)) else None
+    except OutOfDomainError as error:
+        _LOG.warning("%s", error)
+        return None
 
 
 def _alarm_of(
-    model: Model, settings: ListenSettings, moves: bool
-) -> tuple[SequenceModel | NotUsable, CueingPolicy]:
+    model: Model | None, settings: ListenSettings, moves: bool
+) -> tuple[SequenceModel | NotUsable | None, CueingPolicy]:
     """Return the sequence model with the alarm that was asked for, and the policy, by alpha without one."""
+    if model is None:
+        asked = {"budget": settings.budget, "alpha": settings.alpha, "grounding": settings.grounding}
+        for name in (name for name, value in asked.items() if value is not None):
+            raise InvalidArgumentError(f"{name}: expected a model for the array. {TRAIN}")
+        return None, uncalibrated_policy()
     sequence, policies = _sequence_of(model, moves, settings.uncalibrated), model.policies
     usual = next((one for one in policies.policies if one.alpha == _ALPHA), policies.policies[0])
     if isinstance(sequence, SequenceModel):

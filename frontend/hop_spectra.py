@@ -340,8 +340,8 @@ class NoiseMeter:
         e of the newest hop, decibels.
     """
 
-    def __init__(self) -> None:
-        self.excess_db = 0.0
+    def __init__(self, mask_rises: bool = True) -> None:
+        self.excess_db, self._mask_rises = 0.0, mask_rises
         self._memory: deque[FloatArray] = deque(maxlen=_MINUTE_HOPS)
         self._n_hops = 0
         self._quiet: FloatArray = np.zeros(BANDS)
@@ -380,7 +380,7 @@ class NoiseMeter:
         excess = level_db - self._quiet
         self.excess_db = float(mean(excess))
         incoherent = coherence < (1.0 - _INCOHERENT) * self._usual_coherence
-        jump = falling(self._rise_db(float(mean(level_db))), _JUMP_DB)
+        jump = falling(self._rise_db(float(mean(level_db))), _JUMP_DB) if self._mask_rises else 1.0
         shares = (falling(self.excess_db, _NOISE_DB) if incoherent else 1.0, jump)
         if min(shares) >= 1.0:
             return 1.0, None

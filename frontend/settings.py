@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 
 from worldstate.frontend.approach.tone import ENGINE_BAND_HZ
-from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S, MicrophoneArray
 from worldstate.frontend.direction import feature as published
 from worldstate.ground import FloatArray, InvalidArgumentError, in_range
 
@@ -43,6 +43,8 @@ class FrontEndSettings:
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
     watch_channels : bool
         Detect faulty microphones, lost samples and masking noise, and leave them out.
+    mask_rises : bool
+        Leave out sound that rises by 6 to 10 dB within 0.3 s, which covers others, until it falls again.
     character : bool
         Measure what one microphone hears over two seconds: `AcousticFrame.character`.
     feature_order : tuple of int, optional
@@ -67,6 +69,7 @@ class FrontEndSettings:
     srp_band_hz: Band = BAND_HZ
     level_band_hz: Band = (50.0, 8000.0)
     watch_channels: bool = True
+    mask_rises: bool = True
     character: bool = False
     feature_order: tuple[int, ...] | None = None
     heard_rate_hz: float | None = None
@@ -122,6 +125,7 @@ HIGHEST_SHARE = 0.45
 # spatial spectrum fall on other directions at each frequency, and low bands are blunt. White sources at 0 dB,
 # a pair 1 m apart: median error .9 deg in 150-900 Hz, .2 deg in 300-1800 Hz.
 _MOST_OCTAVES = 2
+_FRAME_S = published.FEATURE_NFFT / published.FEATURE_RATE_HZ
 
 
 def default_band_hz(array: MicrophoneArray, sample_rate_hz: float) -> tuple[float, float]:
@@ -137,3 +141,26 @@ def default_band_hz(array: MicrophoneArray, sample_rate_hz: float) -> tuple[floa
     spacing = min(max(math.floor(math.log2(array.alias_hz() / high)), 0), _MOST_OCTAVES)
     octaves = min(spacing, math.floor(math.log2(HIGHEST_SHARE * sample_rate_hz / high)))
     return low * 2.0**octaves, high * 2.0**octaves
+
+
+def default_span_deg(array: MicrophoneArray, sample_rate_hz: float) -> float:
+    r"""Return the sector ahead that an array hears without a mirror image: 360 degrees, or 180.
+
+    Microphones lie off a vertical plane if their deviation from the nearest one turns a wave of the highest
+    frequency of the band by a radian between a direction and its mirror image:
+
+    .. math:: \frac{4 \pi f}{c} \sqrt{\frac1M \sum_m d_m^2} \ge 1
+
+    A wave that takes longer through the array than an STFT frame lasts is not coherent in it.
+
+    Examples
+    --------
+    >>> ring = MicrophoneArray([[0.04, 0, 0], [0, 0.04, 0], [-0.04, 0, 0], [0, -0.04, 0]])
+    >>> line = MicrophoneArray([[0, 0.1, 0], [0, 0, 0], [0, -0.1, 0]])
+    >>> default_span_deg(ring, 16_000), default_span_deg(line, 16_000)
+    (360.0, 180.0)
+    """
+    thickness_m = np.linalg.svd(array.centred_m[:, :2], compute_uv=False)[-1] / math.sqrt(array.n_microphones)
+    top_hz = default_band_hz(array, sample_rate_hz)[1]
+    is_deep = 4.0 * math.pi * top_hz * thickness_m >= SPEED_OF_SOUND_M_S
+    return 360.0 if is_deep and array.widest_m < SPEED_OF_SOUND_M_S * _FRAME_S else 180.0

@@ -17,6 +17,7 @@ from worldstate.frontend.direction.bearing import (
     about_the_peak,
     bearing_of,
     find_peaks,
+    is_all_round,
     noise_prominence,
     normalised,
     uniform_std_rad,
@@ -127,6 +128,12 @@ class AcousticFrame:
     excess_db: float = 0.0
     unheard: str | None = None
 
+    @property
+    def at_edge(self) -> bool:
+        """Whether the highest peak is at an end of the sector that was searched: its source may be beyond."""
+        within = self.azimuths_rad[0] < self.bearing_rad < self.azimuths_rad[-1]
+        return not (within or is_all_round(self.azimuths_rad))
+
 
 __all__ = ["AcousticFrame", "FrontEnd"]
 
@@ -225,7 +232,7 @@ class FrontEnd:
             frequencies = bin_frequencies_hz(self._spectra.srp_bins, rate, settings.nfft)
             n_frames = BEARING_HOPS * 2.0 * rate / (HOP_RATE_HZ * settings.nfft)
             self._least_prominence = noise_prominence(self._spectra.beams, array, frequencies, n_frames)
-        self._noise = NoiseMeter() if settings.watch_channels else None
+        self._noise = NoiseMeter(settings.mask_rises) if settings.watch_channels else None
         self._levels: FloatArray = np.full(BANDS, np.log(SILENCE))
         self._meter = LevelMeter(n_channels, rate, settings, self.sample_rate_hz)
         band_hz = settings.tone_band_hz

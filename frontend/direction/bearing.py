@@ -235,6 +235,12 @@ def find_peaks(values: FloatArray, azimuths_rad: FloatArray, max_peaks: int = 4)
     return tuple([peak for peak in peaks if peak.prominence >= 1.0])
 
 
+def is_all_round(azimuths_rad: FloatArray) -> bool:
+    """Return whether a grid (A,) ends where it begins."""
+    step = azimuths_rad[1] - azimuths_rad[0]
+    return bool(azimuths_rad[-1] - azimuths_rad[0] >= 2.0 * math.pi - 0.5 * step)
+
+
 def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return a spectrum (A,) all round, and its grid, cut open behind its peak; any other as it is.
 
@@ -247,10 +253,9 @@ def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatA
     >>> values.tolist(), np.degrees(grid).round().tolist()
     ([1.0, 2.0, 4.0, 3.0], [-360.0, -270.0, -180.0, -90.0])
     """
-    step = azimuths_rad[1] - azimuths_rad[0]
-    if azimuths_rad[-1] - azimuths_rad[0] < 2.0 * math.pi - 0.5 * step:
+    if not is_all_round(azimuths_rad):
         return values, azimuths_rad
-    count = len(values) - 1
+    step, count = azimuths_rad[1] - azimuths_rad[0], len(values) - 1
     order = int(values[:-1].argmax()) - count // 2 + np.arange(count)
     return values[:-1].take(order, mode="wrap"), azimuths_rad[0] + step * order
 

@@ -81,24 +81,27 @@ RIGHT = {
 }
 
 
-def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(tmp_path, monkeypatch, capsys) -> None:
-    """Without a model the refusal names how one is made, in a program and on the command line."""
+def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(
+    tmp_path, monkeypatch, capsys, caplog
+) -> None:
+    """Without one, bearings alone are stated, in a program and on the command line, and how one is made."""
     monkeypatch.setattr(arrays, "MODELS", tmp_path)
     sound = 0.01 * np.random.default_rng(0).standard_normal((40_000, 7))
     soundfile.write(tmp_path / "own.wav", sound, 16_000)
     run = ["run", str(tmp_path / "own.wav"), "--array", "xmos", "--channels", "1-7", "--json"]
-    with pytest.raises(OutOfDomainError, match="worldstate model make"):
-        Listener("xmos", 16_000)
-    assert main(run) == 2 and "worldstate model make" in capsys.readouterr().err
+    assert Listener("xmos", 16_000).push(sound)[-1].no_model is not None
+    assert "worldstate model make" in caplog.text
+    assert main(run) == 0 and "(no model 16)" in capsys.readouterr().out
     model = read_model()
     domain = replace(model.domain, array="xmos", positions_m=read_array("xmos").positions_m)
     made = replace(model, signature=replace(model.signature, domain=domain))
     save_model(tmp_path / "xmos.json.gz", made)
     states = Listener("xmos", 16_000).push(sound)
     assert [state.stamp_ns for state in states] == [10**9 + 10**8 * hop for hop in range(15)]
-    assert main(run) == 0
+    assert main(run) == 0 and states[-1].no_model is None
+    assert Listener("uma-8", 16_000).world.no_model is not None
     with pytest.raises(OutOfDomainError, match="not the array of the model"):
-        Listener("uma-8", 16_000)
+        Listener("uma-8", 16_000, model=made)
 
 
 @pytest.mark.parametrize("name", list(arrays.named_arrays()))
@@ -165,11 +168,12 @@ def test_a_wrong_array_is_never_taken(
 ) -> None:
     positions, why = WRONG[case]
     said = NO_METRES.get(case, why)
-    path = alone if beside == "model" else approach.folder
+    path, model = (alone, "simulated-56") if beside == "model" else (approach.folder, None)
     mics, states = array_file(tmp_path / f"mics.{form}", positions), tmp_path / "states.jsonl"
     with pytest.raises((OutOfDomainError, InputFileError), match=re.escape(said)):
-        open_source(path, array=mics)
-    assert main(["run", str(path), "--array", str(mics), "--out", str(states)]) == 2
+        open_source(path, array=mics, model=model)
+    named = ["--model", model] if model else []
+    assert main(["run", str(path), "--array", str(mics), *named, "--out", str(states)]) == 2
     assert said in capsys.readouterr().err
     assert not states.exists()
     if case != "one twice":  # no such object can be made
@@ -183,16 +187,19 @@ def test_the_same_places_are_taken_in_any_order_and_anywhere(case: str, alone: P
     AcousticAdapter(MicrophoneArray(RIGHT[case]), RATE, read_model().signature)
 
 
-def test_the_command_refuses_in_one_line_unless_told_to_go_on(
-    alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_array_near_that_of_a_model_has_none_and_the_difference_is_named(
+    alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
+    """A command that needs a model refuses it; so does any, if the model is named."""
     mics = tmp_path / "mics.xml"
     write_array_xml(mics, MicrophoneArray(HERE * [1, -1, 1]))
-    assert main(["run", str(alone), "--array", str(mics)]) == 2
+    assert main(["run", str(alone), "--array", str(mics)]) == 0
+    for said in ("mics.xml", "OVAD", "56 microphones", "mm elsewhere", "looks mirrored", "model make"):
+        assert said in caplog.text
+    capsys.readouterr()
+    assert main(["run", str(alone), "--array", str(mics), "--model", "simulated-56"]) == 2
     line = capsys.readouterr().err.strip()
-    assert "\n" not in line
-    for said in ("mics.xml", "OVAD", "56 microphones", "mm elsewhere", "looks mirrored", "--uncalibrated"):
-        assert said in line
+    assert "\n" not in line and "looks mirrored" in line and "--uncalibrated" in line
     assert (
         main(["model", "threshold", str(alone), "--array", str(mics), "--out", str(tmp_path / "m.json")]) == 2
     )
@@ -382,7 +389,8 @@ def test_a_data_set_is_read_with_its_own_array(tmp_path: Path, approach: Approac
     found = choose_array(tmp_path / "sim").positions_m
     assert np.array_equal(found, choose_array(folder).positions_m)
     np.testing.assert_allclose(found, roof_array_56().positions_m)
-    assert main(["run", str(folder)]) == 2  # the model that ships was not made for it
+    assert open_source(folder).model is None  # the model that ships was not made for it
+    assert main(["run", str(folder), "--model", "simulated-56"]) == 2
     assert main(words) == 2  # one data set, one array
     table = tmp_path / "features.csv"
     assert main(["model", "features", str(tmp_path / "sim"), "--out", str(table)]) in (0, 2)

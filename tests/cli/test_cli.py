@@ -86,7 +86,10 @@ print(code, heavy, front, "worldstate.adapters.files.model_file" in sys.modules)
     ("options", "said"),
     [
         ([], ("expected --array FILE", "4 channels", "array bearings", "model make")),
-        (["--array", "mics.csv"], ("not the array of the model", "4 microphones", "--uncalibrated")),
+        (
+            ["--array", "mics.csv", "--model", "uma-8"],
+            ("not the array of the model", "4 microphones", "--uncalibrated"),
+        ),
         (["--figure", "f.png"], ("worldstate[plot]",)),
         (["--export", "mcap=f.mcap"], ("worldstate[mcap]",)),
     ],

@@ -188,7 +188,7 @@ def test_a_time_outside_and_a_side_that_is_none_are_named(words, said, states, c
 
 def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, tmp_path, capsys):
     file = tmp_path / "old.jsonl"
-    file.write_text(states.read_text().replace('"version":"4.1.0"', '"version":"2.1.0"'))
+    file.write_text(states.read_text().replace('"version":"4.2.0"', '"version":"2.1.0"'))
     assert main(["explain", str(file), "--time", "1"]) == 2
     assert "old.jsonl: expected schema worldstate.Snapshot 4.x, got" in (said := capsys.readouterr().err)
     assert "write it anew" in said

@@ -70,7 +70,7 @@ def street(
             stamp_ns,
             said,
             answer,
-            Bearing(rng.normal(0.6, 0.1), rng.uniform(0.1, 0.3), rng.uniform(2.0, 3.0))
+            Bearing(rng.normal(0.6, 0.1), rng.uniform(0.1, 0.3), rng.uniform(2.0, 3.0), at_edge=hop == 1)
             if hop % 3
             else NotUsable("-"),
             Approach(rng.normal(0.4, 0.02), rng.uniform(0.05, 0.1)) if hop % 2 else NotUsable("-"),
@@ -144,6 +144,7 @@ def states() -> Iterator[WorldState]:
         (WorldFilter(start_ns=START_NS), True),
         (WorldFilter(there, budget, start_ns=START_NS), False),
         (WorldFilter(Context(occluders=corners), start_ns=START_NS), True),
+        (WorldFilter(start_ns=START_NS, no_model=NotUsable("no model")), False),
     ]
     for world, sequence in worlds:
         yield world.state

@@ -91,7 +91,7 @@ def test_a_former_log_is_read_as_its_upgrade_and_loses_nothing(name: str, tmp_pa
     assert again.read_bytes() == upgraded.read_bytes()
     if log.suffix == ".jsonl":
         for before, after in zip(*(map(json.loads, path.open()) for path in (log, upgraded)), strict=True):
-            assert after.pop("schema")["version"] == "4.1.0" and before.pop("schema")["version"] == "3.0.0"
+            assert after.pop("schema")["version"] == "4.2.0" and before.pop("schema")["version"] == "3.0.0"
             for cue in after["cues"]:
                 assert cue.pop("usable") == (not cue.pop("why_not"))
             if before["budget"] is not None:
@@ -99,7 +99,8 @@ def test_a_former_log_is_read_as_its_upgrade_and_loses_nothing(name: str, tmp_pa
                     before["budget"].pop("threshold_shift_nats") == before["budget"]["tally"].pop("lost") == 0
                 )
             # Added since.
-            assert after["context"].pop("hidden_by_side") is None
+            assert after["context"].pop("hidden_by_side") is None and after.pop("no_model") is None
+            assert not (after["bearing"] or {"at_edge": False}).pop("at_edge")
             assert all(one.pop("kinds") is None for one in after["heard"] or ())
             if after["budget"] is not None:
                 assert after["budget"].pop("asked_alpha") is after["budget"].pop("promise") is None

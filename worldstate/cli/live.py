@@ -306,7 +306,7 @@ def _listen(
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.files.file_io import GrowingFile, line_writer
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
-    from worldstate.operations.recordings.recording_report import WarningMeter, calibration_words
+    from worldstate.operations.recordings.recording_report import WarningMeter
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
     notice, sound = _loss_notices(), ports.sound
@@ -341,8 +341,7 @@ def _listen(
         "latency_largest_s": latency.quantile_s(1.0),
         **cost.read(),
         "peak_risk": warnings.peak_risk,
-        "calibration": calibration_words(warnings.uncalibrated, warnings.states),
-        "usable": warnings.usable,
+        **warnings.words,
         "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
     }
 

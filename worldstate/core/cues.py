@@ -1,6 +1,7 @@
 """Advisories and cues: the alarm over the belief and what messages announce, and what is published."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -17,7 +18,7 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.track import Track
 from worldstate.ground import TINY, replaced
 from worldstate.measurement import Measurement
-from worldstate.state import Advisory, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
+from worldstate.state import Advisory, Entity, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
 
 from .birth_death import hidden_on
 from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceState
@@ -55,6 +56,15 @@ def note_source(memory: Memory, measurement: Measurement, model: FilterModel) ->
     found = posterior_of(tuple(map(math.log, usual)), measurement.signature, measurement.co_evidence)
     ratio = found.log_lambda if math.isfinite(found.log_lambda) else None
     memory.last.instant = Instant(min(found.hidden_total, 1.0), ratio)
+
+
+def sound_cues(sounds: Iterable[Entity]) -> tuple[RiskCue, ...]:
+    """Return where to look for what sounds: cues without a side, a risk and an advisory."""
+    places = [(one.id, one.azimuth_rad, one.azimuth_std_rad) for one in sounds]
+    return tuple(
+        RiskCue(None, at, std, None, None, None, None, None, entity_id=name, sector_rad=sector(at, std))
+        for name, at, std in places
+    )
 
 
 # No slots: what follows from the memory is computed once, if it is asked for.

@@ -1,6 +1,7 @@
 """The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
@@ -9,20 +10,20 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated
 from worldstate.belief.detection import BY_ALL
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
-from worldstate.ground import InvalidArgumentError, in_range, integer_ns, nanoseconds, replaced
-from worldstate.ground.serialisation import Layout, decode, encode
+from worldstate.ground import InvalidArgumentError, NotUsable, in_range, integer_ns, nanoseconds, replaced
+from worldstate.ground.serialisation import ADDED, Layout, decode, encode
 from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sighting
-from worldstate.state import Context, Priors, WorldState
+from worldstate.state import Context, Event, Priors, WorldState
 from worldstate.state.world_state import judged
 
 from .birth_death import events_between, published
 from .budget_watch import SLACK_NS
-from .cues import SideAlarms
+from .cues import SideAlarms, sound_cues
 from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import MOST_BOXES, NEWS_HOLDS_NS, Memory, first_memory
 from .relations import relations_at
 from .site_model import FilterModel, from_here, site_geometry_of
-from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of
+from .snapshot_builder import ego_of, entities_of, hearings, searched_views, sensors_of, sound_entities
 from .step import advanced, take_in
 
 MOST_SIDES = 3
@@ -46,6 +47,9 @@ class WorldFilter:
         What another filter carried; the first belief where not given.
     lag : FixedLag, optional
         Measurements of the last two seconds, among which a late one is put; none where not given.
+    no_model : NotUsable, optional
+        Why no model reads the sound, if none does. The snapshots then hold tracks of sound in place of what
+        is hidden, and cues without a side, a risk and an advisory.
 
     Raises
     ------
@@ -73,6 +77,7 @@ class WorldFilter:
     start_ns: int = 0
     memory: Memory | None = field(default=None, repr=False)
     lag: FixedLag | None = field(default=None, repr=False)
+    no_model: NotUsable | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_ns", integer_ns("start_ns", self.start_ns))
@@ -104,13 +109,14 @@ class WorldFilter:
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings.street)
         # Those of the last step hold until time passes, or odometry moves the place.
         is_fresh = memory is self._lag.latest and memory.ego is None
+        sounds, before = sound_entities(memory.sounds, settings), last.predicted or memory.sides.hypotheses
         state = WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.counts.measurements,
-            entities=entities_of(tracks, memory, model.site),
+            entities=(*entities_of(tracks, memory, model.site), *sounds),
             relations=memory.relations if is_fresh else relations_at(memory, tracks, model),
-            context=replaced(context, priors=Priors(*(last.predicted or memory.sides.hypotheses))),
-            cues=SideAlarms(memory, model).cues(sensors),
+            context=context if self.no_model else replaced(context, priors=Priors(*before)),
+            cues=SideAlarms(memory, model).cues(sensors) if self.no_model is None else sound_cues(sounds),
             calibrated=self.policy.alpha > 0.0,
             bearing=last.bearing,
             domain=last.domain,
@@ -123,6 +129,7 @@ class WorldFilter:
             heard=hearings(memory),
             ego=None if memory.ego is None else ego_of(memory.ego),
             budget=memory.belief.budget(memory.stamp_ns),
+            no_model=self.no_model,
         )
         return judged(state)
 
@@ -178,10 +185,17 @@ class WorldFilter:
             # From what was published last on: a late measurement changes what has become of it since.
             steps = (*[one.before for one in lag.arrivals], lag.latest)
             known, now = (published(one.latest.tracks, self.settings.street) for one in (self._lag, lag))
-            lag.latest.last.events = events_between(known, now, steps)
+            lag.latest.last.events = (*events_between(known, now, steps), *self._sound_events(lag.latest))
             lag = lag.counted(boxes_left_out=left_out) if left_out else lag
         world = self._with(lag.latest, lag)
         return world if self.stamp_ns <= world.stamp_ns + SLACK_NS else world.predict_to(self.stamp_ns)
+
+    def _sound_events(self, latest: Memory) -> Iterator[Event]:
+        """Yield which tracks of sound have ended or begun since the last measurement."""
+        both = (sound_entities(one.sounds, self.settings) for one in (self._lag.latest, latest))
+        known, now = ([one.id for one in sounds] for sounds in both)
+        yield from (Event(latest.stamp_ns, "died", name) for name in known if name not in now)
+        yield from (Event(latest.stamp_ns, "born", name) for name in now if name not in known)
 
     def refused(self, inputs: int) -> "WorldFilter":
         """Return the filter, whose `WorldState.delivery` counts so many more inputs refused before it."""
@@ -221,7 +235,8 @@ class WorldFilter:
         lag, measurements = self._lag, tuple(one.measurement for one in self._lag.arrivals)
         past = LagRecord(self.stamp_ns, lag.base, measurements, lag.delivery, lag.late_since_ns, lag.held)
         # What was predicted since the last measurement is predicted again.
-        return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, lag.latest, past))
+        given = self.context, self.policy, self.settings, self.start_ns
+        return encode(FilterRecord(*given, lag.latest, past, self.no_model))
 
     @classmethod
     def from_dict(cls, value: object) -> "WorldFilter":
@@ -236,7 +251,8 @@ class WorldFilter:
         """
         kept = decode(FilterRecord, value, "checkpoint")
         past, latest = kept.past, kept.memory
-        world = cls(kept.context, kept.policy, kept.settings, kept.start_ns, latest)
+        given = kept.context, kept.policy, kept.settings, kept.start_ns
+        world = cls(*given, latest, no_model=kept.no_model)
         world = replaced(world, lag=restored(latest, past, world._step))
         return world if past.stamp_ns <= latest.stamp_ns else world.predict_to(past.stamp_ns)
 
@@ -250,7 +266,8 @@ class WorldFilter:
 
     @cached_property
     def _model(self) -> FilterModel:
-        return FilterModel(self.context, self.policy, site_geometry_of(self.context, self.settings))
+        site = site_geometry_of(self.context, self.settings)
+        return FilterModel(self.context, self.policy, site, self.no_model is None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +282,7 @@ class FilterRecord:
     start_ns: int
     memory: Memory
     past: LagRecord
+    no_model: NotUsable | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         k = len(self.context.directions)

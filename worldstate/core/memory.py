@@ -8,6 +8,7 @@ from worldstate.abduction.road_users import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief, corrected
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.sound_tracks import SoundTrack
 from worldstate.belief.track import Track, Tracks
 from worldstate.ground.serialisation import ADDED, Count, Probability, Via
 from worldstate.ground.values import SECONDS_PER_HOUR, NotUsable, nanoseconds
@@ -106,6 +107,7 @@ class Memory:
     looks: dict[str, CountedLook] = field(default_factory=dict)  # Last one by the sensor
     relations: tuple[Relation, ...] = ()  # With the intervals in which they have held
     ego: EgoBelief | None = None  # By odometry; None without
+    sounds: tuple[SoundTrack, ...] = field(default=(), metadata=ADDED)  # Where no model reads the sound
 
     @property
     def sides(self) -> SideBelief:

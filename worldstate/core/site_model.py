@@ -21,6 +21,7 @@ class FilterModel:
     context: Context
     policy: CueingPolicy
     site: SiteGeometry
+    reads_sound: bool = True  # Whether a model tells what is heard
 
 
 def site_geometry_of(

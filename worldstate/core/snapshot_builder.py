@@ -1,6 +1,7 @@
 """Build the public WorldState from the internal beliefs."""
 
 import math
+from collections.abc import Iterable
 from functools import partial
 from statistics import NormalDist
 from typing import Any, TypeAlias
@@ -23,8 +24,10 @@ from worldstate.belief.kinematics.motion import (
     MotionBelief,
     white_acceleration,
 )
+from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.track import Track, Tracks, acceleration_psd
+from worldstate.belief.sound_tracks import SoundTrack
+from worldstate.belief.track import Track, Tracks, acceleration_psd, entity_id
 from worldstate.ground import seconds
 from worldstate.measurement.measurement import Heard
 from worldstate.state import Classification, Context, Entity, Hearing, SearchedView, SensorHealth, Visibility
@@ -129,6 +132,26 @@ def _entity(belief: StreetBelief, site: SiteGeometry, track: Track, moments: _Mo
         forecast=None if heard_only else forecast,
         azimuth_source=source,
         sides=_side_shares(track, belief, site),
+    )
+
+
+def sound_entities(tracks: Iterable[SoundTrack], settings: FilterSettings) -> tuple[Entity, ...]:
+    """Return what likely sounds as entities, of which only that and the azimuth is stated."""
+    likely = (one for one in tracks if one.existence >= settings.street.birth)
+    return tuple(
+        Entity(
+            entity_id(settings.stream, f"sound of {one.source}", one.created_ns),
+            None,
+            one.existence,
+            None,
+            *(one.motion.azimuth_rad, one.motion.azimuth_std_rad, one.created_ns, one.updated_ns),
+            classification=None,
+            azimuth_rate_rad_s=round(float(one.motion.mean[AZIMUTH_RATE]), _DIGITS),
+            azimuth_covariance=tuple(one.motion.covariance[*_UPPER].round(_DIGITS).tolist()),
+            azimuth_source="measured",
+            sources=(one.source,),
+        )
+        for one in likely
     )
 
 

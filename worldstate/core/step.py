@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from worldstate.belief.kinematics.cartesian import corrected, driven
+from worldstate.belief.sound_tracks import faded, followed
 from worldstate.belief.track import Tracks, predict_tracks, turn
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement import Measurement, Odometry, PositionScan
@@ -45,6 +46,7 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     memory.forget()
     memory.belief = carried(memory.belief, stamp_ns, step_ns, model.context, model.site.street)
     view_heard(memory, model.site)
+    memory.sounds = faded(memory.sounds, seconds(step_ns), model.site.street)
     if True in before.tracks.placed & ~before.tracks.seen:
         _pass_places(before.tracks, memory, model)
     return memory
@@ -79,7 +81,7 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
     alarms = SideAlarms(memory, model)
     alarms.note_announced()
     stands = [one is not None for one in alarms.advisories]
-    if isinstance(measurement, Measurement):
+    if isinstance(measurement, Measurement) and model.reads_sound:
         birth_death(memory, stands, measurement, model.site)
     _keep_likeliest(memory)
     _note_advisories(memory, [one and k not in emerged for k, one in enumerate(stood)], stands)
@@ -111,9 +113,12 @@ def _hear_and_look(memory: Memory, measurement: Measurement, start_ns: int, mode
     last, site = memory.sources.get(measurement.source), model.site
     since_ns = measurement.stamp_ns - (start_ns if last is None else last.stamp_ns)
     # Of windows that overlap, what is new counts.
-    weight = min(max(seconds(since_ns), 0.0) / site.settings.window_s, 1.0)
+    new_s = max(seconds(since_ns), 0.0)
+    weight = min(new_s / site.settings.window_s, 1.0)
     measurement, looks = new_looks(memory, measurement, start_ns, site.street)
     acoustic_update(memory, measurement, weight, site)
+    if not model.reads_sound:
+        memory.sounds = followed(memory.sounds, measurement, new_s, site.street)
     update_looks(memory, measurement, looks, model)
     note_source(memory, measurement, model)
     update_belief(memory, measurement, [seen for seen, _ in looks], model)

@@ -41,6 +41,8 @@ class Bearing:
         Standard deviation of a line-of-sight source; a hidden one has a measurement model of its own.
     prominence : float
         Peak-to-median ratio of the spatial spectrum the bearing was read from, >= 1.
+    at_edge : bool
+        Whether it stands at the edge of the sector that was searched: the source may lie beyond it.
 
     Raises
     ------
@@ -56,9 +58,12 @@ class Bearing:
     azimuth_rad: float
     std_rad: float
     prominence: float = 1.0  # Of a flat spectrum: claims nothing
+    at_edge: bool = field(default=False, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        check_fields(self, azimuth_rad=_AZIMUTHS_RAD, std_rad=_STDS_RAD, prominence=(0.0, _MOST))
+        check_fields(
+            self, azimuth_rad=_AZIMUTHS_RAD, std_rad=_STDS_RAD, prominence=(0.0, _MOST), at_edge=bool
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from worldstate.abduction.road_users import DomainVerdict, Foreign
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable, replaced
 from worldstate.ground.extras import optional
-from worldstate.ground.serialisation import Layout, decode, decode_json, encode
+from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
@@ -71,6 +71,9 @@ class WorldState:
     budget : Budget or None
         Whether the budget of alarms still holds, by what a camera sees later; None without the alarm of a
         sequence model, which has one.
+    no_model : NotUsable or None
+        Why no model reads the sound, if none does: an array that no model was made for. The entities that are
+        heard then have no status, side and class, the cues no side, risk and advisory.
     events : tuple of Event
         What became of entities with the last measurement, at most 64.
 
@@ -81,7 +84,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "4.1.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "4.2.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -103,6 +106,7 @@ class WorldState:
     ego: Ego | None = None
     heard: tuple[Hearing, ...] | None = None
     budget: Budget | None = None
+    no_model: NotUsable | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.
@@ -117,7 +121,7 @@ class WorldState:
     def risk(self) -> float | None:
         """Largest risk of all directions, 0 before the first measurement; None if no model states one."""
         risks = [cue.risk for cue in self.cues if cue.risk is not None]
-        return max(risks, default=None if self.cues else 0.0)
+        return max(risks, default=None if self.cues or self.no_model else 0.0)
 
     def graph(self) -> "nx.MultiDiGraph[str]":
         """Return the scene graph: nodes are the ego vehicle, entities and occluders, edges the relations.

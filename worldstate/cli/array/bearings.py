@@ -3,18 +3,18 @@
 Write the bearing of the loudest source every tenth of a second, for any array, without a model.
 
 --out is CSV with the columns time_s (middle of the sound that the bearing was read from), azimuth_deg (left
-positive), std_deg (standard deviation as the front-end states it) and prominence (peak over median of the
-spatial spectrum; 1 in silence). --sources adds the number of plane waves in each second by an information
-criterion: reflections count, so it is no number of vehicles.
+positive), std_deg (standard deviation as the front-end states it), prominence (peak over median of the
+spatial spectrum; 1 in silence) and at_edge (1 at the edge of the sector that is searched, where the source
+may lie beyond it). --sources adds the number of plane waves in each second by an information criterion:
+reflections count, so it is no number of vehicles.
 
 Examples
 --------
   worldstate array bearings some.wav --array mics.csv --out bearings.csv --figure bearings.png
-  worldstate array bearings mic1.wav mic2.wav --array pair.json --azimuth-span 360 --out bearings.csv
+  worldstate array bearings mic1.wav mic2.wav --array pair.json --out bearings.csv
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 from worldstate.cli.common import inputs, output, progress
@@ -44,11 +44,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     write_text(arguments.out, bearing_track.bearings_csv(track))
     if arguments.figure is not None:
         bearing_track.write_bearings_figure(track, arguments.figure, audio.path.name)
-    if arguments.azimuth_span < 360 and front_end.array.ambiguity in ("none", "up-down"):
-        at_edge = float((abs(track.azimuth_deg) > 0.5 * arguments.azimuth_span - 1.0).mean())
-        if at_edge > _MUCH_AT_EDGE:
-            told = f"{100 * at_edge:.0f} % of the bearings lie at the edge of what is searched"
-            print(f"worldstate: {told}: --azimuth-span 360 searches all round", file=sys.stderr)
+    if (at_edge := float(track.at_edge.mean())) > _MUCH_AT_EDGE and arguments.azimuth_span is not None:
+        told = f"{100 * at_edge:.0f} % of the bearings lie at the edge of what is searched"
+        output.say(f"{told}: without --azimuth-span the array chooses the sector")
     summary = {
         "out": str(arguments.out),
         "array": inputs.stance(front_end.array),

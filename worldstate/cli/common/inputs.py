@@ -88,8 +88,8 @@ def add_search_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     band = "band of the bearing, Hz (default: by the spacing of the microphones; 300 to 1800 for the roof)"
     add("--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help=band)
-    span = "sector ahead that is searched, 360 for all round (default: %(default)g)"
-    add("--azimuth-span", type=float, default=180.0, metavar="DEG", help=span)
+    span = "sector ahead that is searched, 360 for all round (default: by the array, or its model)"
+    add("--azimuth-span", type=float, metavar="DEG", help=span)
 
 
 def topics_of(arguments: argparse.Namespace) -> dict[str, str]:

@@ -78,7 +78,7 @@ def checked_sensors(arguments: argparse.Namespace, sound: list[Path]) -> GivenSe
     looks = arguments.detector in MOVING and "camera_device" not in arguments
     check_extra(*wanted, *needed_extras(arguments), *(["cv2"] if looks else []))
     made_for = array_of_model(given.model, given.car.array)
-    if made_for is not None:
+    if made_for is not None and (given.model is not None or given.car.array is None):
         _check_array(given, made_for, sound)
     return given
 

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.files.file_io import line_writer
     from worldstate.adapters.state_log import read_log
-    from worldstate.operations.recordings.recording_report import WarningMeter, calibration_words
+    from worldstate.operations.recordings.recording_report import WarningMeter
 
     output.check_outputs(arguments, "out")
     crossing_m = ground.in_range("--crossing", arguments.crossing, 1.0, 100.0)
@@ -52,8 +52,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         "first_s": ground.seconds(meter.first_ns),
         "last_s": ground.seconds(meter.last_ns),
         "peak_risk": meter.peak_risk,
-        "calibration": calibration_words(meter.uncalibrated, meter.states),
-        "usable": meter.usable,
+        **meter.words,
         "advisory_onsets_s": list(meter.summary().advisory_onsets_s),
     }
     return output.CommandResult(summary)

@@ -1,6 +1,6 @@
 """`worldstate log upgrade`: a log of an earlier version as this one writes it.
 
-Snapshots of schema 3.x become snapshots of schema 4.1.0: every cue states whether it may be acted on, as far
+Snapshots of schema 3.x become snapshots of schema 4.2.0: every cue states whether it may be acted on, as far
 as the log holds why it may not. Commands, and `WorldState.from_json`, upgrade a log while they read it;
 programs in other languages need the file. An MCAP file of `--export` becomes one with its images and sound; a
 bag, whose other topics follow from its snapshots, becomes JSON lines.

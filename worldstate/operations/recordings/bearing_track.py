@@ -21,8 +21,10 @@ _FEWEST_FRAMES = 10  # From which their covariance means something
 
 
 # Of the table as text: middle of the sound that the bearing was read from; azimuth, left positive; its
-# standard deviation; peak-to-median ratio, 1 in silence; plane waves in the second that the hop ends in.
-_FORMS = {"time_s": ".3f", "azimuth_deg": ".2f", "std_deg": ".2f", "prominence": ".3f", "sources": ".0f"}
+# standard deviation; peak-to-median ratio, 1 in silence; 1 at the edge of the sector that was searched; plane
+# waves in the second that the hop ends in.
+_FORMS = {"time_s": ".3f", "azimuth_deg": ".2f", "std_deg": ".2f", "prominence": ".3f", "at_edge": ".0f"}
+_FORMS |= {"sources": ".0f"}
 
 
 def bearings_csv(track: HopTable) -> str:
@@ -49,7 +51,7 @@ def track_bearings(
         rows += [(*_row(frame), *sources) for frame in front_end.process(block)]
         on_second()
     rows += [(*_row(frame), *sources) for frame in front_end.finish()]
-    return HopTable.of_rows(tuple(_FORMS)[: 5 if count else 4], rows)
+    return HopTable.of_rows(tuple(_FORMS)[: 6 if count else 5], rows)
 
 
 def write_bearings_figure(track: HopTable, path: Path, title: str) -> None:
@@ -64,7 +66,8 @@ def write_bearings_figure(track: HopTable, path: Path, title: str) -> None:
 
 def _row(frame: AcousticFrame) -> Iterable[float]:
     time_s = seconds(frame.stamp_ns) - frame.bearing_age_s
-    return time_s, np.degrees(frame.bearing_rad), np.degrees(frame.bearing_std_rad), frame.prominence
+    azimuth_deg, std_deg = np.degrees([frame.bearing_rad, frame.bearing_std_rad])
+    return time_s, azimuth_deg, std_deg, frame.prominence, frame.at_edge
 
 
 def _sources_in(block: Float32Array, front_end: FrontEnd) -> int:

@@ -3,7 +3,7 @@
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -65,6 +65,7 @@ class WarningMeter:
     uncalibrated: int = 0  # States whose cues keep to no budget
     unusable: int = 0  # States with a cue that is not usable
     reasons: Counter[str] = field(default_factory=Counter)  # States by why not
+    sounds: set[str] = field(default_factory=set)  # Tracks of sound, if no model reads it
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None
@@ -76,8 +77,12 @@ class WarningMeter:
         self.states += 1
         self.peak_risk = max((one for one in (self.peak_risk, state.risk) if one is not None), default=None)
         self.uncalibrated += not state.calibrated
-        self.unusable += not all(cue.usable for cue in state.cues)
-        self.reasons.update(dict.fromkeys((one for cue in state.cues for one in cue.why_not), 1))
+        why_not = {str(one) for cue in state.cues for one in cue.why_not}
+        if state.no_model is not None:
+            why_not = {"no model"}
+            self.sounds |= {one.id for one in state.entities if one.status is None}
+        self.unusable += bool(why_not)
+        self.reasons.update(why_not)
         raised = [cue for cue in state.cues if cue.advisory]
         if raised:
             now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk or 0.0).entity_id
@@ -99,6 +104,12 @@ class WarningMeter:
             return "in every hop"
         given = ", ".join(f"{reason} {number}" for reason, number in self.reasons.items())
         return f"in {self.states - self.unusable} of {self.states} hops ({given})"
+
+    @property
+    def words(self) -> dict[str, object]:
+        """Whether the cues kept to a budget, and could be acted on; how many sounds were followed."""
+        stated = {"calibration": calibration_words(self.uncalibrated, self.states), "usable": self.usable}
+        return stated | ({"sounds": len(self.sounds)} if "no model" in self.reasons else {})
 
     def summary(self) -> WarningSummary:
         """Return the figures of all states so far."""
@@ -136,10 +147,9 @@ class RecordingReport:
         Seconds of audio per second of wall time, the whole chain.
     health : RecordingHealth
         What was wrong with the microphones.
-    calibration : str
-        In words: "calibrated", "uncalibrated", or in how many hops it was not.
-    usable : str
-        In words: in how many hops the cues could be acted on, and why not in the others.
+    words : mapping of str to object
+        Whether the cues kept to a budget of false alarms, in how many hops they could be acted on, and
+        without a model how many sounds were followed.
     end : Checkpoint or None
         Belief and site after the last hop, to go on from; None where there was none.
 
@@ -164,16 +174,14 @@ class RecordingReport:
     peak_risk: float | None
     realtime_factor: float
     health: RecordingHealth
-    calibration: str
-    usable: str
+    words: Mapping[str, object]
     end: Checkpoint | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
         figures = {"hops": self.hops, "peak_risk": self.peak_risk, "realtime_factor": self.realtime_factor}
         masked = {"masked_microphones": [channel + 1 for channel in self.health.masked_channels]}
-        words = {"calibration": self.calibration, "usable": self.usable}
-        return asdict(self.warning) | figures | masked | words
+        return asdict(self.warning) | figures | masked | {**self.words}
 
 
 def run_recording(
@@ -228,9 +236,8 @@ def run_recording(
             end = step.checkpoint
     elapsed_s, last_ns = time.perf_counter() - started, max(meter.last_ns, source.start_ns)
     factor = seconds(last_ns - source.start_ns) / elapsed_s
-    words = calibration_words(meter.uncalibrated, meter.states), meter.usable
     figures = meter.states, meter.peak_risk, factor
-    return RecordingReport(meter.summary(), *figures, health.summary(), *words, end)
+    return RecordingReport(meter.summary(), *figures, health.summary(), meter.words, end)
 
 
 def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehicle: str = "a vehicle") -> str:

@@ -1,0 +1,259 @@
+"""An array that no model was made for: bearings and tracks of sound, and never a side, a class or a risk."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pyroomacoustics as pra
+import pytest
+import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Listener, ListenSettings, WorldState
+from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.adapters import read_checkpoint, save_checkpoint
+from worldstate.belief.sound_tracks import MOST_SOUNDS
+from worldstate.belief.street_model import StreetModel
+from worldstate.cli.main import main
+from worldstate.core.filter import WorldFilter
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.settings import FrontEndSettings, default_span_deg
+from worldstate.frontend.stream import FrontEnd
+from worldstate.ground import InvalidArgumentError, NotUsable, wrap_angle
+from worldstate.measurement import Bearing, Measurement
+from worldstate.simulation.emitters.syntheses import voice
+
+RATE = 16_000
+ANGLES = 2.0 * np.pi * np.arange(5) / 5
+RING = 0.045 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES), 0.0 * ANGLES])
+SOLID = 0.05 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+LINE = np.column_stack([np.zeros(4), 0.06 * np.arange(4), np.zeros(4)])
+ARRAYS = {"ring": RING, "tetrahedron": SOLID, "line": LINE}
+
+
+def talker(positions: np.ndarray, azimuth_rad: float, seed: int, seconds: int = 4) -> np.ndarray:
+    """Return a voice in a room of 0.3 to 0.5 s of reverberation, 1.2 m from the microphones."""
+    rng = np.random.default_rng(seed)
+    size = rng.uniform([4.0, 4.0, 2.4], [7.0, 6.0, 3.2])
+    absorption, order = pra.inverse_sabine(rng.uniform(0.3, 0.5), size)
+    box = pra.ShoeBox(size, fs=RATE, materials=pra.Material(absorption), max_order=min(order, 15))
+    middle = 0.5 * size + rng.uniform(-0.3, 0.3, 3)
+    box.add_microphone_array((positions + middle).T)
+    towards = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.1])
+    box.add_source(middle + 1.2 * towards, signal=voice(seconds * RATE, RATE, rng))
+    box.simulate()
+    sound = box.mic_array.signals.T[: seconds * RATE]
+    noise = 1e-3 * rng.standard_normal(sound.shape)
+    return (0.3 * sound / np.abs(sound).max() + noise).astype(np.float32)
+
+
+def states_nothing(state: WorldState) -> bool:
+    """Return whether a snapshot states no side, class, risk and advisory, neither by JSON nor by object."""
+    told = json.loads(state.to_json())
+    entities = [[one[key] for key in SILENT_OF_ENTITY] for one in told["entities"]]
+    cues = [[one[key] for key in SILENT_OF_CUE] for one in told["cues"]]
+    values = [value for row in (*entities, *cues) for value in row]
+    unusable = all(not cue.usable and cue.why_not for cue in state.cues)
+    return (
+        not any(values) and unusable and state.risk is None and not state.calibrated and bool(state.no_model)
+    )
+
+
+SILENT_OF_ENTITY = "status", "hidden_probability", "classification", "direction", "sides"
+SILENT_OF_CUE = (
+    "direction",
+    "risk",
+    "confidence",
+    "statistic",
+    "log_lambda",
+    "hypotheses",
+    "advisory",
+    "alpha",
+)
+SILENT_OF_CUE += ("within", "time_to_visible_s", "evidence", "held", "horizon_s")
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+@pytest.mark.parametrize("seed", range(3))
+def test_speech_in_a_room_has_a_bearing_and_no_side_class_risk_or_advisory(name: str, seed: int) -> None:
+    array = MicrophoneArray(ARRAYS[name])
+    azimuth_rad = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
+    states = Listener(array, RATE).push(talker(array.positions_m, azimuth_rad, seed))
+    assert len(states) == 30 and all(map(states_nothing, states))
+    sounds = [one for state in states for one in state.entities]
+    assert len(sounds) >= 15
+    if name == "line":  # It hears one talker as one ahead, and near its axis hardly where
+        assert all(one.bearing is None or abs(one.bearing.azimuth_rad) <= math.pi / 2.0 for one in states)
+    else:
+        off = [abs(wrap_angle(one.azimuth_rad - azimuth_rad)) for one in sounds]
+        assert np.median(off) < math.radians(12.0) and len({one.id for one in sounds}) <= 2
+    assert all(
+        one.entity_id in {entity.id for entity in state.entities} for state in states for one in state.cues
+    )
+
+
+def test_the_commands_state_bearings_and_say_that_there_is_no_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sound, mics, log = tmp_path / "some.wav", tmp_path / "mics.csv", tmp_path / "states.jsonl"
+    soundfile.write(sound, talker(RING, 2.5, 0), RATE)
+    mics.write_text("".join(f"{x},{y},{z}\n" for x, y, z in RING.tolist()))
+    words = [str(sound), "--array", str(mics)]
+    assert main(["run", *words, "--out", str(log)]) == 0
+    out = capsys.readouterr().out
+    assert (
+        "(no model 31)" in out
+        and "\nsounds                   1\n" in out
+        and "tells all azimuths apart" in out
+    )
+    states = [WorldState.from_json(line) for line in log.read_text().splitlines()]
+    assert all(map(states_nothing, states)) and {one.no_model.reason for one in states if one.no_model} == {
+        "no model was made for this array of 5 microphones"
+    }
+    told = [one.kind for state in states for one in state.events]
+    assert told.count("born") - told.count("died") == len(states[-1].entities)
+    assert main(["explain", str(log), "--time", "3"]) == 0
+    assert "side unknown: advisory none" in capsys.readouterr().out
+    assert (
+        main(["live", "--play", *words, "--speed", "100", "--duration", "2", "--out", str(tmp_path / "l")])
+        == 0
+    )
+    assert "no model" in capsys.readouterr().out
+    for asked in (["--budget", "5"], ["--alpha", "0.02"], ["--grounded"]):
+        assert main(["run", *words, *asked]) == 2
+        assert "expected a model for the array" in capsys.readouterr().err
+    quiet = ["model", "threshold", *words, "--out", str(tmp_path / "m.json")]
+    assert main(quiet) == 2 and "not the array of the model" in capsys.readouterr().err
+
+
+def test_blocks_and_checkpoints_change_nothing(tmp_path: Path) -> None:
+    array, sound = MicrophoneArray(RING), talker(RING, -1.0, 1)
+    whole = Listener(array, RATE).push(sound)
+    parts, first = Listener(array, RATE), []
+    for block in np.split(sound[:40_000], range(777, 40_000, 777)):
+        first += parts.push(block)
+    second = Listener(array, RATE, resume=parts.checkpoint())
+    save_checkpoint(tmp_path / "now.json", parts.checkpoint())
+    kept = read_checkpoint(tmp_path / "now.json")
+    assert kept.world.state == parts.world.state and kept.world.state.entities
+    assert first + second.push(sound[40_000:]) == whole
+    order = [3, 0, 4, 1, 2]
+    mixed = Listener(MicrophoneArray(RING[order]), RATE).push(sound[:, order])
+    for one, other in zip(whole, mixed, strict=True):
+        azimuths = [[entity.azimuth_rad for entity in state.entities] for state in (one, other)]
+        np.testing.assert_allclose(*azimuths, atol=1e-3)
+
+
+def measured(hop: int, azimuth_rad: float | None, at_edge: bool = False) -> Measurement:
+    bearing = NotUsable("-") if azimuth_rad is None else Bearing(azimuth_rad, 0.1, 2.0, at_edge)
+    even = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    return Measurement(hop * 10**8, even, Unqueried("-"), bearing, NotUsable("-"))
+
+
+def followed(azimuths_rad: list[float | None], at_edge: bool = False) -> list[WorldState]:
+    world, states = WorldFilter(no_model=NotUsable("no model")), []
+    for hop, azimuth_rad in enumerate(azimuths_rad, start=1):
+        world = world.predict_to(hop * 10**8).update(measured(hop, azimuth_rad, at_edge))
+        states.append(world.state)
+    return states
+
+
+bearings = st.lists(st.none() | st.floats(-math.pi, math.pi), max_size=40)
+
+
+@settings(max_examples=40, deadline=None)
+@given(bearings, st.floats(-math.pi, math.pi))
+def test_turning_all_bearings_turns_the_tracks_and_nothing_else(
+    azimuths: list[float | None], turn: float
+) -> None:
+    turned = [None if one is None else wrap_angle(one + turn) for one in azimuths]
+    for one, other in zip(followed(azimuths), followed(turned), strict=True):
+        assert len(one.entities) == len(other.entities) <= MOST_SOUNDS
+        for a, b in zip(one.entities, other.entities, strict=True):
+            assert abs(wrap_angle(a.azimuth_rad + turn - b.azimuth_rad)) < 1e-6
+            assert math.isclose(a.existence_probability, b.existence_probability, rel_tol=1e-6)
+        assert states_nothing(one) and WorldState.from_json(one.to_json()) == one
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(-math.pi, math.pi))
+def test_a_sound_is_believed_while_it_lasts_and_fades_in_silence(azimuth_rad: float) -> None:
+    """In silence by the mean life of what no sensor finds, until it is likelier that nothing sounds."""
+    states = followed([azimuth_rad] * 15 + [None] * 80)
+    chances = [one.entities[0].existence_probability for one in states[3:15]]
+    (entity,) = states[14].entities
+    assert abs(wrap_angle(entity.azimuth_rad - azimuth_rad)) < 1e-6 and chances[-1] > 0.9
+    assert chances == sorted(chances)
+    faded = states[34].entities[0].existence_probability
+    assert math.isclose(faded, chances[-1] * math.exp(-2.0 / StreetModel().unseen_s), rel_tol=1e-9)
+    assert not states[-1].entities and states[-1].risk is None
+
+
+def test_sound_elsewhere_ends_a_track_sooner_than_silence_and_an_edge_begins_none() -> None:
+    silent, moved = followed([0.5] * 15 + [None] * 40), followed([0.5] * 15 + [-2.0] * 40)
+    near = [
+        [abs(wrap_angle(one.azimuth_rad - 0.5)) < 0.3 for one in state.entities]
+        for state in (silent[-1], moved[-1])
+    ]
+    assert near == [[True], [False]]
+    edges = followed([math.pi / 2.0] * 15, at_edge=True)
+    assert (
+        not any(state.entities for state in edges)
+        and edges[-1].bearing is not None
+        and edges[-1].bearing.at_edge
+    )
+
+
+@pytest.mark.parametrize("azimuth_deg", [-170.0, -120.0, -60.0, 0.0, 100.0, 150.0])
+def test_a_ring_searches_all_round_and_a_narrower_search_flags_its_edge(azimuth_deg: float) -> None:
+    array = MicrophoneArray(RING)
+    assert default_span_deg(array, RATE) == 360.0
+    n, rng = 2 * RATE, np.random.default_rng(0)
+    turns = np.exp(
+        -2j * np.pi * np.fft.rfftfreq(n, 1 / RATE)[:, None] * array.delays_s(math.radians(azimuth_deg))
+    )
+    sound = np.fft.irfft(np.fft.rfft(rng.normal(0.0, 0.1, n))[:, None] * turns, n, axis=0)
+    sound += rng.normal(0.0, 0.01, sound.shape)
+    (last,) = Listener(array, RATE).push(sound)[-1:]
+    assert last.bearing is not None and not last.bearing.at_edge
+    assert abs(wrap_angle(last.bearing.azimuth_rad - math.radians(azimuth_deg))) < math.radians(3.0)
+    ahead = Listener(array, RATE, settings=ListenSettings(azimuth_span_deg=120)).push(sound)[-1]
+    assert ahead.bearing is None or ahead.bearing.at_edge is (abs(azimuth_deg) >= 60.0)
+    if abs(azimuth_deg) >= 60.0 and ahead.bearing is not None:
+        assert math.isclose(ahead.bearing.std_rad, math.radians(120.0) / math.sqrt(12.0), rel_tol=1e-6)
+        assert not ahead.entities
+
+
+@given(st.floats(-math.pi, math.pi), st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=8, unique=True))
+def test_what_stands_in_a_vertical_plane_searches_ahead(turn: float, along: list[float]) -> None:
+    """It hears a level direction as its mirror image in the plane."""
+    heights = np.linspace(0.0, 0.3, len(along))
+    apart = np.array(along) + np.linspace(0.0, 0.1, len(along))
+    positions = np.column_stack([apart * math.cos(turn), apart * math.sin(turn), heights])
+    array = MicrophoneArray(positions)
+    assert default_span_deg(array, RATE) == 180.0
+    mirror = array.delays_s(0.7 + turn) - array.delays_s(-0.7 + turn)
+    assert np.ptp(mirror) < 1e-12
+
+
+def test_the_array_alone_chooses_the_sector_where_no_sequence_reads_the_bearing() -> None:
+    settings_of = ListenSettings()
+    spans = [settings_of.front_end(MicrophoneArray(one), RATE).azimuth_span_deg for one in (RING, LINE)]
+    assert spans == [(-180.0, 180.0), (-90.0, 90.0)]
+    with_model = Listener("respeaker-4", RATE)
+    assert with_model._source.settings.azimuth_span_deg == 180.0
+
+
+def test_a_named_model_is_refused_as_before() -> None:
+    with pytest.raises(InvalidArgumentError, match="expected a model for the array"):
+        Listener(MicrophoneArray(RING), RATE, budget=5.0)
+
+
+def test_the_frame_knows_where_its_search_ends() -> None:
+    front_end = FrontEnd(MicrophoneArray(LINE), RATE, FrontEndSettings.heard_at(RATE))
+    frames = front_end.process(np.random.default_rng(0).normal(0.0, 0.1, (2 * RATE, 4)))
+    ends = [frame.bearing_rad in (frame.azimuths_rad[0], frame.azimuths_rad[-1]) for frame in frames]
+    assert [frame.at_edge for frame in frames] == ends
