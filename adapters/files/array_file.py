@@ -219,6 +219,18 @@ def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array
     write_text(path, "\n".join([head, *rows, "</MicArray>", ""]))
 
 
+def array_csv(array: MicrophoneArray) -> str:
+    r"""Return an array as CSV in `base_link` axes, metres, which `read_array` reads.
+
+    Examples
+    --------
+    >>> array_csv(MicrophoneArray([[0.0, 0.2, 1.4], [0.0, -0.2, 1.4]]))
+    'x,y,z\n0.0,0.2,1.4\n0.0,-0.2,1.4\n'
+    """
+    rows = (",".join(map(repr, row)) for row in (array.positions_m + 0.0).tolist())
+    return "\n".join(["x,y,z", *rows, ""])
+
+
 def checked_array(
     path: Path, in_file: Sequence[Sequence[float]], axes: str, channels: tuple[int, ...] = ()
 ) -> MicrophoneArray:

@@ -8,9 +8,10 @@ exchanged or in another order, an array of another size.
 No sound tells whether an array is mirrored or turned: --heard-from DEG says where one sound came from, in
 degrees, left positive.
 
---fit writes an array file with positions near those of --array that explain the sound better, and
-states by how much, on quarters of a second that were not fitted. What the sound does not show is named and
-stays as given. Sound from many sides is needed: --also names further recordings of the same array.
+--fit offers positions that explain the sound better than those of --array, whatever their order and size, up
+to a turn and a mirror image: it prints them as CSV, and states by how much, on quarters of a second that were
+not fitted. --fit FILE writes them, as XML or CSV by its name. What the sound does not show is named and stays
+as given. Sound from many sides is needed, that of one is refused: --also names further recordings.
 
 Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
 and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
@@ -20,7 +21,8 @@ Examples
 --------
   worldstate array check some.wav --array mics.xml
   worldstate array check clapping.wav --array mics.xml --heard-from 40
-  worldstate array check some.wav --array mics.xml --fit fitted.xml --also other.wav third.wav
+  worldstate array check some.wav --array mics.csv --fit
+  worldstate array check some.wav --array mics.csv --fit fitted.csv --also other.wav third.wav
   worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json
 """
 
@@ -29,6 +31,8 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from worldstate import frontend
 from worldstate.cli.common import inputs, output, progress
@@ -45,6 +49,7 @@ if TYPE_CHECKING:
 _LEAST_WAVE = 0.1
 _UNITS = {"inches": 39.37, "millimetres": 1000.0}
 _USUAL_M = (0.03, 1.5)
+_PRINTED = Path()  # Positions are printed alone
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -56,18 +61,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--duration", type=float, metavar="S", help="its length by another clock, seconds")
     add("--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)")
     add("--heard-from", type=float, metavar="DEG", help="azimuth of the only source, left positive")
-    add("--fit", type=Path, metavar="XML", help="write positions that explain the sound better")
+    told = "offer positions that explain the sound better, and write them (.csv or .xml)"
+    add("--fit", type=Path, nargs="?", const=_PRINTED, metavar="FILE", help=told)
     add("--also", type=Path, nargs="+", default=[], metavar="SOUND", help="for --fit: further recordings")
     add("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.array_file import write_array_xml
+    from worldstate.adapters.files.array_file import array_csv, write_array_xml
+    from worldstate.adapters.files.file_io import write_text
     from worldstate.frontend.health.fitted_positions import fit_positions
     from worldstate.operations.recordings import channel_report
 
-    output.check_outputs(arguments, "fit", figures=("figure",))
+    output.check_outputs(arguments, *([] if arguments.fit == _PRINTED else ["fit"]), figures=("figure",))
+    if arguments.fit not in (None, _PRINTED) and arguments.fit.suffix not in (".csv", ".xml"):
+        raise InvalidArgumentError(f"--fit: expected a name that ends in .csv or .xml, got {arguments.fit}")
     if arguments.also and arguments.fit is None:
         raise InvalidArgumentError("--also: expected --fit, which alone hears further recordings")
     if arguments.heard_from is not None:
@@ -85,9 +94,17 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if arguments.fit is not None:
         checks = [check, *(_heard(path, array) for path in arguments.also)]
         fit = fit_positions(checks, health.hears_waves(array.n_microphones))
-        write_array_xml(arguments.fit, replace(array, positions_m=fit.positions_m.round(4)))
+        offered = replace(array, positions_m=fit.positions_m.round(4))
+        text = array_csv(offered)
+        if arguments.fit.suffix == ".csv":
+            write_text(arguments.fit, text)
+        elif arguments.fit != _PRINTED:
+            write_array_xml(arguments.fit, offered)
+        moved_mm = 1e3 * np.linalg.norm(fit.positions_m - array.positions_m, axis=1)
         better = f"explain {fit.explained:.3f} of the coherent sound, those given {fit.explained_before:.3f}"
-        lines += [f"fit: these positions {better}", *(f"not fitted: {one}" for one in fit.unjudged)]
+        far = f"channel {moved_mm.argmax() + 1} moves farthest, by {moved_mm.max():.0f} mm"
+        lines += [f"fit: these positions {better}; {far}", *text.splitlines()]
+        lines += [f"not fitted: {one}" for one in fit.unjudged]
         report = report | {"fit": encode(fit)}
     if arguments.figure is not None:
         channel_report.write_array_figure(array, health, arguments.figure)
