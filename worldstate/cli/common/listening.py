@@ -77,8 +77,9 @@ def checked_sensors(arguments: argparse.Namespace, sound: list[Path]) -> GivenSe
     wanted = {_EXTRAS[option] for option, value in asked.items() if value is not None and value is not False}
     looks = arguments.detector in MOVING and "camera_device" not in arguments
     check_extra(*wanted, *needed_extras(arguments), *(["cv2"] if looks else []))
-    made_for = array_of_model(given.model, given.car.array)
-    if made_for is not None and (given.model is not None or given.car.array is None):
+    # Without a model that is named, any array is listened to.
+    checks = given.model is not None or given.car.array is None
+    if checks and (made_for := array_of_model(given.model)) is not None:
         _check_array(given, made_for, sound)
     return given
 
@@ -101,9 +102,7 @@ def _check_array(given: "GivenSensors", made_for: "frontend.MicrophoneArray", so
         matched_order(made_for, array, WAY_OUT)
 
 
-def array_of_model(
-    path: Path | None = None, heard_by: "frontend.MicrophoneArray | None" = None
-) -> "frontend.MicrophoneArray | None":
+def array_of_model(path: Path | None = None) -> "frontend.MicrophoneArray | None":
     """Return the array that the first lines of a model file name, None where they are of another form.
 
     Examples
@@ -115,7 +114,7 @@ def array_of_model(
     from worldstate.adapters.files.file_io import UNREADABLE, unpacked_file
 
     try:
-        with unpacked_file(file_of_model(path, heard_by), "a model file") as file:
+        with unpacked_file(file_of_model(path), "a model file") as file:
             lines = iter(lambda: file.readline(_LONGEST_LINE).decode(), "")
             line = next(one for one in lines if one.startswith('"signature": {'))
         domain = json.loads(f"{{{line.rstrip().rstrip(',')}}}")["signature"]["domain"]
