@@ -46,4 +46,4 @@ def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path
     assert (np.abs(values) < (0.1 if follows else 1e-9)).mean() > (0.85 if follows else 1.0 - 1e-9)
     stated = [s["bearing"] for s in whole if s["bearing"]]
     assert len(stated) > len(whole) / 2
-    assert set(stated[0]) == {"azimuth_rad", "std_rad", "prominence"}
+    assert set(stated[0]) == {"azimuth_rad", "std_rad", "prominence", "at_edge"}
