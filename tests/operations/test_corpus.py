@@ -27,8 +27,9 @@ from worldstate.adapters.ros.message_types import AUDIO, header
 from worldstate.cli.main import main
 from worldstate.commissioning.alarm_curve import raised_at
 from worldstate.ground import InputFileError, InvalidArgumentError, nanoseconds
+from worldstate.ground.errors import OutOfDomainError
 from worldstate.operations import run_recording
-from worldstate.operations.calibration.cueing_calibration import hop_streams
+from worldstate.operations.calibration.cueing_calibration import hop_streams, read_input
 from worldstate.operations.corpus.approach_meter import LEFT_OUT, ApproachMeter
 from worldstate.operations.corpus.cascade import AFTER_S, BEFORE_S, SAMPLED, kept_seconds
 from worldstate.operations.corpus.corpus_inputs import CorpusInput, find_corpus
@@ -79,6 +80,22 @@ def contents(out: Path) -> dict[str, bytes]:
         for one in out.rglob("*")
         if one.is_file() and not one.name.startswith(".")
     }
+
+
+def test_an_array_without_a_model_is_heard_with_no_score_and_no_approach(street, tmp_path):
+    (tmp_path / "in").mkdir()
+    shutil.copy(street / "street.wav", tmp_path / "in" / "a.wav")
+    (found,) = hear(tmp_path / "in", tmp_path / "out", array=street / "mics.csv", hops=True)
+    assert found.status == "heard", found.failure
+    hops = rows(tmp_path / "out", "hops")
+    assert len(hops) == 11 and {(one.signature, one.risk, one.level_left) for one in hops} == {(None,) * 3}
+    assert all(json.loads(one.snapshot)["no_model"] for one in hops)
+    assert rows(tmp_path / "out", "approaches") == []
+    (recording,) = rows(tmp_path / "out", "recordings")
+    assert (recording.hops, recording.heard, recording.usable, recording.onsets) == (11, 0, 0, 0)
+    assert {one.unheard for one in rows(tmp_path / "out", "hours")} == {"no model"}
+    with pytest.raises(OutOfDomainError, match="another model"):
+        read_input(tmp_path / "out")
 
 
 @pytest.fixture(scope="module")

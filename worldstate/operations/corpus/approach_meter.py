@@ -138,7 +138,9 @@ def sensors_of(state: WorldState) -> str:
 
 
 def _unheard(state: WorldState) -> str | None:
-    """Return why no source could hear, None if one could, or if none states it."""
+    """Return why no advisory could be raised by sound, None if one could, or if no source states it."""
+    if state.no_model is not None:
+        return "no model"
     if not state.heard or any(one.share >= LEAST_HEARD for one in state.heard):
         return None
     return state.heard[0].reason or "unheard"

@@ -253,7 +253,7 @@ def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
 def _hops(source: Source, meter: ApproachMeter) -> Iterator[HeardHop]:
     """Yield the hops of a recording while the meter counts them."""
     alarm, denied = getattr(source.sequence, "alarm", None), (source.street or StreetModel()).death
-    signature = signature_checksum(source.model)
+    signature = None if source.model is None else signature_checksum(source.model)
     for step in listen_steps(source):
         meter.update(state := step.state)
         levels = [alarm and alarm_level(state, side, denied, alarm) for side in SIDES]

@@ -81,7 +81,7 @@ class HeardHop:
     site: str
     risk: float | None
     snapshot: str  # JSON
-    signature: int  # Checksum of the window model whose scores follow
+    signature: int | None  # Checksum of the window model whose scores follow; None without a model
     level_left: float | None  # Log-odds: the alarm is raised by thresholds up to it; None by no threshold
     level_right: float | None
     # As of hop streams
