@@ -8,7 +8,8 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.source import Source
-from worldstate.frontend.spectra.stft import StreamingStft, band_bins, power
+from worldstate.frontend.array.steering import cross_spectra
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins
 from worldstate.ground import TINY
 from worldstate.ground.typing import BoolArray, FloatArray
 
@@ -42,8 +43,8 @@ def _level_and_coherence(frames: np.ndarray) -> FloatArray:
     r"""Return the level in dB and the mean over bins and pairs of :math:`|S_{mn}| / \sqrt{S_{mm} S_{nn}}`."""
     if not len(frames):  # The last block may hold less than a frame
         return np.zeros(2)
-    cross = np.abs(np.einsum("tkm,tkn->kmn", frames, frames.conj()))
-    powers = power(frames).sum(axis=0)
+    cross = np.abs(cross_spectra(frames.transpose(1, 0, 2)))
+    powers = np.diagonal(cross, axis1=1, axis2=2)
     first, second = np.triu_indices(frames.shape[2], 1)
     coherence = cross[:, first, second] / np.sqrt(powers[:, first] * powers[:, second] + TINY**2)
-    return np.array([10.0 * np.log10(power(frames).mean() + TINY), coherence.mean()])
+    return np.array([10.0 * np.log10(powers.mean() / len(frames) + TINY), coherence.mean()])
