@@ -30,7 +30,8 @@ _LOG = logging.getLogger(__name__)
 _SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
 _HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
-HOPS_SUFFIX, _BATCH = ".parquet", 4096
+PARQUET = ".parquet"  # Of the tables of `hear`
+BATCH_ROWS = 4096  # Of one of them; a row of hops has some 5 kB: 20 MB at a time
 _PACKED = b"\x1f\x8b"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
@@ -73,7 +74,7 @@ def upgraded_messages(path: Path) -> Iterator[LogMessage]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    if path.suffix == HOPS_SUFFIX:
+    if path.suffix == PARQUET:
         return _snapshots(path)
     if is_own_mcap(path):
         return (text for _, _, text in read_messages(path, SNAPSHOT_TOPIC))
@@ -85,7 +86,7 @@ def _snapshots(path: Path) -> Iterator[str]:
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     try:
         with parquet.ParquetFile(path) as file:
-            for batch in file.iter_batches(_BATCH, columns=["snapshot"]):
+            for batch in file.iter_batches(BATCH_ROWS, columns=["snapshot"]):
                 yield from map(str, batch.column("snapshot").to_pylist())
     except (OSError, KeyError, arrow.ArrowException) as error:
         raise InputFileError(path, f"expected a table of hops with snapshots ({error})") from error

@@ -22,7 +22,7 @@ from worldstate.adapters.files.odometry_file import read_odometry
 from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.ros.bag_input import is_bag, needed_array, read_bag
 from worldstate.adapters.source import CorpusParts, Source, open_source
-from worldstate.adapters.state_log import is_own_mcap, read_log
+from worldstate.adapters.state_log import PARQUET, is_own_mcap, read_log
 from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import (
@@ -39,7 +39,7 @@ from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, ho
 from .approach_meter import ApproachMeter, alarm_level
 from .cascade import SAMPLED, kept_seconds
 from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
-from .corpus_tables import SUFFIX, TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_rows
+from .corpus_tables import TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_rows
 
 # Of the tables: a major version reads no other one's.
 _SCHEMA = {"name": "worldstate.Corpus", "version": "1.0.0"}
@@ -106,7 +106,7 @@ class HearPlan:
 
     def file(self, table: str, shard: str) -> Path:
         """Return the file of a shard in a table."""
-        return self.out / table / f"{shard}{SUFFIX}"
+        return self.out / table / f"{shard}{PARQUET}"
 
 
 def _plain(value: Any) -> Any:
@@ -192,7 +192,7 @@ def hear(
     inputs = share_of(find_corpus(Path(corpus).absolute()), *shard)
     plan = HearPlan.begun(Path(out).absolute(), hops, cascade, parts)
     former = defaultdict[str, list[Path]](list)
-    for path in plan.out.glob(f"*/*-*{SUFFIX}"):
+    for path in plan.out.glob(f"*/*-*{PARQUET}"):
         former[path.name.partition("-")[0]].append(path)
     work, shards = partial(hear_recording, plan), []
     working = in_processes(work, inputs, jobs) if executor is None else in_executor(executor, work, inputs)

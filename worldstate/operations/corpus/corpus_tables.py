@@ -12,13 +12,12 @@ from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from worldstate.adapters.files.file_io import atomic_path
+from worldstate.adapters.state_log import BATCH_ROWS, PARQUET
 from worldstate.ground import InputFileError
 from worldstate.ground.extras import optional
 
 Row = TypeVar("Row")
-SUFFIX = ".parquet"
 SINCE_1970_S = 1e9  # A stamp above it is no time since a first sample
-_BATCH_ROWS = 4096  # A row of hops has some 5 kB: 20 MB at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +108,7 @@ def write_rows(path: Path, kind: type, rows: Iterable[Any]) -> None:
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     left, schema = map(asdict, rows), _schema(kind)
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, compression="zstd") as file:
-        while batch := list(itertools.islice(left, _BATCH_ROWS)):
+        while batch := list(itertools.islice(left, BATCH_ROWS)):
             file.write_table(arrow.Table.from_pylist(batch, schema=schema))
 
 
@@ -123,7 +122,7 @@ def corpus_rows(out: Path, kind: type[Row]) -> Iterator[Row]:
     """
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     table = next(name for name, one in TABLES.items() if one is kind)
-    paths = sorted((out / "recordings").glob(f"[!.]*{SUFFIX}"))
+    paths = sorted((out / "recordings").glob(f"[!.]*{PARQUET}"))
     if not paths:
         raise InputFileError(out, "expected the folder that `worldstate hear --out` wrote")
     # What could not be heard has no other table.
@@ -132,7 +131,7 @@ def corpus_rows(out: Path, kind: type[Row]) -> Iterator[Row]:
             with parquet.ParquetFile(path) as file:
                 if not file.schema_arrow.equals(_schema(kind)):
                     raise InputFileError(path, f"expected the columns {', '.join(_schema(kind).names)}")
-                for batch in file.iter_batches(_BATCH_ROWS):
+                for batch in file.iter_batches(BATCH_ROWS):
                     yield from (kind(**row) for row in batch.to_pylist())
         except (OSError, arrow.ArrowException) as error:
             raise InputFileError(path, f"expected a Parquet file of a corpus ({error})") from error
