@@ -20,12 +20,14 @@ ROOT = Path(__file__).resolve().parents[1]
 LIMITS: dict[str, float] = {}
 TURNS = {
     "where for if": r"\bwhere (?:it|they|there|none|one|no|an?|the|that|not|nothing|this|its|both)\b",
-    "what for a noun": r"(?:^|[\s(*|])what (?:is|was|has|it|they|an?|the|of|one|each|comes?|came|stands|makes|holds)\b",
+    "what for a noun": r"(?:^|[\s(*|])what "
+    r"(?:is|was|has|it|they|an?|the|of|one|each|comes?|came|stands|makes|holds)\b",
     "a thing that speaks": r"\b(?:says|said|tells|told|names|asks|asked|knows|speaks|answers)\b",
     "a thing that hears": r"\b(?:hears|heard|ears?|listens)\b",
     "stands, lies, goes": r"\b(?:stands?|stood|lies?|goes on|go on|went on)\b",
     "counts, weighs, moves": r"\b(?:counts|counted|weighs|moves)\b",
-    "an hour for per hour": r"\b(?:an (?:hour|entity)|a (?:hop|side|second|minute|snapshot|microphone|line|vehicle)) ?"
+    "an hour for per hour": r"\b(?:an (?:hour|entity)|"
+    r"a (?:hop|side|second|minute|snapshot|microphone|line|vehicle)) ?"
     r"(?=[,.;:)]|\b(?:at|for|in|of|is|are|and)\b)",
     "no leading zero": r"(?<![\w.])\.\d",
 }
@@ -51,7 +53,7 @@ def prose(path: Path) -> str:
 
 
 def kind(path: Path) -> str:
-    """Return the kind of prose that a file holds: a folder of the documentation, a page, or a room of the code."""
+    """Return the kind of prose that a file holds: a folder of pages, a page, or a room of the code."""
     top, *rest = path.parts
     if path.suffix == ".md":
         return f"{top}/{rest[0]}" if len(rest) > 1 else str(path)
@@ -69,7 +71,7 @@ def files() -> Iterator[Path]:
 
 
 def main(below: list[str]) -> int:
-    """Print the places below files or folders or, without any, the table; return 1 if a kind is above its limit."""
+    """Print the places below files or folders, then the table; return 1 if a kind is above its limit."""
     words, turns = Counter[str](), defaultdict[str, Counter[str]](Counter)
     for path in files():
         if below and not any(path.is_relative_to(folder) for folder in below):
