@@ -1,1 +1,1 @@
-"""Places and motion: junctions, occluders, vehicles, presets."""
+"""Geometry and motion: junctions, occluders, vehicles, presets."""

@@ -1,4 +1,4 @@
-"""From settings to motion: when and where every vehicle is, and when the camera on the ego sees it."""
+"""Motion from settings: the position of every vehicle, and when the camera of the ego sees it."""
 
 from functools import partial
 
@@ -15,7 +15,7 @@ from .vehicle import Trajectory, along, drive, follow, turn_in
 
 
 def image_edges_rad(camera: PinholeCamera) -> tuple[float, float]:
-    """Directions (right, left) of the edges of the image, seen from the camera.
+    """Return the azimuths (right, left) of the edges of the image, seen from the camera.
 
     Examples
     --------
@@ -29,7 +29,7 @@ def image_edges_rad(camera: PinholeCamera) -> tuple[float, float]:
 def camera_sees(
     site: Site, camera: PinholeCamera, x_m: FloatArray, y_m: FloatArray, ego_x_m: float | FloatArray = 0.0
 ) -> BoolArray:
-    """Tell when the camera sees a point that moves, shape (T,).
+    """Return when the camera sees a moving point, shape (T,).
 
     Examples
     --------
@@ -43,17 +43,17 @@ def camera_sees(
     direction = np.arctan2(y_m - eye[1], x_m - eye[0])
     pictured = (direction > right_edge) & (direction < left_edge)
     right, left = site.sights_m(x_m, eye)
-    # In the open, and this side of the corners, none stands before a point.
+    # In the open, and on this side of the corners, no corner hides the point.
     past_corners = site.is_open | (x_m <= site.corner_ahead_m) | ((y_m > right) & (y_m < left))
     return np.asarray(pictured & past_corners & ~hidden_by(site.occluders, x_m, y_m, eye))
 
 
 SEARCH_STEP_M = 0.1
-TURN_WITHIN_S = 5.0  # braking for a turn begins and line of sight is reached within this long
+TURN_WITHIN_S = 5.0  # Longest time between the start of braking for a turn and line of sight
 
 
 def trajectories(settings: SimulationSettings, time_s: FloatArray) -> list[Trajectory]:
-    """Motion of every vehicle at evenly spaced times, the first that of the approach; empty without any."""
+    """Return the motion of every vehicle at evenly spaced times; the vehicle of the approach comes first."""
     return [_trajectory(settings, vehicle, time_s) for vehicle in settings.traffic]
 
 
@@ -74,7 +74,7 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
         return follow(passing(time_s, entry_s=vehicle.entry_s), entry_y, way)
     if vehicle.manoeuvre == "turn":
         turn = turn_in(lane, entry_y)
-        # Slowing down for the turn costs time before line of sight: set off that much earlier.
+        # Braking for the turn takes time before line of sight, so the vehicle starts that much earlier.
         near = vehicle.entry_s + np.arange(-TURN_WITHIN_S, TURN_WITHIN_S, time_s[1] - time_s[0])
         slowed = follow(passing(near, entry_s=vehicle.entry_s), entry_y, *turn)
         late = float(np.interp(0.0, slowed.driven_m, near)) - vehicle.entry_s
@@ -83,7 +83,7 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
 
 
 def entry_y_m(site: Site, lane_m: float, approach: str, ego_x_m: float = 0.0) -> float:
-    """Return where in its lane the camera first sees a vehicle that comes from the left or the right."""
+    """Return the y in its lane at which the camera first sees a vehicle from the left or the right."""
     eye_x, eye_y, _ = PinholeCamera.ovad().position_m
     right, left = site.sight_m(lane_m, (ego_x_m + eye_x, eye_y))
     ahead = lane_m - ego_x_m - eye_x
@@ -92,7 +92,7 @@ def entry_y_m(site: Site, lane_m: float, approach: str, ego_x_m: float = 0.0) ->
 
 
 def comes_into_view_s(settings: SimulationSettings, vehicle: VehicleSettings) -> float | None:
-    """Return when the camera first sees a vehicle: 0 where it always has, None where it never does."""
+    """Return when the camera first sees a vehicle: 0 if it is in view from the start, None if never."""
     if not vehicle.route_m:
         return vehicle.entry_s
     _, found = _first_sight(settings.site, vehicle)
@@ -100,9 +100,9 @@ def comes_into_view_s(settings: SimulationSettings, vehicle: VehicleSettings) ->
 
 
 def _first_sight(site: Site, vehicle: VehicleSettings) -> tuple[float, str]:
-    """Return how far along a route the vehicle comes into view, and whether it does.
+    """Return the distance along a route at which the vehicle comes into view, and whether it does.
 
-    Where it is in view at first, or never, that is where it is nearest to the ego.
+    For a vehicle that is in view from the start, or never, it is the distance nearest to the ego.
     """
     route = along(vehicle.route_m)
     length = float(np.hypot(*np.diff(np.array(vehicle.route_m), axis=0).T).sum())
@@ -115,14 +115,14 @@ def _first_sight(site: Site, vehicle: VehicleSettings) -> tuple[float, str]:
 
 
 def _longest_begins(seen: BoolArray) -> int:
-    """Return where the longest run of True begins.
+    """Return the start of the longest run of True.
 
     Examples
     --------
     >>> _longest_begins(np.array([False, True, False, True, True]))
     3
     """
-    # A glimpse before a body hides the vehicle again is not yet the sight that a driver acts on.
+    # A short glimpse before a body hides the vehicle again is too early for a driver to react to.
     edges = np.flatnonzero(np.diff(np.r_[0, seen.astype(int), 0]))
     begins, ends = edges[::2], edges[1::2]
     return int(begins[(ends - begins).argmax()])

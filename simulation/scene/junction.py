@@ -1,7 +1,7 @@
-"""The blind junction: two walled streets and the site's own measures.
+"""The blind junction: two walled streets, with the dimensions of each site.
 
-The ego stands at the origin in its own street, which runs along +x between two side walls and opens into the
-crossing street (along y) between two corners. Type A has a wall across the crossing street, type B none.
+The ego is at the origin of its own street, which runs along +x between two side walls and ends between two
+corners at the crossing street (along y). Type A has a wall across the crossing street, type B has none.
 """
 
 import hashlib
@@ -16,21 +16,21 @@ from worldstate.ground.checks import check_ranges, in_range, one_of
 from .occluders import OccludingBody, box
 
 SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, in this order
-MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
+MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # The same places with an ego that drives up to the corner
 MAX_OCCLUDERS = 4
-# Named or drawn: where the ego moves at the place S.., T.. or M..; DA1, DTA101.
+# Fixed or drawn sites at which the ego moves, at the place S.., T.. or M..: DA1, DTA101
 _MOVING = re.compile(r"D([TM]?)([AB]\d+)")
-# By the first letter of a drawn place: TA1, MB917. All others are heard along the paths of their plan.
+# By the first letter of a drawn place: TA1, MB917. All other sites use the paths of their plan.
 _RENDERERS = {"T": "rays", "M": "mirrors"}
 _DRAWN = re.compile(r"[TM][AB]\d{1,6}")
-# The fits want smooth side walls, and a rough one opposite: shop fronts, doors, parked bicycles.
+# The fits require smooth side walls and a rough facade opposite (shop fronts, doors, parked bicycles).
 ROUGHNESS_A, ROUGHNESS_B = (1.0, 4.0), (0.3, 1.0)
-WALL_END_M = 99.0  # openings before a wall begins and after it ends go on to here
+WALL_END_M = 99.0  # Openings before the start and after the end of a wall extend to here
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Plan of one junction, metres in `base_link`.
+    """Plan of one junction, in metres in `base_link`.
 
     Parameters
     ----------
@@ -39,37 +39,37 @@ class Site:
     corner_left_m, corner_right_m : float
         Distance of the building corners to the left and right of the ego's axis, >= 1.
     corner_ahead_m : float
-        How far ahead the corners stand.
+        Distance of the corners ahead.
     opposite_wall_m : float or None
-        Distance ahead of the wall across the crossing street; None where there is none (type B).
+        Distance ahead of the wall across the crossing street; None if there is none (type B).
     side_wall_left_m, side_wall_right_m : float
-        Distance of the side walls of the ego's own street; nearer than the corners where these are bevelled.
+        Distance of the side walls of the ego's street; less than that of the corners if these are bevelled.
     street_width_m : float
-        Width of the crossing street's roadway; lanes are at a quarter and three quarters.
+        Width of the crossing roadway; the lanes are at a quarter and three quarters of it.
     verge_m : float
-        Pavement, verge or square between the corners and that roadway.
+        Pavement, verge or square between the corners and the crossing roadway.
     side_shares : tuple of (float, float)
-        Of `side_reflection`, what the left and the right wall have: a hedge or a fence less than brick, 0..1.
+        Factors 0..1 on `side_reflection` for the left and the right wall: a hedge or a fence reflects less.
     roughness : tuple of (float, float)
-        Scattering of the side walls and of the crossing street's facades against the preset's, 0..6.
+        Scattering of the side walls and of the crossing street's facades relative to the preset's, 0..6.
     surface_db : float
-        How much louder vehicles are on its roadway than on the preset's, -12 to 12: smooth asphalt, setts.
+        Level of vehicles on its roadway relative to the preset's, -12 to 12: smooth asphalt, setts.
     left_openings_m, right_openings_m : tuple of (float, float)
-        Stretches along x in which the side wall is missing: driveways, set-back fronts, and the places
-        before it begins and after it ends.
+        Stretches along x without a side wall: driveways, set-back fronts, and the regions before its start
+        and after its end.
     side_reflection, facade_reflection : float
         Pressure reflection factors of the side walls and of the crossing street's facades, 0..1.
     side_order, facade_order : int
-        Highest number of reflections followed in the ego's street and in the crossing street.
+        Maximum reflection order in the ego's street and in the crossing street.
     occluders : tuple of OccludingBody
-        Bodies in the open that hide a vehicle, at most 4. Where there are any the site is in the open.
+        Bodies in the open that hide a vehicle, at most 4. A site with occluders is in the open.
     in_the_open : bool
-        Whether there are neither corners nor walls to be heard; the corners only limit what the camera sees.
+        Whether corners and walls have no acoustic effect; the corners then only limit the camera's view.
 
     Raises
     ------
     InvalidArgumentError
-        If a measure is out of range or the vehicles' street has no room.
+        If a dimension is out of range or the crossing street has no room for vehicles.
 
     Examples
     --------
@@ -117,27 +117,27 @@ class Site:
 
     @property
     def is_open(self) -> bool:
-        """Whether sound meets only the road and bodies."""
+        """Whether sound interacts with the road and occluding bodies only."""
         return self.in_the_open or bool(self.occluders)
 
     @property
     def renderer(self) -> str:
-        """What carries sound: "paths", "rays" through drawn houses (TA1), "mirrors": smooth walls (MA1)."""
+        """Renderer: "paths", "rays" through drawn houses (TA1), or "mirrors" with smooth walls (MA1)."""
         return renderer_named(self.name)
 
     @property
     def far_kerb_m(self) -> float:
-        """Distance ahead of the crossing roadway's far edge."""
+        """Distance ahead of the far edge of the crossing roadway."""
         return self.corner_ahead_m + self.verge_m + self.street_width_m
 
     @property
     def lanes_m(self) -> tuple[float, float]:
-        """Distance ahead of the near lane (traffic from the left keeps right) and of the far lane."""
+        """Distances ahead of the near lane (traffic from the left keeps right) and of the far lane."""
         quarter = self.street_width_m / 4.0
         return self.far_kerb_m - 3.0 * quarter, self.far_kerb_m - quarter
 
     def sight_m(self, ahead_m: float, eye_m: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
-        """Return the lateral limits (right, left) of what an eye sees between the corners, at a distance.
+        """Return the lateral limits (right, left) of the view between the corners at a distance ahead.
 
         Examples
         --------
@@ -150,14 +150,14 @@ class Site:
     def sights_m(
         self, ahead_m: FloatArray, eye_m: tuple[float | FloatArray, float]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return those limits for distances, and an eye, that change: shape (T,) each."""
+        """Return those limits for distances and viewpoints that change, shape (T,) each."""
         x, y = eye_m
         reach = (ahead_m - x) / (self.corner_ahead_m - x)
         return y + (-self.corner_right_m - y) * reach, y + (self.corner_left_m - y) * reach
 
 
 def renderer_named(name: str) -> str:
-    """Return what carries the sound of a junction of this name.
+    """Return the renderer of the junction of this name.
 
     Examples
     --------
@@ -169,26 +169,26 @@ def renderer_named(name: str) -> str:
 
 
 def site(name: str) -> Site:
-    """Return a site: fitted plans for SA1, SB1 and SB2, drawn ones of their family for SA2 and SB3.
+    """Return a site: fitted plans for SA1, SB1 and SB2, and drawn plans of the same family for SA2 and SB3.
 
-    What the plan leaves open is drawn from generators seeded with the site's name, so that a site keeps its
-    face from one recording to the next. DA1 is the place of SA1, and so on: there the ego moves.
+    Quantities that the plan leaves open are drawn from generators seeded with the site's name, so that they
+    are the same in each recording. DA1 is the place of SA1 with a moving ego, and so on.
 
     Parameters
     ----------
     name : str
         One of `SITES` or `MOVING_SITES`, or TA1, TB1, ... and MA1, ... of the other renderers; DTA1 and DMA1
-        are these places with an ego that moves.
+        are these places with a moving ego.
 
     Returns
     -------
     Site
-        Walls, corners and occluders, metres.
+        Walls, corners and occluders, in metres.
 
     Raises
     ------
     InvalidArgumentError
-        For an unknown name.
+        If the name is unknown.
 
     Examples
     --------
@@ -202,13 +202,13 @@ def site(name: str) -> Site:
     return PLANS[name] if name in PLANS else drawn_site(name)
 
 
-# Fitted: a search for the least difference, and the least odd part of it, between the expected pattern
-# (energies of all paths, the array's beams, an ambience that gives the site's empty windows) and the mean
-# released one, hidden and in front, by side and half, averaged over the speeds that are drawn. It started
-# from the published plans of a type A and a type B junction (corners 2.8 m aside, 4.5 m ahead), moved them by
-# up to .7 m and leaves .07, .13 and .09 nepers rms; the plans and drivers before, with the vehicle's level
-# free, left .13, .23 and .13. A wall nearer than its corner ends where the line of sight to the corner leaves
-# it: one that went on would be seen, and hide the street.
+# Fitted. A search minimised the difference between the expected pattern (energies of all paths, beams of the
+# array, an ambience that gives the site's empty windows) and the mean released pattern, hidden and in front,
+# by side and half, averaged over the drawn speeds; the antisymmetric part had its own weight. The search
+# started from the published plans of a type A and a type B junction (corners 2.8 m aside, 4.5 m ahead),
+# changed them by up to 0.7 m and leaves 0.07, 0.13 and 0.09 nepers rms. The former plans and drivers, with a
+# free vehicle level, left 0.13, 0.23 and 0.13. A wall that is nearer than its corner ends at the line of
+# sight to the corner; a longer wall would be visible and hide the street.
 PLANS = {
     "SA1": Site(
         "SA1",
@@ -248,7 +248,7 @@ PLANS = {
 
 
 def ego_moves(name: str) -> bool:
-    """Tell whether the ego moves at a site of this name.
+    """Return whether the ego moves at the site of this name.
 
     Examples
     --------
@@ -259,7 +259,7 @@ def ego_moves(name: str) -> bool:
 
 
 def standing_name(name: str) -> str:
-    """Return the name of the same place for an ego that stands there.
+    """Return the name of the same place for a standing ego.
 
     Examples
     --------
@@ -271,7 +271,7 @@ def standing_name(name: str) -> str:
 
 
 def drawn_site(name: str) -> Site:
-    """Draw a site from the family of those in `PLANS`, by a generator seeded with its name.
+    """Draw a site from the family of `PLANS`, by a generator seeded with its name.
 
     Examples
     --------
@@ -291,7 +291,7 @@ def drawn_site(name: str) -> Site:
     begins = rng.uniform(-1.5, 1.2, 2)
     verge = rng.uniform(*((0.8, 1.4) if with_wall else (0.9, 1.9)))
     street = 3.0 if with_wall else rng.uniform(3.0, 5.1)
-    # A wall ends where the line of sight to the corner leaves it.
+    # A wall ends at the line of sight to the corner.
     ends = ahead * walls / corners
     openings = [((-WALL_END_M, begin), (end, WALL_END_M)) for begin, end in zip(begins, ends, strict=True)]
     return Site(
@@ -310,14 +310,16 @@ def drawn_site(name: str) -> Site:
     )
 
 
-# Of the image, whose edge is at 34 degrees: tangent, and how far its camera stands behind the array.
+# Tangent of a corner's azimuth within the image (edge at 34 degrees), and distance of the camera behind the
+# array
 WIDEST_CORNER, CAMERA_BEHIND_M = 0.65, 0.57
 
 
 def _wider_site(name: str, rng: np.random.Generator) -> Site:
-    """Draw a site of the other renderers: wider streets, and more of them, than the fitted family has."""
+    """Draw a site of the other renderers: its streets are wider and more varied than the fitted family."""
     corners, ahead = rng.uniform(2.2, 8.0, 2), rng.uniform(3.0, 10.0)
-    # A vehicle passes a corner outside the image before the camera sees it: T0 would be no line of sight.
+    # At a corner outside the image a vehicle passes before the camera sees it, and T0 would not be line of
+    # sight.
     left, right = np.minimum(corners, WIDEST_CORNER * (ahead + CAMERA_BEHIND_M)).tolist()
     verge, street = rng.uniform(0.3, 3.5), rng.uniform(4.0, 9.0)
     opposite = ahead + verge + street + rng.uniform(0.3, 4.0) if name[1] == "A" else None
@@ -327,7 +329,7 @@ def _wider_site(name: str, rng: np.random.Generator) -> Site:
 
 
 def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:
-    """Return a generator that depends on the site alone: on the place, not on what happens there.
+    """Return a generator that depends on the place alone, not on the traffic there.
 
     Examples
     --------
@@ -345,18 +347,19 @@ OPEN_M = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Where a vehicle goes, and what that makes of a recording."""
+    """Route of a vehicle, and the class of the recording that results."""
 
-    approach: str  # Side on which it comes into view; "none" where it is in view at first, or never
-    route_m: Points = ()  # Points of its way; none for the lane of the crossing street
+    # Side on which the vehicle comes into view; "none" if it is in view from the start, or never
+    approach: str
+    route_m: Points = ()  # Points of the route; none for the lane of the crossing street
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A site besides the junctions, and the ways of vehicles that drive there.
+    """A site that is not a junction, and the routes of its vehicles.
 
-    Most are in the open: no walls, only bodies that stand in the line of sight. A vehicle is a hazard where
-    the camera does not see it at first, for a body in between or because it comes from beside or behind.
+    Most places are in the open: no walls, only bodies in the line of sight. A vehicle is a hazard if the
+    camera does not see it at first, because a body hides it or because it comes from beside or behind.
     """
 
     site: Site
@@ -364,66 +367,66 @@ class Place:
 
     @property
     def approaches(self) -> tuple[str, ...]:
-        """Sides from which a vehicle comes into view, left first."""
+        """Sides on which a vehicle comes into view, left first."""
         return tuple(side for side in ("left", "right") if any(way.approach == side for way in self.ways))
 
     def drawn_way(self, approach: str, rng: np.random.Generator) -> Way | None:
-        """Draw a way of that approach; of "none" in half of the draws only. None where there is none."""
+        """Draw a route of this approach, or None; "none" has a route in half of the draws."""
         found = [way for way in self.ways if way.approach == approach]
         if not found or (approach == "none" and rng.random() < 0.5):
             return None
         return found[int(rng.integers(len(found)))]
 
 
-# Nothing ever sees these: one turns off behind the ego, the other crosses there.
+# Never in view: one vehicle turns off behind the ego, the other crosses there.
 TURNS_OFF_BEHIND = Way("none", ((-80.0, 0.0), (-20.0, 0.0), (-16.0, -4.0), (-16.0, -80.0)))
 CROSSES_BEHIND = Way("none", ((-12.0, 60.0), (-12.0, -60.0)))
-# These are in view at first, and then beside.
+# In view at first, and then beside the ego
 ONCOMING = Way("none", ((90.0, 3.2), (-60.0, 3.2)))
 TURNS_OFF_AHEAD = Way("none", ((90.0, 3.2), (16.0, 3.2), (11.5, -3.0), (11.5, -60.0)))
 
 
 def lead_vehicle() -> Place:
-    """Return a van six metres ahead that hides what comes towards us in the next lane."""
+    """Return a van six metres ahead that hides oncoming vehicles in the next lane."""
     hidden = Way("left", ((60.0, 2.2), (30.0, 2.6), (10.0, 3.2), (-10.0, 3.2)))
     return _open("SL1", (hidden, TURNS_OFF_BEHIND), box(6.0, 12.0, -1.1, 1.1))
 
 
 def bridge_pier() -> Place:
-    """Return two piers beside a ramp; a vehicle on a road that the ramp joins stays behind one for long."""
+    """Return two piers beside a ramp; one of them hides a vehicle on the joining road for a long time."""
     left = ((60.0, 21.0), (24.0, 8.0), (12.0, 5.6), (-10.0, 5.6))
     piers = box(7.0, 9.0, 1.0, 3.0), box(7.0, 9.0, -3.0, -1.0)
     return _open("SP1", (Way("left", left), Way("right", _mirrored(left)), CROSSES_BEHIND), *piers)
 
 
 def merge() -> Place:
-    """Return a wall between our lane and the one that we merge into, and another beyond that lane."""
+    """Return a wall between the ego's lane and the lane it merges into, and another beyond that lane."""
     near, far = OccludingBody(((-60.0, 2.6), (7.0, 2.6))), OccludingBody(((-60.0, 9.5), (60.0, 9.5)))
     return _open("SM1", (Way("left", ((-60.0, 5.6), (60.0, 5.6))),), near, far)
 
 
 def open_road() -> Place:
-    """Return a road where nothing stands: others overtake, come towards us, or stay behind."""
+    """Return a road without bodies: other vehicles overtake, are oncoming, or stay behind."""
     left = ((-80.0, 3.2), (80.0, 3.2))
     overtaking = Way("left", left), Way("right", _mirrored(left))
     return _open("SO1", (*overtaking, ONCOMING, TURNS_OFF_BEHIND, CROSSES_BEHIND))
 
 
 def wide_crossing() -> Place:
-    """Return a crossing of wide streets: what comes is heard straight before the camera sees it."""
+    """Return a crossing of wide streets: the direct sound of a vehicle arrives before the camera sees it."""
     site = Site("SW1", 14.0, 17.0, 8.0, None, 14.5, 17.5, 14.0, side_reflection=0.8, side_order=1)
     return Place(site, (Way("left"), Way("right"), ONCOMING, TURNS_OFF_BEHIND))
 
 
 def one_corner() -> Place:
-    """Return a crossing with a house on the left alone: from the right a vehicle is in plain direction."""
+    """Return a crossing with a house on the left alone: the right side has direct sound and a clear view."""
     house = OccludingBody(((-60.0, 2.8), (4.5, 2.8), (4.5, 60.0), (-60.0, 60.0)))
     ways = Way("left", ((6.5, 60.0), (6.5, -60.0))), Way("right", ((9.5, -60.0), (9.5, 60.0)))
     return _open("SC1", (*ways, TURNS_OFF_AHEAD, TURNS_OFF_BEHIND), house)
 
 
 def parked_van() -> Place:
-    """Return a crossing in the open, before which a van parked on our left hides vehicles from there."""
+    """Return a crossing in the open, with a parked van on the left that hides vehicles behind it."""
     ways = Way("left", ((8.5, 60.0), (8.5, -60.0))), Way("right", ((11.5, -60.0), (11.5, 60.0)))
     return _open("SV1", (*ways, TURNS_OFF_AHEAD, CROSSES_BEHIND), box(1.5, 6.5, 2.0, 4.0))
 
@@ -443,12 +446,12 @@ def place(name: str) -> Place:
     Returns
     -------
     Place
-        Its site, and the ways of vehicles there.
+        Its site, and the routes of vehicles there.
 
     Raises
     ------
     InvalidArgumentError
-        For an unknown name.
+        If the name is unknown.
 
     Examples
     --------
@@ -463,7 +466,7 @@ def place(name: str) -> Place:
 
 
 def place_of(site_name: str) -> Place | None:
-    """Return the place whose site has this name; None if it is none of them.
+    """Return the place whose site has this name, or None.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Kinds of road users, as parameters: how long, how high, how loud at which speed.
+"""Kinds of road users as parameters: length, height, and sound power at each speed.
 
-Light, medium and heavy vehicles and motorcycles are categories 1 to 4 of CNOSSOS-EU. It has no electric car,
-bicycle or tram: those are stated assumptions, set against published pass-by levels (see each).
+Light, medium and heavy vehicles and motorcycles are categories 1 to 4 of CNOSSOS-EU. Electric cars, bicycles
+and trams are not in it: they are stated assumptions, compared with published pass-by levels (see each).
 """
 
 from dataclasses import dataclass, replace
@@ -26,9 +26,9 @@ class VehicleKind:
     Directive (EU) 2015/996 as amended by (EU) 2021/1226, table F-1.
     """
 
-    name: str  # Our name, and the detector's class
+    name: str  # Our name, and the class of the detector
     label: str
-    length_m: float  # Of its body
+    length_m: float  # Length of the body
     width_m: float
     height_m: float
     axles_m: tuple[float, ...]  # Axles behind the front; the engine is at the first
@@ -37,11 +37,12 @@ class VehicleKind:
     rolling_b_db: Octaves
     propulsion_a_db: Octaves  # That of the engine, L = A + B (v - 70) / 70
     propulsion_b_db: Octaves
-    propulsion_until_kmh: float = np.inf  # Above, it falls silent within 5 km/h: the warning of electric cars
+    # Above this speed it fades out within 5 km/h: the warning sound of electric cars
+    propulsion_until_kmh: float = np.inf
     engine_m: float = 0.3  # Height of the engine as a source; tyres are at `TYRE_M`
-    ridden_mps: tuple[float, float] | None = None  # Its speeds, where they are not those of the street
+    ridden_mps: tuple[float, float] | None = None  # Range of speeds, if it differs from that of the street
     harmonic_share: float = 0.5  # Share of the engine's power in multiples of its firing frequency
-    turns_hz: tuple[float, float] | None = None  # Of a crank whose single pulses are heard, as it is ridden
+    turns_hz: tuple[float, float] | None = None  # Crank speed of an engine whose single pulses are audible
 
 
 TYRE_M = 0.05
@@ -84,8 +85,9 @@ HEAVY = VehicleKind(
     (0.0, 3.0, 4.6, 5.0, 5.0, 5.0, 5.0, 5.0),
     engine_m=0.75,
 )
-# Tyres of a light vehicle; in place of the engine the warning sound that UN Regulation No. 138 asks for up to
-# 20 km/h, at least 50 dB(A) at 2 m at 10 km/h and 56 at 20: some 70 dB of sound power, from 250 Hz to 2 kHz.
+# Tyres of a light vehicle. In place of the engine, the warning sound of UN Regulation No. 138 up to 20 km/h:
+# at least 50 dB(A) at 2 m at 10 km/h and 56 dB(A) at 20 km/h, some 70 dB of sound power, from 250 Hz to 2
+# kHz.
 ELECTRIC = replace(
     LIGHT,
     name="electric",
@@ -108,22 +110,22 @@ BICYCLE = replace(
     propulsion_b_db=FLAT,
     harmonic_share=0.0,
 )
-# Electric kick scooter: small hard tyres and a hub motor, 4 dB over a bicycle (assumed). Noise only: an
-# engine's lines follow the gears of a car.
+# Electric kick scooter: small hard tyres and a hub motor, 4 dB above a bicycle (assumed). It emits noise
+# only, because the model's engine lines follow the gears of a car.
 SCOOTER = replace(
     BICYCLE,
     name="scooter",
     length_m=1.2,
     height_m=1.8,
     axles_m=(0.1, 0.95),
-    ridden_mps=(3.5, 5.5),  # they end at 20 km/h
+    ridden_mps=(3.5, 5.5),  # The range ends at 20 km/h
     rolling_a_db=(66.1, 73.2, 74.7, 80.1, 84.1, 80.7, 74.8, 66.2),
     propulsion_a_db=(SILENT_DB, SILENT_DB, 56.0, 60.0, 60.0, 56.0, 52.0, SILENT_DB),
     propulsion_b_db=(0.0, 0.0, 20.0, 20.0, 20.0, 20.0, 20.0, 0.0),
     engine_m=0.1,
 )
 # Wheel and rail at street speeds, some 72 dB(A) at 7.5 m at 30 km/h; four bogies, traction noise far below.
-# The shape is that of the third-octave spectra of 32 real passes: most at 250 Hz, 24 dB less at 2 kHz.
+# The shape follows the third-octave spectra of 32 real passes: maximum at 250 Hz, 24 dB less at 2 kHz.
 TRAM = replace(
     LIGHT,
     name="tram",
@@ -139,7 +141,7 @@ TRAM = replace(
     harmonic_share=0.0,
 )
 
-# Category 4b of CNOSSOS-EU, which counts its engine alone, at 2,100 to 9,000 turns a minute.
+# Category 4b of CNOSSOS-EU, which contains the engine alone, at 2,100 to 9,000 turns per minute.
 MOTORCYCLE = replace(
     LIGHT,
     name="motorcycle",

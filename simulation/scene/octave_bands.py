@@ -1,4 +1,4 @@
-"""Eight octave bands that add up to the whole signal again."""
+"""Eight octave bands that sum to the whole signal."""
 
 from functools import lru_cache
 
@@ -13,7 +13,7 @@ REFERENCE_PA = 20e-6
 
 
 def octave_masks(frequencies_hz: FloatArray) -> FloatArray:
-    """Amplitude weights of the octave bands, a partition of unity over frequency.
+    """Return the amplitude weights of the octave bands, a partition of unity over frequency.
 
     Shapes: frequencies_hz (F,).
     """
@@ -41,26 +41,26 @@ def split_octaves(signal: Float32Array, sample_rate_hz: float, oversampling: int
     Shapes: signal (n,).
     """
     n = len(signal)
-    # The length of a vehicle's time in sight may be a prime: its transform takes five times as long.
+    # The length of a vehicle's signal may be a prime number, whose transform takes five times as long.
     whole = next_fast_len(n, real=True)
     spectrum = rfft(signal, whole)
     bands = np.zeros((len(OCTAVES_HZ), n * oversampling), np.float32)
     for band, mask in zip(bands, _masks_for(whole, sample_rate_hz), strict=True):
-        # Above half the rate there is nothing.
+        # The band is empty above half the sample rate.
         if mask.any():
             wave = irfft(spectrum * (mask * np.float32(oversampling)), whole * oversampling)
             band[:] = wave[: n * oversampling]
     return bands
 
 
-# The sources of one vehicle are as long as each other, seven of them.
+# The seven sources of one vehicle have the same length.
 @lru_cache(maxsize=2)
 def _masks_for(samples: int, sample_rate_hz: float) -> Float32Array:
     return octave_masks(rfftfreq(samples, 1.0 / sample_rate_hz)).astype(np.float32)
 
 
 def resample_whole(signal: Float32Array, oversampling: int) -> Float32Array:
-    """Interpolate a signal, band-limited, by a whole factor; the ends are joined.
+    """Interpolate a signal, band-limited, by an integer factor; the signal is treated as periodic.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def resample_whole(signal: Float32Array, oversampling: int) -> Float32Array:
 
 
 def level_curve(octave_levels_db: FloatArray, frequencies_hz: FloatArray) -> FloatArray:
-    """Power spectral density in Pa^2/Hz of octave-band levels (dB re 20 uPa), log-interpolated.
+    """Return the power spectral density in Pa^2/Hz of octave-band levels (dB re 20 uPa), log-interpolated.
 
     Shapes: octave_levels_db (8,), frequencies_hz (F,).
 

@@ -1,42 +1,44 @@
-"""Levels and shapes of everything that is not geometry: named, versioned, frozen.
+"""Levels and spectra of everything that is not geometry, as named and frozen presets.
 
-`street-6` differs from `street-5` in its physics. A site has an ambient level, a spectrum, a wind and
-openings of its own (`ambience.py`). Ambience and distant traffic come in by these openings as extended
-sources that wander and move slowly; a distant vehicle was a plane wave before, two with its echo. Background
-passes through the same mismatched channels as vehicles do. Vehicles differ by more: in level, and in their
-engine's load, which follows the acceleration.
+`street-6` changed the physics of `street-5`. Each site has its own ambient level, spectrum, wind and openings
+(`ambience.py`). Ambience and distant traffic enter through these openings as extended sources that fluctuate
+and move slowly; before, a distant vehicle was one plane wave, or two with its echo. The background passes
+through the same channel mismatch as vehicles. Vehicles vary more in level and in engine load, which follows
+the acceleration.
 
-Levels and spreads were set on the released windows of SA1, SB1 and SB2 (moving ego: DA1, DB1), at first by
-hand in some fifty tries. Then the parts of 36 approaches and 36 empty windows (tyres and engine by mirrored,
-scattered and late paths; ambience) were rendered once, mixed at other levels without rendering, and a random
-search of some 350 steps took the least sum of squared differences of level, peak, prominence, change and
-spread of the level, in all and by site; the result was rounded and looked at with other seeds. What it found
-is one thing: low bins, where the array hears every direction alike, must be incoherent (`wind_100hz_db`,
-`engine_bass_db`) and high ones coherent (`delay_mismatch_s`), or no vehicle stands out. No classifier and no
-false alarm was looked at.
+Levels and spreads were fitted to the released windows of SA1, SB1 and SB2 (moving ego: DA1, DB1), first by
+hand in some fifty trials. Then the parts of 36 approaches and 36 empty windows (tyres and engine by mirrored,
+scattered and late paths; ambience) were rendered once and mixed at other levels. A random search of some 350
+steps minimised the summed squared differences of level, peak, prominence, change and spread of the level,
+overall and per site. The result was rounded and checked with other seeds. Its main finding: low bins, at
+which the array cannot resolve directions, must be incoherent (`wind_100hz_db`, `engine_bass_db`) and high
+bins coherent (`delay_mismatch_s`); otherwise no vehicle is prominent. The search used no classifier and no
+false alarm.
 
-Plans of sites and drivers came after that search; four joint looks at 8 to 12 windows a class, side and site
-then moved the wind, the late field and the level of vehicles by a few dB. Reached on the last of them, seed
-203 (real, then simulated): hidden level .192, .191, peak .280, .289, prominence 1.44, 1.50, change .173,
-.177, sd of the log level .113, .125; in front .196, .201 and .328, .347 and 1.80, 1.86 and .222, .206 and
-.106, .116; empty .149, .153 and .193, .192 and 1.25, 1.23 and .050, .059 and .305, .226. Not reached: hidden
-windows of SB1 are quiet (.186, .164), and their pattern has deeper valleys (sd .379, .477); where the ego
-moves windows are a quarter too loud (empty .157, .198) and hidden vehicles stand out (1.17, 1.28).
+The plans of sites and the drivers were fitted after that search. Four joint checks of 8 to 12 windows per
+class, side and site then changed the wind, the late field and the level of vehicles by a few dB. The last
+check, seed 203, gave (real, simulated): hidden level 0.192, 0.191, peak 0.280, 0.289, prominence 1.44, 1.50,
+change 0.173, 0.177, deviation of the log level 0.113, 0.125; in front 0.196, 0.201 and 0.328, 0.347 and 1.80,
+1.86 and 0.222, 0.206 and 0.106, 0.116; empty 0.149, 0.153 and 0.193, 0.192 and 1.25, 1.23 and 0.050, 0.059
+and 0.305, 0.226. Remaining differences: hidden windows of SB1 are quieter in reality (0.186, 0.164), and
+their pattern has deeper valleys (deviation 0.379, 0.477); for a moving ego simulated windows are a quarter
+too loud (empty 0.157, 0.198) and hidden vehicles too prominent (1.17, 1.28).
 
-`street-7` is set on what a sequence reads of 23 approaches and 22 hazard-free recordings at SA1, SB1 and SB3
-(two microphones): level and bands by time before T0, their deviation and autocorrelation without a vehicle.
-Vehicles are a quarter faster (seven real ones pass SB1 at 5.0 to 6.5 m/s), which makes their tyres 2.9 dB
-louder, and 4.5 dB are taken off. Between walls the late field is 3 dB fainter, distant vehicles are 2 dB
-fainter, the ambience has more of 1 and 2 kHz, and the whole background flickers. Seven sets were rendered at
-four junctions, and the one with the least distance of the median column to SA1 and SB1 was taken; no score
-was looked at.
+`street-7` is fitted to the inputs of a sequence in 23 approaches and 22 hazard-free recordings at SA1, SB1
+and SB3 (two microphones): level and bands by time before T0, and their deviation and autocorrelation without
+a vehicle. Vehicles are a quarter faster (seven real ones pass SB1 at 5.0 to 6.5 m/s), which makes their tyres
+2.9 dB louder; their level is 4.5 dB lower. Between walls the late field is 3 dB lower, distant vehicles are 2
+dB lower, the ambience has more energy at 1 and 2 kHz, and the whole background flickers. Seven candidates
+were rendered at four junctions; the chosen one has the smallest distance of the median column to SA1 and SB1.
+No classification score was used.
 
 `street-6-calm` is a street with half as many distant vehicles, 4 dB fainter.
 
-The history is not all clean. `street-5` had its wind and drivers set on medians of the same sites, and its
-distant vehicles on the published false alarms. `street-2` was chosen among candidates after one look at a
-classifier's scores on simulated windows; what was kept of it (ambient octaves) is older than that look.
-Earlier presets are not offered: the physics that they were set with is gone. A change is a new name.
+Two earlier choices used evaluation data. The wind and drivers of `street-5` were set on medians of the same
+sites, and its distant vehicles on the published false alarms. `street-2` was chosen after one look at a
+classifier's scores on simulated windows; the part of it that remains (ambient octaves) is older than that
+look. Earlier presets are not offered, because their physics no longer exists. A changed preset gets a new
+name.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -51,13 +53,13 @@ from .junction import Site, site_generator
 
 
 def _within(low: float, high: float, default: float) -> Any:
-    """Declare a number of a preset with its limits."""
+    """Declare a number of a preset and its limits."""
     return field(default=default, metadata={"limits": (low, high)})
 
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Background, late field and vehicle levels; dB re 20 uPa unless said otherwise.
+    """Background, late field and vehicle levels; dB re 20 uPa unless stated otherwise.
 
     Parameters
     ----------
@@ -66,25 +68,25 @@ class Preset:
     ambient_octaves_db : tuple of 8 float
         Level of the ambient field per octave, 62.5 Hz .. 8 kHz.
     site_ambient_db, ambient_spread_db : float
-        Standard deviation of the ambient level between sites and between recordings of one.
+        Standard deviation of the ambient level between sites, and between recordings of a site.
     ambient_waves : int
-        Number of directions from which the ambient field comes.
+        Number of directions of the ambient field.
     sky_share : float
-        Share of it that comes from everywhere; the rest comes in by the street's openings.
+        Share of the ambient field that arrives from all directions; the rest enters by the street's openings.
     opening_db, site_opening_db, opening_spread_db : float
-        Level of what one opening lets in against the ambient level, and its standard deviations between sites
-        and between recordings.
+        Level of one opening relative to the ambient level, and its standard deviations between sites and
+        between recordings.
     wave_fluctuation_db : float
-        Standard deviation of the wander of every single direction.
+        Standard deviation of the level of each single direction over time.
     flicker_db : float
         Standard deviation of the fast change of the whole background in one octave.
     far_rate : float
         Mean number of distant vehicles in ten seconds.
     far_level_db, far_spread_db : float
-        Level of a distant vehicle at its loudest against the ambient level, and its standard deviation.
+        Maximum level of a distant vehicle relative to the ambient level, and its standard deviation.
     wind_100hz_db : float
-        What every microphone hears by itself of wind and of the roof it is fixed to, in the octave of 100
-        Hz; falls with f^-3.7.
+        Level of the uncorrelated noise of wind and roof at each microphone in the octave of 100 Hz; falls
+        with f^-3.7.
     site_wind_db, wind_spread_db : float
         Standard deviation of the wind between sites and between recordings.
     self_noise_db : float
@@ -92,34 +94,34 @@ class Preset:
     gain_mismatch_db, delay_mismatch_s : float
         Standard deviation of the channels' gains and delays; the latter includes scattering at the roof.
     late_walled_db, late_open_db : float
-        Late field of a vehicle at the mouth against its pressure at 1 m, dB, in a crossing street with a wall
+        Late field of a vehicle at the mouth of the street relative to its pressure at 1 m, dB, with a wall
         opposite (type A) and without (type B).
     late_decay_s : float
         Reverberation time of the late field.
     vehicle_level_db, vehicle_spread_db : float
-        Mean level of vehicles against CNOSSOS on its reference asphalt, and its standard deviation; what the
-        road of a site adds to the tyres comes on top.
+        Mean level of vehicles relative to CNOSSOS on its reference asphalt, and its standard deviation; the
+        road surface of a site is added to the tyres.
     traced_vehicle_db : float
-        What is added to that mean in streets of the second renderer, which are wider.
+        Added to that mean in streets of the second renderer, which are wider.
     speed_factor : float
-        How many times as fast as `SPEEDS_MPS` vehicles are.
+        Speed of vehicles relative to `SPEEDS_MPS`.
     engine_spread_db : float
-        Standard deviation of an engine's level against its vehicle's: make, gear and load, from coasting
-        or driving on a battery to full power.
+        Standard deviation of an engine's level relative to its vehicle's: make, gear and load, from coasting
+        or battery to full power.
     engine_bass_db : float
-        Level of vehicles' engines in the octaves of 62.5 and 125 Hz against CNOSSOS: below 30 km/h a petrol
-        engine of today has less of them than the fleet that its coefficients were fitted to.
+        Level of vehicles' engines in the octaves of 62.5 and 125 Hz relative to CNOSSOS: below 30 km/h a
+        modern petrol engine has less bass than the fleet of its coefficients.
     ego_engine_db : float
-        Level of a moving ego's engine and exhaust against a car's of CNOSSOS; a hybrid drives up to a
+        Level of a moving ego's engine and exhaust relative to a car's in CNOSSOS; a hybrid approaches a
         corner on its battery.
     screen_cap_db : float
         Largest screen attenuation.
     wall_scattering : float
-        Share of the energy that rough walls scatter instead of mirroring it, at high frequencies, 0..1.
+        Share of the energy that rough walls scatter at high frequencies in place of mirroring it, 0..1.
     late_lobe_share : float
-        Share of the late field that comes from a site's own directions.
+        Share of the late field that arrives from a site's own directions.
     sounds_folder : str
-        Folder with recordings, a folder a kind of sound, that take the place of synthesis; none where empty.
+        Folder of recordings, one folder per kind of sound, that replace synthesis; none if empty.
 
     Raises
     ------
@@ -176,7 +178,7 @@ class Preset:
                 in_range(one.name, getattr(self, one.name), *one.metadata["limits"])
 
     def vehicles_db(self, site: Site) -> float:
-        """Return the mean level of vehicles at a site against CNOSSOS, but for its road."""
+        """Return the mean level of vehicles at a site relative to CNOSSOS, without its road surface."""
         return self.vehicle_level_db + self.traced_vehicle_db * (site.renderer == "rays")
 
 
@@ -211,12 +213,12 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
     Returns
     -------
     Preset
-        Levels of everything that is not geometry.
+        Levels and spectra of everything that is not geometry.
 
     Raises
     ------
     InvalidArgumentError
-        For an unknown name.
+        If the name is unknown.
 
     Examples
     --------
@@ -227,14 +229,14 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
 
 
 OPENINGS = ("left", "right", "ahead", "behind")
-# Neighbouring octaves of traffic noise rise and fall together: a tilt, and little beside it.
+# Neighbouring octaves of traffic noise rise and fall together: a common tilt and a small residue.
 TILT_DB_PER_OCTAVE, OCTAVE_SPREAD_DB = 0.7, 0.7
-# So much of what comes from ahead a facade opposite, two or three floors high, leaves.
+# Share of the sound from ahead that passes over a facade opposite, two or three floors high.
 OVER_THE_WALL_DB = -8.0
-# Between walls hardly, on an open corner much: levels of the released windows of SB1, hidden and in front
-# alike, spread three times as far as those of SA1 and SB2. The logarithm is drawn evenly.
+# Low between walls, high on an open corner: levels of the released windows of SB1, hidden and in front alike,
+# spread three times as far as those of SA1 and SB2. The logarithm is drawn uniformly.
 GUSTINESS = (0.13, 2.5)
-TURNED_RAD = 0.12  # no street is exactly in line with another
+TURNED_RAD = 0.12  # No street is exactly in line with another
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,18 +244,18 @@ class Ambience:
     """Ambient field of one site, or of one recording there.
 
     A court at night and a street beside a main road differ by more than two recordings of either. Level,
-    spectrum and openings of a site are drawn once from its name and kept from recording to recording.
+    spectrum and openings of a site are drawn once from its name and are the same in all its recordings.
     """
 
     octaves_db: FloatArray  # shape (8,): Level of the whole field, dB re 20 uPa
-    wind_db: float  # Of the wind at the microphones, against the preset's
-    gustiness: float  # How much more it differs from recording to recording than the preset says
-    openings_db: FloatArray  # shape (4,): Share of each of `OPENINGS` of that level, dB
-    turned_rad: FloatArray  # shape (4,): Azimuth of each against its nominal one
+    wind_db: float  # Level of the wind at the microphones relative to the preset's
+    gustiness: float  # Factor on the spread of the wind between recordings
+    openings_db: FloatArray  # shape (4,): Level of each of `OPENINGS` relative to the whole field, dB
+    turned_rad: FloatArray  # shape (4,): Azimuth of each relative to its nominal one
 
 
 def site_ambience(site: Site, preset: Preset) -> Ambience:
-    """Draw what a site keeps.
+    """Draw the constant part of a site's ambience.
 
     Examples
     --------
@@ -275,8 +277,8 @@ def site_ambience(site: Site, preset: Preset) -> Ambience:
 
 
 def recording_ambience(of_site: Ambience, preset: Preset, rng: np.random.Generator) -> Ambience:
-    """Draw what one recording makes of it."""
-    # No two draws depend on each other: how loud the town is, how it blows, which street is busy.
+    """Draw the ambience of one recording."""
+    # All draws are independent: level of the town, wind, traffic of each street.
     octaves = of_site.octaves_db + preset.ambient_spread_db * rng.standard_normal()
     wind_db = of_site.wind_db + of_site.gustiness * preset.wind_spread_db * rng.standard_normal()
     openings = of_site.openings_db + preset.opening_spread_db * rng.standard_normal(len(OPENINGS))

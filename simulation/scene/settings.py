@@ -1,7 +1,7 @@
-"""What is simulated: a site, an approach, how the vehicles drive, and what else sounds, as given or drawn.
+"""Settings of a recording: site, approach, motion of the vehicles, and further sounds, given or drawn.
 
 Levels of sounds are A-weighted, in dB re 20 uPa at 1 m in front in the free field, over the eighths of a
-second that are within 10 dB of the loudest: a horn is as loud as its blast, whatever its pauses.
+second within 10 dB of the loudest. The level of a horn is that of its blast, whatever its pauses are.
 """
 
 from collections.abc import Sequence
@@ -26,33 +26,33 @@ class SoundKind:
 
     name: str
     label: str
-    level_db: float  # See the head of this file; of rain and gusts at a microphone
+    level_db: float  # Defined at the head of this file; for rain and gusts, the level at a microphone
     height_m: float = 1.0
-    # Level straight behind against straight ahead, per octave; in between the mean over (1 + cos angle) / 2.
+    # Level behind relative to ahead, per octave; in between the mean over (1 + cos angle) / 2.
     back_db: Octaves = FLAT
-    origin: str = PLACE  # What it belongs to: PLACE, VEHICLE or MICROPHONES
-    faces: float = 1.0  # Of a signal of a vehicle: 1 from the front forwards, -1 from the rear backwards
+    origin: str = PLACE  # Its carrier: PLACE, VEHICLE or MICROPHONES
+    faces: float = 1.0  # Signals of a vehicle: 1 from the front forwards, -1 from the rear backwards
 
 
-# A talker's head shades high frequencies, after the polar patterns of Chu and Warnock, "Detailed directivity
-# of sound fields around human talkers", NRC Canada, 2002; rounded by us.
+# A talker's head shadows high frequencies, after the polar patterns of Chu and Warnock, "Detailed directivity
+# of sound fields around human talkers", NRC Canada, 2002; rounded.
 HEAD_DB: Octaves = (-1.0, -2.0, -3.0, -5.0, -6.0, -9.0, -14.0, -18.0)
-# A piston of 0.1 m in a box turns directional where its circumference is a wavelength, some 500 Hz (assumed).
+# A piston of 0.1 m in a box is directional if its circumference exceeds a wavelength, some 500 Hz (assumed).
 BOX_DB: Octaves = (0.0, -1.0, -3.0, -7.0, -11.0, -15.0, -18.0, -20.0)
 # A horn mouth on a car's front or roof, and the car's body behind it (assumed).
 MOUTH_DB: Octaves = (-2.0, -3.0, -6.0, -9.0, -12.0, -15.0, -17.0, -18.0)
 
 _TABLE = (
-    # ISO 9921:2003: raised effort is 66 dB(A) at 1 m with its pauses, normal 60, loud 72.
+    # ISO 9921:2003: raised effort is 66 dB(A) at 1 m with pauses, normal effort 60, loud 72.
     SoundKind("voice", "one talker, raised effort", 68.3, 1.5, HEAD_DB),
-    # Assumed: a few children who call at play, and a dog in a yard, some 90 dB(A) at 1 m.
+    # Assumed: a few children at play, and a dog in a yard, some 90 dB(A) at 1 m.
     SoundKind("children", "children at play", 78.0, 1.0, HEAD_DB),
     SoundKind("dog", "barking dog", 90.0, 0.5, HEAD_DB),
     # Hard heels on paving; assumed.
     SoundKind("steps", "one person walking", 58.0, 0.05),
     # Assumed: some 65 dB(A) at 100 m.
     SoundKind("bell", "church bell", 105.0, 25.0),
-    # Makers' declarations of hand-held tools lie at 90 to 100 dB(A) at the operator; assumed.
+    # Manufacturers declare 90 to 100 dB(A) at the operator for hand-held tools; assumed.
     SoundKind("saw", "circular saw, grinder or another machine with a motor", 95.0, 1.0),
     SoundKind("drill", "hammer drill in masonry", 93.0, 1.2),
     SoundKind("jackhammer", "breaker on a road", 105.0, 0.5),
@@ -72,7 +72,7 @@ _TABLE = (
     SoundKind("wail", "wailing siren", 121.0, 1.8, MOUTH_DB, VEHICLE),
     SoundKind("sweeps", "siren that rises and falls at any pace", 121.0, 1.8, MOUTH_DB, VEHICLE),
     SoundKind("turns", "siren of any two tones", 121.0, 1.8, MOUTH_DB, VEHICLE),
-    # 93 dB(A) at 7 m in front of the vehicle, the least that UN Regulation No. 28 asks, is 110 at 1 m.
+    # 93 dB(A) at 7 m in front of the vehicle, the minimum of UN Regulation No. 28, is 110 at 1 m.
     SoundKind("horn", "horn of a car", 110.0, 0.5, MOUTH_DB, VEHICLE),
     SoundKind("horns", "one horn or two of any pitch", 110.0, 0.5, MOUTH_DB, VEHICLE),
     # 97 dB(A) at 1.2 m, class C of SAE J994, is 98.6 at 1 m.
@@ -81,9 +81,9 @@ _TABLE = (
     SoundKind("bicycle-bell", "bell of a bicycle", 80.0, 1.0, origin=VEHICLE),
     # Drops on the roof round each microphone and the rain of the whole street; assumed: moderate rain.
     SoundKind("rain", "rain on roof and street", 58.0, origin=MICROPHONES),
-    # In the octave of 100 Hz, unweighted, as `ego_sound` has it at 10 m/s behind a windscreen and 6 dB more.
+    # Octave of 100 Hz, unweighted: the level of `ego_sound` at 10 m/s behind a windscreen, plus 6 dB.
     SoundKind("gusts", "gusts at one to three microphones", 82.0, origin=MICROPHONES),
-    # The same measure: the wind of the preset `street-6`, 60.5 dB, and the middle of what it swells by.
+    # Same measure: the wind of the preset `street-6`, 60.5 dB, plus the mean swell.
     SoundKind("wind", "one swell of wind at all microphones", 77.0, origin=MICROPHONES),
 )
 SOUNDS = {kind.name: kind for kind in _TABLE}
@@ -107,22 +107,22 @@ class SoundSettings:
     kind : str
         One of `SOUNDS`.
     start_s, duration_s : float
-        When it is emitted, -60 to 120 s, and how long, up to 120 s.
+        Time of emission, -60 to 120 s, and duration, up to 120 s.
     place_m : tuple of float
-        Where it stands, or starts: x ahead and y left of where the ego stops. Not of weather.
+        Position or start: x ahead and y left of the ego's stop. Ignored for weather.
     route_m : tuple of (float, float)
-        More points of its way; empty for a sound that stands.
+        Further points of its route; empty for a sound at rest.
     speed_mps : float
-        On that way, up to 30; at its end the sound stands.
+        Speed on that route, up to 30; the sound rests at its end.
     level_offset_db : float
-        Over the level of its kind.
+        Added to the level of its kind.
     facing_rad : float, optional
-        Where a standing sound faces, 0 along the ego's street; towards where the ego stops if not given. A
-        moving one faces forwards.
+        Direction that a sound at rest faces, 0 along the ego's street; towards the ego's stop by default. A
+        moving sound faces forwards.
     channels : tuple of int
         Microphones that gusts hit, at most 3.
     lens_missed : float
-        Share of the camera's detections that is lost meanwhile, 0 to 1: rain soils the lens, too.
+        Share of the camera's detections that is lost meanwhile, 0 to 1, because rain wets the lens.
 
     Raises
     ------
@@ -166,16 +166,16 @@ class SoundSettings:
 
     @property
     def has_place(self) -> bool:
-        """Whether it comes from somewhere, and is not the microphones' own."""
+        """Whether it has a position and is not generated at the microphones."""
         return self.what.origin != MICROPHONES
 
     @property
     def end_s(self) -> float:
-        """When it ends."""
+        """Time of its end."""
         return self.start_s + self.duration_s
 
     def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return where it is, x and y, shape (T,) each."""
+        """Return its position, x and y, shape (T,) each."""
         if not self.route_m:
             return tuple(np.full_like(time_s, value) for value in self.place_m)  # type: ignore[return-value]
         points = np.array((self.place_m, *self.route_m))
@@ -183,7 +183,7 @@ class SoundSettings:
         return along(points).at(np.clip(self.speed_mps * (time_s - self.start_s), 0.0, length))
 
     def facing(self, time_s: FloatArray) -> FloatArray:
-        """Return where it faces, rad, shape (T,)."""
+        """Return the direction that it faces, rad, shape (T,)."""
         if self.route_m:
             (x, y), (ahead_x, ahead_y) = self.at(time_s - 0.5), self.at(time_s + 0.5)
             return np.arctan2(ahead_y - y, ahead_x - x)
@@ -196,23 +196,23 @@ APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this 
 MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
 MAX_OTHERS, MAX_SOUNDS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 16, 64, 0.1
-# What the released patterns move by in the two seconds round T0: in all three fitted places 3 to 5 m/s then,
-# hardly braking. Drivers that came at 9 m/s and braked by 3 left the windows in front half a second behind.
+# Fitted to the motion of the released patterns in the two seconds round T0: 3 to 5 m/s at all three fitted
+# places, with little braking. Drivers at 9 m/s with 3 m/s2 of braking were half a second late in front.
 SPEEDS_MPS, WALLED_SPEEDS_MPS = (3.8, 6.2), (3.4, 4.8)
 BRAKING_SHARE, BRAKING_MPS2 = 0.6, (0.3, 1.4)
 EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
 
 
 def rate_for(bandwidth_hz: float) -> float:
-    """Return the sample rate that sound of a bandwidth is rendered at, three to six times it.
+    """Return the sample rate for sound of a bandwidth, three to six times it.
 
     Examples
     --------
     >>> rate_for(2000.0), rate_for(2500.0), rate_for(16_000.0)
     (6000.0, 12000.0, 47998.0)
     """
-    # Halvings of the full rate, so that frames of 512 samples become 256, 128 or 64 and bins stay. Files
-    # hold whole rates: 5,999.75 Hz read as 6,000 would be a tenth of a second late after an hour.
+    # Halvings of the full rate keep the bins: frames of 512 samples become 256, 128 or 64. Files need integer
+    # rates: 5,999.75 Hz read as 6,000 would be late by a tenth of a second after an hour.
     halvings = max(int(np.floor(np.log2(SAMPLE_RATE_HZ / (3.0 * bandwidth_hz)) + 1e-3)), 0)
     return float(round(SAMPLE_RATE_HZ / 2**halvings))
 
@@ -226,7 +226,7 @@ class VehicleSettings:
     approach : str
         "left" or "right".
     entry_s : float
-        When its front comes into the camera's line of sight, -60 to 120 s.
+        Time at which its front comes into the camera's line of sight, -60 to 120 s.
     speed_mps : float
         Speed before braking, 1 to 30.
     braking_mps2 : float
@@ -234,16 +234,16 @@ class VehicleSettings:
     kind : str
         One of `KINDS`.
     manoeuvre : str
-        "pass" or "turn": turn into the ego's street, and stop there.
+        "pass" or "turn": it turns into the ego's street and stops there.
     route_m : tuple of (float, float)
-        Where it goes instead of along the crossing street: points x, y, at least 2; empty for none.
+        Route in place of the crossing street: points x, y, at least 2; empty for none.
     signal : str
-        What it warns with all the time, one of `SIGNALS`; empty for nothing.
+        Continuous warning signal, one of `SIGNALS`; empty for none.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range or a word unknown.
+        If a number is out of range or a word is unknown.
 
     Examples
     --------
@@ -287,25 +287,25 @@ class SimulationSettings:
     duration_s : float
         Length, 0.5 to 60 s.
     entry_s : float
-        When the vehicle's front comes into the camera's line of sight; ignored without a vehicle.
+        Time at which the vehicle's front comes into line of sight; ignored without a vehicle.
     speed_mps : float
         Speed before braking, 1 to 30.
     braking_mps2 : float
         Deceleration in the two seconds before line of sight, 0 to 8.
     parked_car : bool
-        Whether a car stands in view.
+        Whether a parked car is in view.
     sample_rate_hz : float
         2 to 96 kHz; sound is rendered up to a third of it.
     preset : Preset
-        Levels of everything else.
+        Levels and spectra of everything else.
     kind, manoeuvre, route_m, signal
         Of the vehicle: see `VehicleSettings`.
     others : tuple of VehicleSettings
-        More vehicles, at most 8; with `approach` "none" all there are, none of them a hidden hazard.
+        At most 8 further vehicles; with `approach` "none" they are all, and none is a hidden hazard.
     ego : EgoMotion
-        How the ego moves; it stands if not given.
+        Motion of the ego; it stands by default.
     sounds : tuple of SoundSettings
-        What else sounds, at most 16.
+        Further sounds, at most 16.
 
     Raises
     ------
@@ -346,7 +346,7 @@ class SimulationSettings:
 
     @property
     def traffic(self) -> tuple[VehicleSettings, ...]:
-        """All vehicles, the one that `approach` names first."""
+        """All vehicles; the vehicle of `approach` comes first."""
         if self.approach == "none":
             return self.others
         own = {one.name: getattr(self, one.name) for one in fields(VehicleSettings)}
@@ -361,16 +361,17 @@ def draw_settings(
     kind: str = "light",
     levels: Preset | None = None,
 ) -> SimulationSettings:
-    """Draw how a vehicle drives, in sight at 65 to 75 % of the time.
+    """Draw the motion of a vehicle that comes into sight at 65 to 75 % of the recording.
 
-    Most brake a little; before that they do 14 to 22 km/h, 12 to 17 where a wall stands opposite (type A).
+    Most vehicles brake a little; before that their speed is 14 to 22 km/h, or 12 to 17 with a wall opposite
+    (type A).
 
     Parameters
     ----------
     site_name : str
-        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h, or of
-        one of `PLACES`, where a vehicle takes one of the place's ways; half of the hazard-free recordings
-        there have one that is in plain view, or never in view.
+        One of `SITES`; of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h; or of
+        `PLACES`, where a vehicle takes one of the place's routes. Half of the hazard-free recordings there
+        have a vehicle that is always in view, or never.
     approach : str
         "left", "right" or "none".
     rng : numpy.random.Generator
@@ -380,17 +381,17 @@ def draw_settings(
     kind : str
         One of `KINDS`.
     levels : Preset, optional
-        Of everything else; the default preset where not given.
+        Levels of everything else; the default preset if not given.
 
     Returns
     -------
     SimulationSettings
-        Of one recording.
+        Settings of one recording.
 
     Raises
     ------
     InvalidArgumentError
-        For an unknown name, or a place that has no such approach.
+        If a name is unknown or the place has no such approach.
 
     Examples
     --------
@@ -421,7 +422,7 @@ def draw_settings(
 
 
 def _on_way(settings: SimulationSettings, way: Way) -> SimulationSettings:
-    """Return a recording of a vehicle that takes a way: the one of the approach, or one that is no hazard."""
+    """Return a recording whose vehicle takes a route: that of the approach, or one without a hazard."""
     if way.approach != "none":
         return replace(settings, route_m=way.route_m)
     own = settings.entry_s, settings.speed_mps, 0.0, settings.kind
@@ -429,33 +430,33 @@ def _on_way(settings: SimulationSettings, way: Way) -> SimulationSettings:
 
 
 def speeds_mps(site: Site, kind: VehicleKind, levels: Preset) -> tuple[float, float]:
-    """Range of the speeds of a kind of vehicle at a site, before braking."""
+    """Return the range of speeds of a kind of vehicle at a site, before braking."""
     slow, fast = SPEEDS_MPS if site.opposite_wall_m is None else WALLED_SPEEDS_MPS
     return kind.ridden_mps or (levels.speed_factor * slow, levels.speed_factor * fast)
 
 
 def _draw_ego(rng: np.random.Generator, duration_s: float) -> EgoMotion:
-    """Stop shortly after the vehicle comes into sight."""
+    """Draw an ego that stops shortly after the vehicle comes into sight."""
     stop_s = 0.7 * duration_s + rng.uniform(*EGO_STOPS_AFTER_S)
     return EgoMotion(rng.uniform(*EGO_SPEEDS_MPS), stop_s)
 
 
-# How long one of them is heard, of the recording; rain and music last.
+# Share of the recording in which a sound is audible; rain and music last.
 SHARE, LASTING = (0.3, 0.8), ("rain", "music", "bell")
 WALKING_MPS = (1.1, 1.6)
-NEAR_M, SIDE_STREET_M = (3.0, 12.0), (6.0, 30.0)  # behind the ego, and along the crossing street
+NEAR_M, SIDE_STREET_M = (3.0, 12.0), (6.0, 30.0)  # Behind the ego, and along the crossing street
 FAR_M, BELL_M = (60.0, 200.0), (80.0, 250.0)
 FROM_WALL_M = 0.6
-LENS_SHARE, LENS_MISSED = 0.5, (0.2, 0.8)  # every other rain soils the lens, too
+LENS_SHARE, LENS_MISSED = 0.5, (0.2, 0.8)  # Half of the rain wets the lens, too
 MAX_GUSTY = 3
-# How long wind swells and dies away, and by how much over the mean wind of the site, dB (assumed).
+# Duration of a swell of wind, and its level above the mean wind of the site, dB (assumed).
 SWELL_S, SWELL_DB = (1.0, 5.0), (8.0, 25.0)
 
 
 def with_sounds(
     settings: SimulationSettings, kinds: Sequence[str], microphones: int, rng: np.random.Generator
 ) -> SimulationSettings:
-    """Add a sound of each kind; the last signal of a vehicle goes to the vehicle, if there is one.
+    """Add a sound of each kind; the last signal of a vehicle is assigned to the vehicle, if there is one.
 
     Examples
     --------
@@ -479,7 +480,7 @@ def _drawn(
     start = rng.uniform(0.0, whole - long) if long < whole else 0.0
     if kind == "gusts":
         count = int(rng.integers(1, min(MAX_GUSTY, microphones) + 1))
-        # Neighbours: a gust is as wide as an arm.
+        # Neighbouring microphones: a gust is as wide as an arm.
         first = int(rng.integers(microphones - count + 1))
         return SoundSettings(kind, start, long, channels=tuple(range(first, first + count)))
     if kind == "wind":
@@ -490,7 +491,7 @@ def _drawn(
         missed = rng.uniform(*LENS_MISSED) if rng.random() < LENS_SHARE else 0.0
         return SoundSettings(kind, start, long, lens_missed=missed)
     sound = SoundSettings(kind, start, long, facing_rad=rng.uniform(-np.pi, np.pi))
-    # What only a vehicle carries comes from another street where this one has none.
+    # A signal of a vehicle comes from another street if this one has no vehicle.
     far = BELL_M if kind == "bell" else FAR_M if sound.what.origin == VEHICLE else None
     if far is not None:
         azimuth, away = rng.uniform(-np.pi, np.pi), rng.uniform(*far)
@@ -499,7 +500,7 @@ def _drawn(
 
 
 def _in_a_street(sound: SoundSettings, site: Site, rng: np.random.Generator) -> SoundSettings:
-    """Stand before a wall, behind the ego or in the crossing street; walkers walk on along it."""
+    """Place a sound before a wall, behind the ego or in the crossing street; steps move along it."""
     side, walk = rng.choice([-1.0, 1.0]), rng.uniform(*WALKING_MPS)
     if rng.random() < 0.5:
         wall = site.side_wall_left_m if side > 0.0 else site.side_wall_right_m

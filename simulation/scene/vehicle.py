@@ -1,4 +1,4 @@
-"""Ways on the ground and what drives there: routes, the ego, vehicles, and how loud each is by itself."""
+"""Routes on the ground, the motion of the ego and of vehicles, and the sound power of each vehicle."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -13,22 +13,22 @@ from worldstate.ground.typing import Float32Array, FloatArray, IntArray
 from .kinds import LIGHT, SILENT_DB, TYRE_M, VehicleKind
 from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 
-FAR_M = 600.0  # a route goes on straight this far at both ends
+FAR_M = 600.0  # Straight extension of a route at both ends
 TURN_RADIUS_M = 3.5
-LANE_FROM_MIDDLE_M = 1.2  # where a vehicle drives that turned into the ego's street
-STOP_AHEAD_M = 3.0  # it stops here: the ego is in its way
+LANE_FROM_MIDDLE_M = 1.2  # Lateral position of a vehicle that has turned into the ego's street
+STOP_AHEAD_M = 3.0  # It stops here, in front of the ego
 ARC_STEPS = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
-    """A polyline, parametrised by the distance driven; 0 is where line of sight begins."""
+    """A polyline parametrised by the distance driven; line of sight begins at 0."""
 
     driven_m: FloatArray  # shape (N,): Increasing
     points_m: FloatArray  # shape (N, 2): Positions there, x ahead and y left
 
     def at(self, driven_m: float | FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return x and y after some distance, shape of `driven_m`."""
+        """Return x and y after a distance, shape of `driven_m`."""
         along = np.asarray(driven_m)
         x, y = (np.interp(along, self.driven_m, column) for column in self.points_m.T)
         return np.asarray(x), np.asarray(y)
@@ -53,7 +53,7 @@ def along(points_m: ArrayLike, entry_m: float = 0.0) -> Route:
 
 
 def turn_in(lane_x_m: float, entry_y_m: float) -> tuple[Route, float]:
-    """Return the route of a vehicle that turns into the ego's street, and how far it can drive.
+    """Return the route of a vehicle that turns into the ego's street, and its length.
 
     Examples
     --------
@@ -76,19 +76,20 @@ def turn_in(lane_x_m: float, entry_y_m: float) -> tuple[Route, float]:
 
 
 BRAKING_MPS2 = 2.5
-ARRAY_HEIGHT_M = 1.7  # origin of `base_link` above the road: the array's centre on the roof
+# Height of the origin of `base_link` above the road: the centre of the array on the roof
+ARRAY_HEIGHT_M = 1.7
 
 
 @dataclass(frozen=True, slots=True)
 class EgoMotion:
-    """An ego that drives along its street at a constant speed, brakes and stops at the origin.
+    """An ego that drives along its street at constant speed, brakes and stops at the origin.
 
     Parameters
     ----------
     speed_mps : float
-        Before braking; 0 for an ego that stands all the time.
+        Speed before braking; 0 for an ego at rest.
     stop_s : float
-        When it comes to stand.
+        Time at which it stops.
 
     Raises
     ------
@@ -110,11 +111,11 @@ class EgoMotion:
 
     @property
     def stands(self) -> bool:
-        """Whether it never moves."""
+        """Whether it is always at rest."""
         return self.speed_mps == 0.0
 
     def later(self, start_s: float) -> "EgoMotion":
-        """Return the same motion on a clock that begins so much later; it stands if it has stopped by then.
+        """Return the same motion on a clock that starts later; it is at rest if it has stopped by then.
 
         Examples
         --------
@@ -125,64 +126,65 @@ class EgoMotion:
         return replace(self, stop_s=left_s) if left_s > 0.0 else EgoMotion()
 
     def at_mps(self, time_s: FloatArray) -> FloatArray:
-        """Speed at any time, same shape as `time_s`."""
+        """Return the speed at any time, shape of `time_s`."""
         return np.clip(BRAKING_MPS2 * (self.stop_s - time_s), 0.0, self.speed_mps)
 
     def x_m(self, time_s: FloatArray) -> FloatArray:
-        """Position along the street, 0 where it stops, same shape as `time_s`."""
+        """Return the position along the street, 0 at the stop, shape of `time_s`."""
         left = np.maximum(self.stop_s - time_s, 0.0)
         braking = np.minimum(left, self.speed_mps / BRAKING_MPS2)
         return np.asarray(0.0 - 0.5 * BRAKING_MPS2 * braking**2 - self.speed_mps * (left - braking))
 
 
 LENGTH_M, WIDTH_M, HEIGHT_M = LIGHT.length_m, LIGHT.width_m, LIGHT.height_m
-AXLES_BEHIND_FRONT_M = LIGHT.axles_m  # each axle is a source of its own; the engine is at the first
+AXLES_BEHIND_FRONT_M = LIGHT.axles_m  # Each axle is a source; the engine is at the first
 SOURCE_HEIGHT_M = 0.3
 
 REFERENCE_KMH = 70.0
 # Sound power to pressure at 1 m over hard ground: -11 dB of a free sphere, +3 dB of the ground's half-space.
 POWER_TO_1M_DB = -8.0
-FADE_KMH = 5.0  # a warning sound that ends at some speed is gone so much above it
-SLOWEST_KMH = 10.0  # the law is fitted above 20; a log of zero speed would be silence
-CREEPING_MPS = 1.0  # below, tyres fade with the speed: a vehicle that stands is an engine alone
-HARMONIC_SHARE = 0.5  # of the propulsion power; the rest is broadband
+FADE_KMH = 5.0  # A warning sound that ends at some speed has faded out this much above it
+SLOWEST_KMH = 10.0  # The law is fitted above 20 km/h; the logarithm of zero speed would be silence
+CREEPING_MPS = 1.0  # Below this speed tyre noise fades: a vehicle at rest is an engine alone
+HARMONIC_SHARE = 0.5  # Share of the propulsion power in harmonics; the rest is broadband
 HARMONICS = 24
-# Firing frequency of four cylinders over speed in gears 1 to 4, Hz per m/s; up at 2400 rpm, idle at 850 rpm.
+# Firing frequency of four cylinders over speed in gears 1 to 4, Hz per m/s; gears change at 2400 rpm, idle is
+# 850 rpm.
 GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0)
 SHIFT_UP_HZ, IDLE_HZ = 80.0, 28.0
 SHIFT_S = 0.4
 WANDER, WANDER_STEP_S = 0.05, 0.5
-# An engine under load is louder, one that is pushed quieter (the source model of IMAGINE, light vehicles);
-# beyond these accelerations nothing more was measured.
+# An engine under load is louder, one that is driven by the wheels quieter (source model of IMAGINE, light
+# vehicles); accelerations beyond these were not measured.
 LOAD_DB_PER_MPS2, LOADS_MPS2 = 4.4, (-1.0, 2.0)
 TURN_MPS, TURN_BRAKING_MPS2 = 3.5, 2.0
-TURN_BEGINS_M = 12.0  # braking for the turn begins at most so long before line of sight
-SILENCE_DB = 0.0  # an engine whose every octave is below emits nothing that matters
+TURN_BEGINS_M = 12.0  # Longest distance before line of sight at which braking for the turn begins
+SILENCE_DB = 0.0  # An engine with every octave below this level is left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Motion along a route; for a vehicle that passes, along the crossing street (y) at a fixed lane (x)."""
+    """Motion along a route, or along the crossing street (y) in a fixed lane (x)."""
 
     time_s: FloatArray  # shape (T,): Increasing, evenly spaced
     front_y_m: FloatArray  # shape (T,): Lateral position of the front bumper
     speed_mps: FloatArray  # shape (T,): Speed, >= 0
-    lane_x_m: float  # Middle of the lane on which it comes, m ahead of the origin
+    lane_x_m: float  # Middle of the lane, metres ahead of the origin
     heading: int  # +1 towards +y (comes from the right), -1 towards -y (comes from the left)
-    kind: VehicleKind = LIGHT  # What drives there
-    route: Route | None = None  # Where it goes if not straight along its lane
+    kind: VehicleKind = LIGHT  # Kind of the vehicle
+    route: Route | None = None  # Route, if it is not straight along the lane
     # shape (T,): Distance of the front along the route.
     driven_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def behind(self, distance_m: float) -> tuple[FloatArray, FloatArray]:
-        """Position x, y of what is so far behind the front, shape (T,) each."""
+        """Return the position x, y at a distance behind the front, shape (T,) each."""
         if self.route is None:
             y = self.front_y_m - self.heading * distance_m
             return np.full_like(y, self.lane_x_m), y
         return self.route.at(self.driven_m - distance_m)
 
     def footprint_y_m(self) -> tuple[FloatArray, FloatArray]:
-        """Lateral limits (right, left) of the whole vehicle, shape (T,) each."""
+        """Return the lateral limits (right, left) of the whole vehicle, shape (T,) each."""
         ends = np.stack([self.front_y_m, self.behind(self.kind.length_m)[1]])
         if self.route is None:
             return ends.min(axis=0), ends.max(axis=0)
@@ -208,13 +210,13 @@ def drive(
     braking_mps2: float = 0.0,
     kind: VehicleKind = LIGHT,
 ) -> Trajectory:
-    """Pass `entry_y_m` at `entry_s`, braking at a constant rate during the two seconds before.
+    """Return a vehicle that passes `entry_y_m` at `entry_s` and brakes evenly in the two seconds before.
 
     Shapes: time_s (T,).
     """
     heading = -1 if entry_y_m > 0 else 1
     step = time_s[1] - time_s[0]
-    # Where it passes before the first time or after the last, it is followed to there.
+    # The motion is extended if it passes there before the first or after the last time.
     outside_s = time_s[0] - entry_s, entry_s - time_s[-1]
     before, after = (int(np.ceil(max(out_s, 0.0) / step)) for out_s in outside_s)
     earlier, later = step * np.arange(before, 0, -1), step * np.arange(1, after + 1)
@@ -228,7 +230,7 @@ def drive(
 
 
 def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = np.inf) -> Trajectory:
-    """Drive along another route as `passing` drives along its lane, slowly where the route has an end."""
+    """Return the motion of `passing` along another route, slower before an end of the route."""
     step = passing.time_s[1] - passing.time_s[0]
     driven = (passing.front_y_m - entry_y_m) * passing.heading
     speed = passing.speed_mps.copy()
@@ -241,20 +243,20 @@ def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = n
 
 
 def _turn_speed(driven_m: float, end_m: float) -> float:
-    """Highest speed from which the vehicle can still slow down to the turn, and to its end."""
+    """Return the highest speed from which the vehicle can still slow down for the turn and its end."""
     to_turn, to_end = max(-driven_m, 0.0), max(end_m - driven_m, 0.0)
     turning = np.sqrt(TURN_MPS**2 + 2.0 * TURN_BRAKING_MPS2 * to_turn)
     return float(min(turning, np.sqrt(2.0 * TURN_BRAKING_MPS2 * to_end)))
 
 
 def rolling_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
-    """Sound power level of the tyres, L = A + B log10(v / 70 km/h), shape (8, T)."""
+    """Return the sound power level of the tyres, L = A + B log10(v / 70 km/h), shape (8, T)."""
     speed_kmh = np.maximum(3.6 * speed_mps, SLOWEST_KMH)
     return _octaves(kind.rolling_a_db) + _octaves(kind.rolling_b_db) * np.log10(speed_kmh / REFERENCE_KMH)
 
 
 def propulsion_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
-    """Sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T)."""
+    """Return the sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T)."""
     speed_kmh = 3.6 * speed_mps
     fade_db = SILENT_DB * np.clip((speed_kmh - kind.propulsion_until_kmh) / FADE_KMH, 0.0, 1.0)
     relative = speed_kmh / REFERENCE_KMH - 1.0
@@ -262,7 +264,7 @@ def propulsion_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> Flo
 
 
 def load_db(trajectory: Trajectory) -> FloatArray:
-    """How much louder the engine is than at constant speed, shape (T,)."""
+    """Return the level of the engine above that at constant speed, shape (T,)."""
     step = trajectory.time_s[1] - trajectory.time_s[0]
     acceleration = np.clip(np.gradient(trajectory.speed_mps, step), *LOADS_MPS2)
     return LOAD_DB_PER_MPS2 * _smooth(acceleration, trajectory.time_s)
@@ -274,10 +276,10 @@ def _octaves(levels_db: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceSignal:
-    """One of the places of a vehicle that sound."""
+    """One point source of a vehicle."""
 
     signal: Float32Array  # shape (n,): Pressure at 1 m, Pa
-    behind_m: float  # How far behind the front
+    behind_m: float  # Distance behind the front
     height_m: float  # Above the road
 
 
@@ -289,9 +291,9 @@ def emit(
     rng: np.random.Generator,
     engine_offset_db: float | FloatArray = 0.0,
 ) -> list[SourceSignal]:
-    """Draw what every axle's tyres and the engine emit; the engine's offset may differ by octave, (8, 1)."""
-    # The tyres of the axles share the rolling noise and know nothing of each other, which makes a vehicle in
-    # view a wide source; engine noise, broadband and harmonics, comes from the first axle and from higher up.
+    """Draw the signals of all tyres and of the engine, whose offset may differ by octave, (8, 1)."""
+    # The tyres of the axles share the rolling noise but are uncorrelated, so that a vehicle in view is a wide
+    # source. Engine noise, broadband and harmonics, is emitted at the first axle and higher up.
     kind = trajectory.kind
     time = trajectory.time_s[0] + np.arange(samples) / sample_rate_hz
     drawing = _Drawing(trajectory, time, sample_rate_hz, rng)
@@ -308,7 +310,7 @@ def emit(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drawing:
-    """What one vehicle's signals are drawn for: its motion, the times of the samples, the randomness."""
+    """Motion, sample times and randomness of one vehicle's signals."""
 
     trajectory: Trajectory
     time: FloatArray
@@ -316,7 +318,7 @@ class _Drawing:
     rng: np.random.Generator
 
     def noise(self, octave_pressure: FloatArray, white: Float32Array | None = None) -> Float32Array:
-        """Gaussian noise, or what else is white, whose octave pressures (8, T) follow the drive."""
+        """Return Gaussian or another white noise whose octave pressures (8, T) follow the motion."""
         if white is None:
             white = self.rng.standard_normal(len(self.time), dtype=np.float32)
         gains = octave_pressure / np.sqrt(_band_shares(self.sample_rate_hz))[:, None]
@@ -326,7 +328,7 @@ class _Drawing:
         return signal
 
     def engine(self, octave_pressure: FloatArray) -> Float32Array:
-        """Noise and lines; an octave that no line falls into is noise alone."""
+        """Return noise and lines; an octave without a line is noise alone."""
         if self.trajectory.kind.turns_hz is not None:
             return self.noise(octave_pressure, exhaust_pulses(self.trajectory, self.time, self.rng))
         share = self.trajectory.kind.harmonic_share
@@ -347,19 +349,19 @@ class _Drawing:
 
 
 def _pressure(power_level_db: FloatArray) -> FloatArray:
-    """RMS pressure at 1 m in Pa."""
+    """Return the RMS pressure at 1 m in Pa."""
     return np.asarray(REFERENCE_PA * 10.0 ** ((power_level_db + POWER_TO_1M_DB) / 20.0))
 
 
 @cache
 def _band_shares(sample_rate_hz: float) -> FloatArray:
-    """Power of white noise of unit variance in every octave band; bands beyond Nyquist stay empty."""
+    """Return the power of white noise of unit variance per octave band; bands beyond Nyquist are empty."""
     masks = octave_masks(np.linspace(0.0, sample_rate_hz / 2.0, 4096))
     return np.asarray(np.maximum((masks**2).mean(axis=1), 1e-6))
 
 
 def octaves_of_lines(firing_hz: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the octave of each multiple of a firing frequency, (24,), and how many fall into each, (8,)."""
+    """Return the octave of each multiple of a firing frequency, (24,), and their number per octave, (8,)."""
     orders = np.arange(1, HARMONICS + 1)
     octave = np.clip(np.round(np.log2(orders * firing_hz.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
     return octave, np.bincount(octave, minlength=8)
@@ -368,15 +370,15 @@ def octaves_of_lines(firing_hz: FloatArray) -> tuple[IntArray, IntArray]:
 def engine_lines(
     firing_hz: FloatArray, cycles: FloatArray, sample_rate_hz: float, rng: np.random.Generator
 ) -> Iterator[Float32Array]:
-    """Yield multiples 1, 2, ... of the firing frequency with an amplitude of 1; shapes (n,)."""
+    """Yield multiples 1, 2, ... of the firing frequency with amplitude 1; shapes (n,)."""
     for order in range(1, HARMONICS + 1):
         phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
-        heard = order * firing_hz < 0.5 * sample_rate_hz  # above, a line would come back folded
+        heard = order * firing_hz < 0.5 * sample_rate_hz  # Avoids aliasing
         yield np.cos(phase.astype(np.float32)) * heard
 
 
 def firing_frequency_hz(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw the firing frequency in Hz: follows the speed through the gears, never idles, wanders by 5 %."""
+    """Draw the firing frequency in Hz: it follows the speed through the gears and fluctuates by 5 %."""
     shift_up = SHIFT_UP_HZ * rng.uniform(0.8, 1.2)
     speed = np.interp(time, trajectory.time_s, trajectory.speed_mps)
     choices = np.array(GEARS_HZ_PER_MPS)[:, None] * trajectory.speed_mps
@@ -387,18 +389,19 @@ def firing_frequency_hz(trajectory: Trajectory, time: FloatArray, rng: np.random
     return np.asarray(np.maximum(ratio * speed, IDLE_HZ) * np.interp(time, knots, wander))
 
 
-# A motorcycle has one to four cylinders; a moped has one of two strokes, which fires at every turn. Cylinders
-# fire neither evenly nor alike, so that there are lines at half orders, and the exhaust's noise follows them.
+# A motorcycle has one to four cylinders; a moped has one two-stroke cylinder, which fires at every turn. The
+# cylinders fire unevenly and with different strength, which makes lines at half orders; the exhaust noise
+# follows them.
 TWO_STROKES, CYLINDERS, UNEVEN_FIRING, WEAKEST = 0.25, (1, 2, 2, 3, 4), 0.5, 0.6
 PULSE_SPREAD, PULSE_JITTER, MOST_NOISE, SHARPEST = (0.02, 0.3), (0.0, 0.02), 0.8, 6.0
-# Turns a second at idle, 1,100 to 1,900 a minute; of a gear over those of the next one; share with a belt,
-# whose turns hardly follow the speed; share of those that stand and are revved, and how far (all assumed).
+# Turns per second at idle, 1,100 to 1,900 per minute; ratio of neighbouring gears; share with a belt, whose
+# crank speed is nearly constant; share of vehicles at rest that rev up, and how far (all assumed).
 IDLE_TURNS_HZ, GEAR_RATIO, BELTS, BELT, REVVED, MOST_REVS = (18.0, 32.0), (1.25, 1.7), 0.25, 0.3, 0.6, 4.0
-TURNS_WANDER, LOUDER_BY_TURNS = 0.02, 1.5  # Amplitude over turns: 30 dB a decade (assumed)
+TURNS_WANDER, LOUDER_BY_TURNS = 0.02, 1.5  # Amplitude over crank speed: 30 dB per decade (assumed)
 
 
 def crank_turns_hz(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw how often a motorcycle's crank turns a second, shape of `time`."""
+    """Draw the crank speed of a motorcycle in turns per second, shape of `time`."""
     knots = np.arange(time[0], time[-1] + WANDER_STEP_S, WANDER_STEP_S)
     wander = np.interp(time, knots, rng.standard_normal(len(knots)))
     speed, idle = trajectory.speed_mps, rng.uniform(*IDLE_TURNS_HZ)
@@ -415,11 +418,11 @@ def crank_turns_hz(trajectory: Trajectory, time: FloatArray, rng: np.random.Gene
 
 
 def exhaust_pulses(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> Float32Array:
-    """Draw pulses of cylinders and noise that follows them, white and of power one, shape of `time`."""
+    """Draw the pulses of the cylinders and the noise that follows them, white and of unit power, (n,)."""
     rate_hz = (len(time) - 1) / (time[-1] - time[0])
     turns, is_moped = crank_turns_hz(trajectory, time, rng), rng.random() < TWO_STROKES
     cylinders = 1 if is_moped else int(rng.choice(CYLINDERS))
-    steps = turns * (1.0 if is_moped else 0.5) / rate_hz  # Cycles of the engine a sample
+    steps = turns * (1.0 if is_moped else 0.5) / rate_hz  # Engine cycles per sample
     spread, jitter, sharp = rng.uniform(*PULSE_SPREAD), rng.uniform(*PULSE_JITTER), rng.uniform(0.0, SHARPEST)
     pulses, envelope, cycles = np.zeros(len(time)), np.zeros(len(time)), np.cumsum(steps)
     for number in range(cylinders):
@@ -428,7 +431,7 @@ def exhaust_pulses(trajectory: Trajectory, time: FloatArray, rng: np.random.Gene
         late = 1.0 - np.mod(own[fires], 1.0) + jitter * rng.standard_normal(len(fires))
         first, share = np.divmod(np.clip(fires + late / steps[fires], 0.0, len(time) - 2.0), 1.0)
         strength = rng.uniform(WEAKEST, 1.0) * (1.0 + spread * rng.standard_normal(len(fires)))
-        # Between two samples where it falls between them.
+        # Linear interpolation between two samples.
         np.add.at(pulses, first.astype(np.intp), (1.0 - share) * strength)
         np.add.at(pulses, first.astype(np.intp) + 1, share * strength)
         envelope += np.exp(sharp * (np.cos(2.0 * np.pi * own) - 1.0))
@@ -439,7 +442,7 @@ def exhaust_pulses(trajectory: Trajectory, time: FloatArray, rng: np.random.Gene
 
 
 def _smooth(values: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Return the running mean over the time that a change of gear takes."""
+    """Return the running mean over the duration of a gear change."""
     length = max(int(SHIFT_S / (time_s[1] - time_s[0])), 1)
     padded = np.pad(values, (length, length), mode="edge")
     return np.convolve(padded, np.full(length, 1.0 / length), mode="same")[length:-length]
