@@ -1,1 +1,1 @@
-"""How sound gets from every source to every microphone."""
+"""Propagation of sound from every source to every microphone."""

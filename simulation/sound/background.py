@@ -1,8 +1,8 @@
-"""What an empty street sounds like: anisotropic ambience, distant traffic, wind and noise.
+"""Background of an empty street: anisotropic ambience, distant traffic, wind and noise.
 
-All of it is noise from many directions whose powers change slowly. An open sky gives a part from everywhere;
-the rest comes in by the street's openings: along both arms of the crossing street, round the corners and by
-the walls as a vehicle there would be heard, straight ahead, and from behind.
+The background is noise from many directions whose powers change slowly. An open sky contributes a part from
+all directions. The rest enters by the street's openings: along both arms of the crossing street, round the
+corners and by the walls like the sound of a vehicle there, straight ahead, and from behind.
 """
 
 from collections.abc import Iterator
@@ -22,8 +22,8 @@ from .paths import trace_paths
 from .receiver import Receiver
 from .static_field import azimuths_all_round, plane_wave_delays, unit_vectors
 
-# Long against the delays across an array (some 3 ms), which go round within a block, and short against the
-# second in which a level changes.
+# Long compared with the delays across an array (some 3 ms), which are circular within a block, and short
+# compared with the second in which a level changes.
 BLOCK_S = 0.043
 BLOCKS_AT_ONCE = 32
 NORMALS = 2**16
@@ -31,7 +31,7 @@ NORMALS = 2**16
 
 @dataclass(frozen=True, slots=True)
 class BlockGrid:
-    """Blocks, half overlapping, that cover a recording."""
+    """Half-overlapping blocks that cover a recording."""
 
     samples: int
     sample_rate_hz: float
@@ -48,32 +48,32 @@ class BlockGrid:
 
     @property
     def middles_s(self) -> FloatArray:
-        """When each block is in its middle, shape (B,); the first begins a hop before the recording."""
+        """Middle of each block, shape (B,); the first block begins a hop before the recording."""
         return np.arange(-(-self.samples // self.hop) + 1) * self.hop / self.sample_rate_hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaveField:
-    r"""Plane waves of independent noise of one spectrum, their changing powers, and noise beside them.
+    r"""Plane waves of independent noise with a common spectrum and changing powers, and uncorrelated noise.
 
-    Every block of a weighted overlap-add is drawn in the frequency domain,
+    Every block of a weighted overlap-add is drawn in the frequency domain:
 
     .. math:: X_m(f) = \sum_q \sqrt{G_q S(f)}\, e^{-2 \pi j f \tau_{qm}} W_q(f) + \sqrt{N(f)}\, V_m(f),
 
-    with W and V white: no wave exists as a signal, and the cost is one product and one transform per
-    microphone. Blocks are independent; the squares of their windows add up to one, so that the level is
-    steady while powers G may change from block to block.
+    W and V are white. No wave exists as a signal, so the cost is one product and one transform per
+    microphone. Blocks are independent. The squares of their windows sum to one, so that the level is steady
+    while the powers G may change from block to block.
     """
 
     grid: BlockGrid
-    delays_s: FloatArray  # shape (Q, M): Of every wave at every microphone
-    density: FloatArray  # shape (F,): Power spectral density of a wave of power one, Pa^2/Hz
-    power: FloatArray  # shape (B, Q): Of every wave in every block
-    noise_density: FloatArray  # shape (F,): Of every microphone by itself, Pa^2/Hz
-    flicker_db: float = 0.0  # Of all of it; see `Preset`
+    delays_s: FloatArray  # shape (Q, M): Delay of every wave at every microphone
+    density: FloatArray  # shape (F,): Power spectral density of a wave of unit power, Pa^2/Hz
+    power: FloatArray  # shape (B, Q): Power of every wave in every block
+    noise_density: FloatArray  # shape (F,): Density of the uncorrelated noise of each microphone, Pa^2/Hz
+    flicker_db: float = 0.0  # Flicker of the whole background; see `Preset`
 
     def add_to(self, out: Float32Array, rng: np.random.Generator) -> None:
-        """Draw the noise and add it to what every microphone hears, shape (M, n)."""
+        """Draw the noise and add it to the signals of all microphones, shape (M, n)."""
         at = 0
         for heard in self.stretches(rng):
             room = out[:, at : at + heard.shape[1]]
@@ -81,7 +81,7 @@ class WaveField:
             at += heard.shape[1]
 
     def stretches(self, rng: np.random.Generator) -> Iterator[Float32Array]:
-        """Draw the noise a few blocks at a time, shape (M, some hops) each, however long it gets."""
+        """Draw the noise a few blocks at a time, shape (M, some hops) each, without end."""
         hop, gains = self.grid.hop, np.sqrt(self.power).astype(np.float32)
         window = np.sin(np.pi * (np.arange(2 * hop) + 0.5) / (2 * hop)).astype(np.float32)
         steering, noise = self._steering(), self._amplitude(self.noise_density)[:, None, None]
@@ -111,7 +111,7 @@ class WaveField:
         wander = self.flicker_db * scipy.signal.lfilter([1.0], [1.0, -kept], drawn)
         octave = np.log2(np.clip(self.grid.frequencies_hz, OCTAVES_HZ[0], OCTAVES_HZ[-1]) / OCTAVES_HZ[0])
         near = np.maximum(1.0 - np.abs(octave[:, None] - np.arange(octaves)), 0.0)
-        # Between the middles of two octaves both count, and independent changes add up by their squares.
+        # Between the middles of two octaves both contribute, and independent changes add by their squares.
         own = np.sqrt(near) @ wander[1:]
         level_db = np.sqrt(FLICKER_SHARED) * wander[0] + np.sqrt(1.0 - FLICKER_SHARED) * own
         mean = np.exp(0.5 * (self.flicker_db * np.log(10.0) / 10.0) ** 2)
@@ -130,41 +130,43 @@ class WaveField:
 
 def _white(shape: tuple[int, ...], rng: np.random.Generator) -> Complex64Array:
     """Draw complex normal numbers whose real and imaginary parts have unit variance."""
-    # Drawn out of a fixed set that fills the plane evenly with that density: five times as fast as the
-    # ziggurat, which took half the time of a background, and no sum of some hundred knows the difference.
+    # Drawn from a fixed set that fills the plane evenly with that density: five times as fast as the
+    # ziggurat, which took half the time of a background. A sum of some hundred such numbers has the same
+    # distribution.
     return np.asarray(_normal_plane()[rng.integers(0, NORMALS, shape, dtype=np.uint16)])
 
 
 @cache
 def _normal_plane() -> Complex64Array:
-    """Quantiles of the radius of complex normal numbers, each turned on by the golden angle."""
+    """Return quantiles of the radius of complex normal numbers, each rotated by the golden angle."""
     index = np.arange(NORMALS)
     radius = np.sqrt(-2.0 * np.log((index + 0.5) / NORMALS))
     return np.asarray(radius * np.exp(1j * np.pi * (np.sqrt(5.0) - 1.0) * index), np.complex64)
 
 
-ELEVATION_RAD = 0.25  # traffic between buildings is heard from near the horizon
-FAR_M, FAR_HEIGHT_M = 60.0, 1.4  # where traffic in an arm is, and how much lower than the array
-FAR_OCTAVE = 3  # 500 Hz, the middle of what the feature listens to
-# Of an opening, or of an image seen in rough walls: some 20 degrees. With twice as much, the walls of single
-# sites made their empty windows differ more from one another than real ones do.
+ELEVATION_RAD = 0.25  # Traffic between buildings arrives from near the horizon
+FAR_M, FAR_HEIGHT_M = 60.0, 1.4  # Distance of traffic in an arm, and its height below the array
+FAR_OCTAVE = 3  # 500 Hz, the middle of the band of the feature
+# Concentration of an opening, or of an image in rough walls: some 20 degrees. With twice as much, the empty
+# windows of different sites differed more than real ones do.
 OPENING_CONCENTRATION = 7.0
-# A distant vehicle swells and fades with these standard deviations; two of them off it is 17 dB down.
+# Standard deviations of the rise and fall of a distant vehicle; at two of them the level is 17 dB lower.
 FAR_WIDTH_S, FAR_AUDIBLE_S = (1.5, 4.0), 8.0
-FAR_SPAN_S, MAX_FAR = 10.0, 512  # the rate is that in so many seconds
-FAR_DRIFT_RAD = 0.15  # as far its direction moves while it swells
-# Correlation time of the flicker, and the share of its variance that all octaves have in common. In real
-# recordings without a hazard the loudness of a hop has a deviation of 0.77 dB, one band of four 0.9 to 1.2,
-# and the autocorrelation of loudness at 0.1, 0.3, 1 s is 0.63, 0.34, 0.16. With these numbers and 1.1 dB it
-# is 0.70, 0.37, 0.19 at 0.75 dB, without flicker 0.84, 0.75, 0.38 at 0.65 dB.
+FAR_SPAN_S, MAX_FAR = 10.0, 512  # Time to which the rate refers
+FAR_DRIFT_RAD = 0.15  # Change of its direction during the rise
+# Correlation time of the flicker, and the share of its variance that is common to all octaves. In real
+# recordings without a hazard the loudness of a hop has a deviation of 0.77 dB, a single band of four 0.9 to
+# 1.2 dB, and the autocorrelation of the loudness at 0.1, 0.3, 1 s is 0.63, 0.34, 0.16. With these numbers and
+# 1.1 dB it is 0.70, 0.37, 0.19 at 0.75 dB; without flicker it is 0.84, 0.75, 0.38 at 0.65 dB.
 FLICKER_S, FLICKER_SHARED = 0.12, 0.2
-FLUCTUATION_STEP_S = 0.5  # turbulence and moving sources change a distant sound in about so long
-# Free turbulence falls with f^-2.2. What the microphones of a standing car hear by themselves is steeper, for
-# screens average the small eddies and a roof rings low: with -2.2 the bins at 94 and 188 Hz, where the array
-# hears every direction alike, are so coherent that no vehicle stands out as far as the real ones do.
+FLUCTUATION_STEP_S = 0.5  # Turbulence and moving sources change a distant sound in about this time
+# Free turbulence falls with f^-2.2. The uncorrelated noise of a parked car's microphones is steeper, because
+# screens average small eddies and a roof resonates at low frequencies. With -2.2 the bins at 94 and 188 Hz,
+# at which the array cannot resolve directions, are so coherent that vehicles are less prominent than real
+# ones.
 WIND_SLOPE, ROOF_SLOPE = -2.2, -3.7
-WIND_FLOOR_HZ, ROOF_FLOOR_HZ = 20.0, 60.0  # below, it stays as it is there
-NOISE_BAND_HZ = 24_000.0  # the band that electronic noise is stated for
+WIND_FLOOR_HZ, ROOF_FLOOR_HZ = 20.0, 60.0  # The density is constant below
+NOISE_BAND_HZ = 24_000.0  # Band to which the electronic noise refers
 
 
 def add_background(
@@ -175,7 +177,7 @@ def add_background(
     rng: np.random.Generator,
     here: Ambience,
 ) -> None:
-    """Add everything that a street without a vehicle sounds like in an ambience, shape (M, n)."""
+    """Add the background of a street without a vehicle in an ambience, shape (M, n)."""
     grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
     azimuth = azimuths_all_round(preset.ambient_waves, rng)
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, len(azimuth)))
@@ -192,7 +194,7 @@ def add_background(
 
 
 def own_noise_density(preset: Preset, here: Ambience, frequencies_hz: FloatArray) -> FloatArray:
-    """Power spectral density of what a microphone hears by itself, wind and electronics, Pa^2/Hz, (F,)."""
+    """Return the density of a microphone's own noise, wind and electronics, Pa^2/Hz, (F,)."""
     wind = wind_density(preset.wind_100hz_db + here.wind_db, frequencies_hz, ROOF_SLOPE, ROOF_FLOOR_HZ)
     electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / NOISE_BAND_HZ
     return np.asarray(wind + electronic)
@@ -200,7 +202,7 @@ def own_noise_density(preset: Preset, here: Ambience, frequencies_hz: FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Town:
-    """What surrounds a site, seen from the array in some directions (Q,)."""
+    """Surroundings of a site, in some directions (Q,) from the array."""
 
     site: Site
     preset: Preset
@@ -208,18 +210,18 @@ class _Town:
     azimuth_rad: FloatArray
 
     def power(self, grid: BlockGrid, rng: np.random.Generator) -> FloatArray:
-        """Power of every wave in every block, as factors on the ambient level, shape (B, Q)."""
+        """Return the power of every wave in every block, relative to the ambient level, shape (B, Q)."""
         sky = self.preset.sky_share
         steady = sky / len(self.azimuth_rad) + (1.0 - sky) * (self.shares @ self.lobes())
         return (steady + self.passing(grid, rng)) * self.fluctuation(grid, rng)
 
     @property
     def shares(self) -> FloatArray:
-        """Power that comes in by each of `OPENINGS`, shape (4,)."""
+        """Return the power that enters by each of `OPENINGS`, shape (4,)."""
         return np.asarray(10.0 ** (self.here.openings_db / 10.0))
 
     def passing(self, grid: BlockGrid, rng: np.random.Generator) -> FloatArray:
-        """Power that distant vehicles add, shape (B, Q): each swells and fades in one opening."""
+        """Return the power of distant vehicles, shape (B, Q): each rises and falls in one opening."""
         preset, time = self.preset, grid.middles_s
         added = np.zeros((len(time), len(self.azimuth_rad)))
         for loudest_s in far_passages_s(preset, grid.samples / grid.sample_rate_hz, rng):
@@ -233,7 +235,7 @@ class _Town:
         return added
 
     def fluctuation(self, grid: BlockGrid, rng: np.random.Generator) -> FloatArray:
-        """Wander of every wave by itself, mean power one, shape (B, Q)."""
+        """Return independent fluctuations of the waves, mean power one, shape (B, Q)."""
         spread_db = self.preset.wave_fluctuation_db
         at = grid.middles_s / FLUCTUATION_STEP_S
         knots = spread_db * rng.standard_normal((int(at[-1]) + 2, len(self.azimuth_rad)))
@@ -242,7 +244,7 @@ class _Town:
         return np.asarray(power / np.exp(0.5 * (spread_db * np.log(10.0) / 10.0) ** 2))
 
     def lobes(self, turned_rad: float = 0.0) -> FloatArray:
-        """Share of every direction in the sound of each of `OPENINGS`, shape (4, Q), rows of sum one."""
+        """Return the share of each direction in the sound of each of `OPENINGS`, (4, Q); rows sum to one."""
         turns = self.here.turned_rad + turned_rad
         lobes = np.stack(
             [
@@ -254,7 +256,7 @@ class _Town:
 
 
 def opening_images(site: Site) -> list[tuple[FloatArray, FloatArray]]:
-    """Azimuths from which the sound of each of `OPENINGS` arrives, and their powers.
+    """Return the azimuths from which the sound of each of `OPENINGS` arrives, and their powers.
 
     Examples
     --------
@@ -264,14 +266,14 @@ def opening_images(site: Site) -> list[tuple[FloatArray, FloatArray]]:
     True
     """
     straight = [(np.array([direction]), np.ones(1)) for direction in (0.0, np.pi)]
-    if site.is_open:  # in the open nothing mirrors, and the road lies across
+    if site.is_open:  # In the open there are no reflections, and the road runs across
         return [(np.array([side]), np.ones(1)) for side in (0.5 * np.pi, -0.5 * np.pi)] + straight
     return [_arm_images(site, side) for side in (1.0, -1.0)] + straight
 
 
 @lru_cache(maxsize=64)
 def _arm_images(site: Site, side: float) -> tuple[FloatArray, FloatArray]:
-    """Directions of the images of traffic far along an arm (side +1 left), and their powers."""
+    """Return the directions of the images of traffic far along an arm (side +1 left), and their powers."""
     paths = trace_paths(site, site.lanes_m[0], np.array([side * FAR_M]), FAR_HEIGHT_M, np.inf)
     ends = [one.receiver.sign * (one.edge_y_m[0] - one.receiver.offset_m) for one in paths]
     power = [float(one.gain[0, FAR_OCTAVE] / one.bent_m[0]) ** 2 for one in paths]
@@ -279,7 +281,7 @@ def _arm_images(site: Site, side: float) -> tuple[FloatArray, FloatArray]:
 
 
 def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator) -> Float32Array:
-    """Gaussian noise with a given power spectral density, shape (samples,).
+    """Draw Gaussian noise with a given power spectral density, shape (samples,).
 
     Shapes: density (n // 2 + 1,).
     """
@@ -291,12 +293,12 @@ def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator) ->
 
 
 def noise_frequencies(samples: int, sample_rate_hz: float) -> FloatArray:
-    """Bins at which `shaped_noise` wants its density."""
+    """Return the bins of the density that `shaped_noise` takes."""
     return np.asarray(rfftfreq(next_fast_len(samples, real=True), 1.0 / sample_rate_hz))
 
 
 def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> FloatArray:
-    """Draw when distant vehicles are loudest, a Poisson process that knows nothing of a recording's ends."""
+    """Draw when distant vehicles are loudest: a Poisson process that also covers times outside."""
     expected = preset.far_rate * (duration_s + 2.0 * FAR_AUDIBLE_S) / FAR_SPAN_S
     return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, min(int(rng.poisson(expected)), MAX_FAR))
 
@@ -307,37 +309,37 @@ def wind_density(
     slope: float = WIND_SLOPE,
     floor_hz: float = WIND_FLOOR_HZ,
 ) -> FloatArray:
-    """Power spectral density of wind at a microphone, Pa^2/Hz, from its level in the octave of 100 Hz."""
+    """Return the density of wind at a microphone, Pa^2/Hz, from its level in the octave of 100 Hz."""
     at_100hz = REFERENCE_PA**2 * 10.0 ** (octave_100hz_db / 10.0) / (100.0 / np.sqrt(2.0))
     return np.asarray(at_100hz * (np.maximum(frequencies_hz, floor_hz) / 100.0) ** slope)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Town:
-    """What surrounds drawn walls or houses: plane waves from the sky and by where these end."""
+    """Surroundings of drawn walls or houses: plane waves from the sky and through the gaps."""
 
     here: Ambience
-    own: np.random.Generator  # Of the site alone
-    opened: FloatArray  # shape (K,): Share of each of K even directions from -pi on
+    own: np.random.Generator  # Depends on the site alone
+    opened: FloatArray  # shape (K,): Share of each of K equal sectors from -pi on
     sky_share: tuple[float, float] = (0.3, 0.8)
     louder_db: tuple[float, float] = (0.0, 0.0)
 
 
 def direction_numbers(azimuth_rad: FloatArray, count: int) -> IndexArray:
-    """Return which of so many even directions each azimuth of -pi to pi belongs to, shape (n,)."""
+    """Return the index of the equal sector of each azimuth in -pi to pi, shape (n,)."""
     return ((azimuth_rad + np.pi) * count / (2.0 * np.pi)).astype(np.intp) % count
 
 
 WAVES, WANDER_DB, WANDER_S = 64, 2.5, 0.7
-TOWN_DB, TOWN_S = 1.5, 12.0  # all of it rises and falls together
-OCTAVE_DB = 2.5  # how far a street's spectrum is from the preset's
+TOWN_DB, TOWN_S = 1.5, 12.0  # Common fluctuation of the whole background
+OCTAVE_DB = 2.5  # Deviation of a street's spectrum from the preset's
 PASSING_S, PASSING_DB = (2.0, 6.0), (-8.0, 4.0)
 
 
 def add_town(
     out: Float32Array, receiver: Receiver, preset: Preset, rng: np.random.Generator, town: Town
 ) -> None:
-    """Add what such a street sounds like without a vehicle, shape (M, n); what passes far away is heard."""
+    """Add the background of such a street, distant traffic included, shape (M, n)."""
     grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
     azimuth = rng.uniform(-np.pi, np.pi, WAVES)
     elevation = np.abs(rng.normal(0.0, 0.3, WAVES))
@@ -359,6 +361,6 @@ def add_town(
 
 
 def _wander(time_s: FloatArray, every_s: float, spread_db: float, rng: np.random.Generator) -> FloatArray:
-    """Level that wanders by so much in so long, shape (B,)."""
+    """Draw a level that fluctuates by a spread within a time, shape (B,)."""
     knots = spread_db * rng.standard_normal(int(time_s[-1] / every_s) + 2)
     return np.interp(time_s / every_s, np.arange(len(knots)), knots)

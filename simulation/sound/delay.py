@@ -1,9 +1,9 @@
-"""Signals that arrive late, and later every moment: retarded time with fractional delays.
+"""Delayed signals with changing delays: retarded time with fractional delays.
 
-A source is a table, oversampled so that a cubic through four of its values is exact enough (for factor 2 at
-48 kHz the error is below -70 dB up to 4 kHz, -35 dB at 12 kHz). Emission times are known at knots and linear
-in between, which is smooth enough for anything on wheels and makes Doppler a consequence, not a factor. What
-an array's centre hears is spread over its microphones, whose delays against it are short and change little.
+A source is an oversampled table, read by a cubic through four values (for factor 2 at 48 kHz the error is
+below -70 dB up to 4 kHz, and -35 dB at 12 kHz). Emission times are given at knots and linear in between. That
+is smooth enough for vehicles, and the Doppler effect follows from it. The signal at the array's centre is
+spread over the microphones, whose delays relative to it are short and change little.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,14 @@ from .diffraction import SPEED_OF_SOUND_MPS
 
 KNOT_SAMPLES = 128
 OVERSAMPLING = 2
-PHASES = 4  # of what is spread: linear between them, with an error below -50 dB up to 4 kHz
+# Oversampling of the signal that is spread: linear interpolation has an error below -50 dB up to 4 kHz
+PHASES = 4
 ROWS_AT_ONCE = 128
 
 
 @dataclass(frozen=True, slots=True)
 class SampledSignal:
-    """An oversampled emitted signal and when it begins."""
+    """An oversampled emitted signal and its start."""
 
     values: Float32Array  # shape (n,): float32
     start_s: float  # Emission time of the first value
@@ -57,7 +58,7 @@ def add_delayed(out: Float32Array, table: SampledSignal, emit_s: FloatArray, gai
 
 
 def _inside(at: FloatArray, end: int) -> slice | None:
-    """Intervals between knots that lie within a signal: one span, as times increase."""
+    """Return the intervals between knots that lie within a signal: one span, because times increase."""
     with np.errstate(invalid="ignore"):
         heard = np.flatnonzero((at[:-1] >= 0.0) & (at[1:] < end))
     return slice(int(heard[0]), int(heard[-1]) + 1) if len(heard) else None
@@ -103,7 +104,7 @@ def _add_between_knots(
 def _cubic(
     part: Float32Array, values: list[Float32Array], gains: _Lines, some: slice, line: Float32Array
 ) -> Float32Array:
-    """Newton's polynomial through four values, `part` beyond the second, times the gains; all overwritten."""
+    """Evaluate Newton's polynomial at `part` beyond the second of four values, times the gains, in place."""
     for stop in (0, 1, 2):
         for i in (3, 2, 1):
             if i > stop:
@@ -121,7 +122,7 @@ def _cubic(
 
 
 class Phases:
-    """A signal, `PHASES` times oversampled, to be read at nearly its own speed."""
+    """A signal, oversampled `PHASES` times, for reading at nearly its own speed."""
 
     def __init__(self, values: Float32Array) -> None:
         step = np.diff(values, append=values[-1:])
@@ -132,7 +133,7 @@ class Phases:
         )
 
     def add_to(self, out: Float32Array, at: FloatArray, gain: FloatArray) -> None:
-        """Add the signal as it is at positions `at`, in oversampled values, and scaled between them.
+        """Add the signal at positions `at`, in oversampled values, with gains between them.
 
         Shapes: out (K * KNOT_SAMPLES,), at (K + 1,), gain (K,).
         """
@@ -141,8 +142,8 @@ class Phases:
             return
         low, high = at[:-1][span], at[1:][span]
         base = np.minimum(np.floor(low).astype(np.intp), PHASES * (self._length - KNOT_SAMPLES))
-        # Within an interval the delay changes by a fraction of a value: the two values that are read lie a
-        # fixed way behind, so that whole rows are copied and none looked up.
+        # Within an interval the delay changes by a fraction of a value. The two values that are read have a
+        # fixed distance, so whole rows are copied without a look-up.
         lines = _Lines(low - base, high - base - (PHASES * KNOT_SAMPLES))
         start = base % PHASES * self._length + base // PHASES
         rows, scale = out.reshape(-1, KNOT_SAMPLES)[span], gain[span, None].astype(np.float32)
@@ -159,7 +160,7 @@ class Phases:
 
 @dataclass(frozen=True, slots=True)
 class Emission:
-    """What a source sends out, split into octave bands between emission knots."""
+    """Emitted signal of a source, split into octave bands between emission knots."""
 
     bands: Float32Array  # shape (K, 8, KNOT_SAMPLES * OVERSAMPLING): Pressure at 1 m, Pa, oversampled
     start_s: float  # Emission time of the first value
@@ -178,9 +179,9 @@ class Emission:
         return self.start_s + np.arange(len(self.bands) + 1) * KNOT_SAMPLES / self.sample_rate_hz
 
     def table(self, gain: FloatArray, *, fades: bool = False) -> tuple[SampledSignal, slice] | None:
-        """Add up the bands, weighted by gains (K + 1, 8) at the knots, over the span where any is not 0.
+        """Sum the bands, weighted by gains (K + 1, 8) at the knots, over the span of nonzero gains.
 
-        A block that is heard in part is left out: what `fades` in has a knot more before and after it.
+        Blocks at the ends of the span are left out; with `fades`, the span has one more knot at each end.
         """
         loud = np.flatnonzero(gain.max(axis=1) > 0.0)
         if not len(loud):
@@ -195,15 +196,15 @@ class Emission:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingSource:
-    """A sound and where it comes from."""
+    """A sound and its position."""
 
     emission: Emission  # Its sound
-    # shape (T,): How far ahead it is, at the knots of `emission` if it is not on a lane.
+    # shape (T,): Distance ahead at the knots of `emission`, or one value for a lane.
     x_m: float | FloatArray
     y_m: FloatArray  # shape (T,): Its lateral position there
     height_m: float = SOURCE_HEIGHT_M  # Above the road
 
     @property
     def ahead_m(self) -> FloatArray:
-        """How far ahead it is, shape (T,)."""
+        """Distance ahead, shape (T,)."""
         return np.asarray(self.x_m + np.zeros_like(self.y_m))

@@ -1,4 +1,4 @@
-"""What sound loses on its way: round an edge, in the air, and over the ground."""
+"""Losses along a path: round an edge, in the air, and over the ground."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,14 +9,14 @@ from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 
 REFERENCE_KELVIN, TRIPLE_POINT_KELVIN = 293.15, 273.16
 STREET_KELVIN, STREET_HUMIDITY = 283.15, 70.0
-ROAD_REFLECTION = 0.9  # pressure; dense asphalt and paving
+ROAD_REFLECTION = 0.9  # Pressure; dense asphalt and paving
 SMALLEST_LENGTH_M = 0.1
 
 
 def absorption_db_per_m(
     frequency_hz: ArrayLike, kelvin: float = STREET_KELVIN, humidity_percent: float = STREET_HUMIDITY
 ) -> FloatArray:
-    r"""Atmospheric absorption of pure tones at sea level.
+    r"""Return the atmospheric absorption of pure tones at sea level.
 
     .. math:: \alpha = 8.686 f^2 \Big[1.84 \cdot 10^{-11} \tau^{1/2} + \tau^{-5/2} \Big(
               \frac{0.01275\, e^{-2239.1 / T}}{f_{rO} + f^2 / f_{rO}} +
@@ -29,7 +29,7 @@ def absorption_db_per_m(
     f2 = np.asarray(frequency_hz, dtype=np.float64) ** 2
     tau = kelvin / REFERENCE_KELVIN
     saturation = 10.0 ** (-6.8346 * (TRIPLE_POINT_KELVIN / kelvin) ** 1.261 + 4.6151)
-    water = humidity_percent * saturation  # molar concentration of water vapour, per cent
+    water = humidity_percent * saturation  # Molar concentration of water vapour, per cent
     oxygen_hz = 24.0 + 4.04e4 * water * (0.02 + water) / (0.391 + water)
     nitrogen_hz = tau**-0.5 * (9.0 + 280.0 * water * np.exp(-4.170 * (tau ** (-1.0 / 3.0) - 1.0)))
     relaxed = 0.01275 * np.exp(-2239.1 / kelvin) / (oxygen_hz + f2 / oxygen_hz)
@@ -41,18 +41,18 @@ OCTAVE_DB_PER_M = absorption_db_per_m(OCTAVES_HZ)
 
 
 def air_gain(length_m: FloatArray) -> FloatArray:
-    """Amplitude that is left after `length_m` (T,) through air, shape (T, 8)."""
+    """Return the amplitude after `length_m` (T,) through air, shape (T, 8)."""
     return np.asarray(10.0 ** (-length_m[:, None] * OCTAVE_DB_PER_M / 20.0))
 
 
 def ground_gain(length_m: FloatArray, source_m: float, receiver_m: float) -> FloatArray:
-    r"""Amplitude by the road's reflection per octave, against the energetic sum of both ways, shape (T, 8).
+    r"""Return the amplitude by the road's reflection per octave, relative to the energy sum, shape (T, 8).
 
     .. math:: g^2 = 1 + \frac{2 \rho}{1 + \rho^2} \overline{\cos k \Delta}, \qquad
               \Delta \approx 2 h_s h_r / r
 
-    with the mean over the octave's band. The source levels already stand over hard ground, which doubles the
-    energy; what is left is the interference: +3 dB where both ways agree, 0 dB far above.
+    with the mean over the octave's band. Source levels already include hard ground, which doubles the energy;
+    the interference remains: +3 dB if both paths are equal, 0 dB at high frequencies.
 
     Shapes: length_m (T,).
     """
@@ -65,12 +65,12 @@ def ground_gain(length_m: FloatArray, source_m: float, receiver_m: float) -> Flo
 
 
 SPEED_OF_SOUND_MPS = 343.0
-EXTERIOR_RAD = 1.5 * np.pi  # round the right angle of a building's corner
-LEAST_RAD = 1e-6  # on the shadow boundary the formula is 0 times infinity; so far off it is exact
+EXTERIOR_RAD = 1.5 * np.pi  # Exterior angle of a right-angled building corner
+LEAST_RAD = 1e-6  # The formula is 0 times infinity on the shadow boundary, and exact at this distance
 
 
 def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: float = 40.0) -> FloatArray:
-    r"""Attenuation by a thin screen beyond spherical spreading.
+    r"""Return the attenuation by a thin screen beyond spherical spreading.
 
     .. math:: A = 5 + 20\log_{10}\frac{\sqrt{2\pi N}}{\tanh\sqrt{2\pi N}}, \qquad N = 2\delta f / c
 
@@ -78,12 +78,12 @@ def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: 
     ----------
     U. J. Kurze and G. S. Anderson, "Sound attenuation by barriers", Applied Acoustics 4 (1971), eq. (13).
     """
-    # In the light (N < 0) tanh turns into tan and the attenuation falls to 0 dB at N about -0.2, so it is
+    # In the light (N < 0) tanh becomes tan and the attenuation falls to 0 dB at N of about -0.2. It is
     # continuous through the shadow boundary, where it is 5 dB.
     fresnel = 2.0 * np.asarray(detour_m) * np.asarray(frequency_hz) / SPEED_OF_SOUND_MPS
     root = np.sqrt(2.0 * np.pi * np.maximum(np.abs(fresnel), 1e-9))
     shadow = 20.0 * np.log10(root / np.tanh(root))
-    # tan is only needed down to N = -0.2; clipping keeps its argument far from the pole.
+    # tan is needed down to N = -0.2 only; clipping keeps its argument away from the pole.
     light = 20.0 * np.log10(root / np.tan(np.minimum(root, 1.2)))
     attenuation = 5.0 + np.where(fresnel >= 0.0, shadow, np.where(root < 1.2, light, -5.0))
     return np.asarray(np.clip(attenuation, 0.0, cap_db))
@@ -92,16 +92,17 @@ def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: 
 def edge_gain(
     turn_rad: FloatArray, reduced_m: FloatArray, detour_m: FloatArray, frequency_hz: ArrayLike
 ) -> FloatArray:
-    r"""Amplitude of a wave that passes a building's corner, against the free field, shape (T, F).
+    r"""Return the amplitude of a wave past a building's corner, relative to the free field, shape (T, F).
 
     .. math:: \Big| H(\pi - \beta) - \frac{e^{-j\pi/4}}{2 n \sqrt{2 \pi k L}} \sum_{\pm}
               \cot\frac{\pi \pm \beta}{2 n}\, F\big(2 k L \cos^2\tfrac{2 n \pi N_\pm - \beta}{2}\big)\,
               e^{-jk\delta} \Big|, \qquad n = \tfrac{3}{2}, \quad L = \frac{s s'}{s + s'}
 
-    with the angle beta between the two legs s', s (below pi: in the light) and the detour delta, 0 in shadow.
-    The two terms of R. G. Kouyoumjian and P. H. Pathak, "A uniform geometrical theory of diffraction for an
-    edge in a perfectly conducting surface", Proc. IEEE 62 (1974), that hold for the wave as it comes; the
-    other two, of the wave that a face of the corner reflects, are these for the mirror image in that face.
+    with the angle beta between the two legs s', s (below pi: in the light) and the detour delta, which is 0
+    in shadow. These are the two terms of R. G. Kouyoumjian and P. H. Pathak, "A uniform geometrical theory of
+    diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62 (1974), for the incident wave.
+    The other two, for the wave reflected by a face of the corner, are the same terms for the mirror image in
+    that face.
 
     Shapes: turn_rad, reduced_m, detour_m (T,), frequency_hz (F,).
 
@@ -118,21 +119,22 @@ def edge_gain(
     turn = np.where(np.abs(turn_rad - np.pi) < LEAST_RAD, np.pi + LEAST_RAD, turn_rad)
     away = np.pi - turn
     terms = np.zeros(root.shape, np.complex128)
-    # N- is 0 and N+ is 1 for every angle beyond pi / 2; nearer the second term is small whatever N+.
+    # N- is 0 and N+ is 1 for every angle beyond pi / 2; for smaller angles the second term is small for any
+    # N+.
     for angle, argument in ((away, 0.5 * turn), (np.pi + turn, EXTERIOR_RAD - 0.5 * turn)):
         size = root * np.abs(np.cos(argument))[:, None]
         terms += _transition(size) / np.tan(angle / (2.0 * n))[:, None]
     edge = -np.exp(-0.25j * np.pi) / (2.0 * n * np.sqrt(np.pi) * root) * terms
     lit = away > 0.0
-    # In shadow the detour counts for nothing: exponentials are a third of the cost.
+    # The detour has no effect in shadow, and exponentials are a third of the cost.
     edge[lit] *= np.exp(-1j * detour_m[lit, None] * wave)
     return np.asarray(np.abs(lit[:, None] + edge))
 
 
 def _transition(root: FloatArray) -> Complex128Array:
-    r"""Return F(x) = 2j sqrt(x) exp(jx) times the integral of exp(-j t^2) from sqrt(x) on.
+    r"""Return F(x) = 2j sqrt(x) exp(jx) times the integral of exp(-j t^2) from sqrt(x) to infinity.
 
-    By the rational approximations 7.3.32 and 7.3.33 of M. Abramowitz and I. A. Stegun, "Handbook of
+    It uses the rational approximations 7.3.32 and 7.3.33 of M. Abramowitz and I. A. Stegun, "Handbook of
     mathematical functions" (1964), to 0.002.
     """
     z = root * np.sqrt(2.0 / np.pi)
@@ -142,14 +144,14 @@ def _transition(root: FloatArray) -> Complex128Array:
 
 
 def corner_gain(edge_m: tuple[float, float], x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-    r"""Amplitude round the corner of a house to the array at the origin, shape (T, 8), rms over the octave.
+    r"""Return the amplitude round the corner of a house to the array at the origin, (T, 8), octave rms.
 
     .. math:: \frac{|D|}{\sqrt{s' s (s' + s)}}
 
     with the coefficient D of a hard wedge of 90 degrees (Kouyoumjian and Pathak, eqs. 25 to 29) whose faces
-    run back along the own street and sideways along the crossing one.
+    extend back along the ego's street and sideways along the crossing street.
     """
-    # A corner on the right is one on the left of the mirrored plan.
+    # A corner on the right is a corner on the left of the mirrored plan.
     side = np.sign(edge_m[1])
     ahead, beside = edge_m[0], abs(edge_m[1])
     from_edge = x_m - ahead, side * y_m - beside
@@ -168,12 +170,13 @@ def corner_gain(edge_m: tuple[float, float], x_m: FloatArray, y_m: FloatArray) -
     return np.asarray(rms / np.sqrt(away * last * (away + last))[:, None])
 
 
-WEDGE = 1.5  # the open angle round the corner, in half turns
+WEDGE = 1.5  # Open angle round the corner, in half turns
 
 
 def _wedge_term(angle_rad: FloatArray, sign: float, k_distance: FloatArray) -> FloatArray:
-    """One of the four cotangents with its transition function."""
-    # On the boundary itself the cotangent is infinite and the transition nought: a milliradian beside it.
+    """Return one of the four cotangents with its transition function."""
+    # On the boundary the cotangent is infinite and the transition zero, so the angle is a milliradian beside
+    # it.
     tangent = np.tan((np.pi + sign * angle_rad) / (2.0 * WEDGE))
     beside = angle_rad + np.where(np.abs(tangent) < 1e-3, 4e-3, 0.0)
     turns = np.rint((beside + sign * np.pi) / (2.0 * np.pi * WEDGE))

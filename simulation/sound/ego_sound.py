@@ -1,12 +1,11 @@
-"""What the ego vehicle sounds like on its own roof: engine, exhaust, tyres, airflow and wind.
+"""Noise of the ego vehicle on its own roof: engine, exhaust, tyres, airflow and wind.
 
-Every source stands still against the array, so that its sound reaches each microphone after a delay of its
-own that never changes: coherent across the array, a few directions, all of them near. What lies below the
-roof comes over the nearest point of the roof's edge, once from itself and once from its image in the road.
-Wind is the turbulence at the microphones themselves and knows nothing of its neighbour. What a street's
-walls give back is a field of its own (`add_ego_echo`): near the horizon, over the roof's edge with hardly
-any loss, and so as loud as the screened sources themselves. Reflections in the body's upper side are not
-rendered.
+Every source has a fixed position relative to the array, so its delay at each microphone is constant: the
+noise is coherent across the array and comes from a few near directions. Sound from below the roof passes over
+the nearest point of the roof's edge, once from the source and once from its image in the road. Wind is the
+turbulence at the microphones and is uncorrelated between them. Reflections of the street's walls are a
+separate field (`add_ego_echo`): they arrive near the horizon and pass the roof's edge with hardly any loss,
+so they are as loud as the screened sources. Reflections by the upper side of the body are not rendered.
 """
 
 import numpy as np
@@ -36,7 +35,7 @@ from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from .receiver import Receiver
 from .static_field import StaticSources, azimuths_all_round, plane_wave_delays, unit_vectors
 
-# Places in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
+# Positions in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
 TYRES_M = np.array([[1.1, 0.75, 0.1], [1.1, -0.75, 0.1], [-1.5, 0.75, 0.1], [-1.5, -0.75, 0.1]])
 ENGINE_M = np.array([1.3, 0.1, 0.6])
 EXHAUST_M = np.array([-2.2, -0.5, 0.3])
@@ -46,13 +45,14 @@ ROOF_BELOW_ARRAY_M = 0.05
 ROAD_REFLECTION = 0.9
 SCREEN_CAP_DB = 24.0
 
-EXHAUST_SHARE = 0.3  # of the propulsion power; the rest leaves through the engine bay
-FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])  # at 1 m, per octave and pillar
-FLOW_EXPONENT = 60.0  # dB per decade of speed: a dipole's power grows with the sixth power of the flow
-# Octave of 100 Hz at 10 m/s behind a windscreen, set on the level of windows of DA1 and DB1: with 71 dB it is
-# a quarter too high there, with 77 dB single seconds are too uneven.
+EXHAUST_SHARE = 0.3  # Share of the propulsion power; the rest leaves through the engine bay
+FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])  # At 1 m, per octave and pillar
+# dB per decade of speed: the power of a dipole grows with the sixth power of the flow speed
+FLOW_EXPONENT = 60.0
+# Octave of 100 Hz at 10 m/s behind a windscreen, fitted to the level of windows of DA1 and DB1: with 71 dB it
+# is a quarter too high there, with 77 dB single seconds vary too much.
 WIND_AT_10_DB = 74.0
-WIND_EXPONENT = 40.0  # dB per decade: pseudo-sound is dynamic pressure
+WIND_EXPONENT = 40.0  # dB per decade: the pressure of turbulence is dynamic pressure
 
 # Firing frequency of four cylinders over speed in gears 1 to 5, Hz per m/s; the engine idles at 800 rpm.
 GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0, 3.2)
@@ -60,13 +60,14 @@ IDLE_HZ, SHIFT_UP_HZ = 26.7, 45.0
 ENGINE_WANDER, WANDER_STEP_S = 0.01, 0.5
 
 ECHO_WAVES, ECHO_ORDERS, ECHO_AT_MPS = 36, 4, 5.0
-# Images of a car in the walls beside it stand at its sides; reveals and parked cars ahead give back what goes
-# forward, and most comes so. Set on prominence and peak of the empty and hidden windows of DA1 and DB1: with
-# .2 from around and no mismatch of the channels an empty street has a prominence of 1.5 (real 1.16).
+# Images of a car in the walls beside it are at its sides. Reveals and parked cars ahead return sound that
+# goes forward, and most of the echo. Fitted to prominence and peak of the empty and hidden windows of DA1 and
+# DB1: with a share of 0.2 from around and no channel mismatch an empty street has a prominence of 1.5 (real
+# 1.16).
 ECHO_RAD, ECHO_CONCENTRATION, ECHO_AROUND, ECHO_SPREAD_DB = 1.15, 9.0, 0.8, 3.0
 
-HEAD_START_S = 0.05  # no way on the vehicle is as long
-KNOT = 1024  # levels are evaluated so often, samples
+HEAD_START_S = 0.05  # Longer than any path on the vehicle
+KNOT = 1024  # Interval at which levels are evaluated, samples
 
 
 def ego_noise(
@@ -90,11 +91,11 @@ def ego_noise(
     of solid boundaries upon aerodynamic sound", 1955 (sixth power). U. J. Kurze and G. S. Anderson, 1971
     (screens).
     """
-    # over the sources q (four tyres, engine, exhaust, two pillars) and their road images i, with the path
+    # Sum over the sources q (four tyres, engine, exhaust, two pillars) and their road images i, with the path
     # length d over the roof's edge, the screen attenuation g per octave, and wind w. Tyres and engine emit
-    # the sound power of CNOSSOS-EU, category 1, the airflow that of a dipole (sixth power of the speed),
-    # wind grows with the dynamic pressure.
-    # Everything ran before the recording began; what is on its way then is heard at its beginning.
+    # the sound power of CNOSSOS-EU, category 1, the airflow that of a dipole (sixth power of the speed); wind
+    # grows with the dynamic pressure. The sources run before the recording begins, so that its start is
+    # complete.
     lead = round(HEAD_START_S * sample_rate_hz)
     driven = np.pad(speed_mps, (lead, 0), mode="edge")
     to_engine, to_noise, to_wind = rng.spawn(3)
@@ -108,7 +109,7 @@ def ego_noise(
 def add_ego(
     out: Float32Array, receiver: Receiver, site: Site, preset: Preset, rng: np.random.Generator
 ) -> None:
-    """Add the sound of a moving ego, and what the walls beside it give back.
+    """Add the sound of a moving ego and its echoes from the walls beside it.
 
     Shapes: out (M, n).
     """
@@ -122,7 +123,7 @@ def add_ego(
 def add_ego_echo(
     out: Float32Array, receiver: Receiver, site: Site, engine_db: float, rng: np.random.Generator
 ) -> None:
-    """Add what the walls beside a moving ego give back of its own sound.
+    """Add the echoes of a moving ego's own sound from the walls beside it.
 
     Shapes: out (M, n).
     """
@@ -147,7 +148,7 @@ def add_ego_echo(
 
 
 def echo_gain(site: Site) -> float:
-    """Power of all images in both side walls at the array over that at 1 m; a body hides half from each.
+    """Return the power of all images in both side walls relative to 1 m; the body hides half of each.
 
     Examples
     --------
@@ -161,8 +162,8 @@ def echo_gain(site: Site) -> float:
 
 
 def echo_lobes(site: Site, azimuth_rad: FloatArray) -> FloatArray:
-    """Share of every direction in what the walls give back, shape (Q,)."""
-    # No two walls are equal: which side gives back more belongs to the site.
+    """Return the share of every direction in the echoes of the walls, shape (Q,)."""
+    # The two walls differ: the side with the stronger echo is a property of the site.
     level = 10.0 ** (ECHO_SPREAD_DB * site_generator(site.name, "echo").standard_normal(2) / 10.0)
     beside = np.exp(ECHO_CONCENTRATION * (np.cos(azimuth_rad[:, None] - [ECHO_RAD, -ECHO_RAD]) - 1.0))
     lobes = (beside / beside.sum(axis=0)) @ (level / level.sum())
@@ -192,14 +193,14 @@ def _add_sources(
 
 
 _PLACES_M = np.concatenate([TYRES_M, ENGINE_M[None], EXHAUST_M[None], PILLARS_M])
-# Of every source's power in harmonics of the firing frequency.
+# Share of each source's power in harmonics of the firing frequency
 _LINE_SHARES = (0.0,) * 4 + (HARMONIC_SHARE, HARMONIC_SHARE) + (0.0,) * 2
 
 
 def _levels_db(speed: FloatArray, engine_db: float, tyre_db: float) -> list[FloatArray]:
-    """Pressure level at 1 m of every source per octave, (8, knots), dB re 20 uPa."""
+    """Return the pressure level of every source at 1 m per octave, (8, knots), dB re 20 uPa."""
     slowest = SLOWEST_KMH / 3.6
-    # The law ends above a standstill; below, rolling noise fades with the speed itself.
+    # The law does not cover very low speeds; there, rolling noise fades with the speed.
     fade = 20.0 * np.log10(np.clip(speed / slowest, 1e-5, 1.0))
     tyre = rolling_level_db(speed) + tyre_db + POWER_TO_1M_DB - 10.0 * np.log10(len(TYRES_M)) + fade
     propulsion = propulsion_level_db(speed) + POWER_TO_1M_DB + engine_db
@@ -215,16 +216,16 @@ def _pressure_pa(level_db: FloatArray) -> FloatArray:
 
 
 def _at_samples(knots: FloatArray, samples: int) -> Float32Array:
-    """Straight lines between the knots, (8, knots) -> (8, n)."""
+    """Interpolate linearly between the knots, (8, knots) -> (8, n)."""
     time = np.arange(samples)
     return np.stack([np.interp(time, np.arange(len(row)) * KNOT, row) for row in knots]).astype(np.float32)
 
 
 def _emission(firing: FloatArray, line_share: float, rate: float, rng: np.random.Generator) -> Float32Array:
-    """Noise and engine lines that together have unit mean square in every octave, shape (n,)."""
+    """Return noise and engine lines with a joint mean square of one in every octave, shape (n,)."""
     samples = len(firing)
     masks = octave_masks(noise_frequencies(samples, rate))
-    # White noise divided by its own share of power per octave: unit pressure in each of them.
+    # White noise divided by its own power per octave has unit pressure in each of them.
     shares = np.maximum((masks**2).mean(axis=1), 1e-6)
     shape = (masks / np.sqrt(shares)[:, None]).sum(axis=0)
     noise = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng)
@@ -237,7 +238,7 @@ def _emission(firing: FloatArray, line_share: float, rate: float, rng: np.random
 
 
 def _firing_hz(speed: FloatArray, rate: float, rng: np.random.Generator) -> FloatArray:
-    """Follow the speed in the highest gear that its mean allows, never below idling; wander a little."""
+    """Return the firing frequency in the highest gear for the mean speed, at least idle, with jitter."""
     mean = float(speed.mean())
     gear = next((g for g in reversed(GEARS_HZ_PER_MPS) if g * mean >= SHIFT_UP_HZ), GEARS_HZ_PER_MPS[0])
     knots = np.arange(0.0, len(speed) / rate + 2.0 * WANDER_STEP_S, WANDER_STEP_S)
@@ -246,7 +247,7 @@ def _firing_hz(speed: FloatArray, rate: float, rng: np.random.Generator) -> Floa
 
 
 def _roof_edge(height_m: float) -> FloatArray:
-    """Points round the roof, five centimetres apart, shape (E, 3)."""
+    """Return points round the roof, five centimetres apart, shape (E, 3)."""
     x, y = (np.linspace(*ends, round((ends[1] - ends[0]) / 0.05) + 1) for ends in (ROOF_X_M, ROOF_Y_M))
     sides = [np.stack([x, np.full_like(x, edge)], axis=1) for edge in ROOF_Y_M]
     ends = [np.stack([np.full_like(y, edge), y], axis=1) for edge in ROOF_X_M]
@@ -255,7 +256,7 @@ def _roof_edge(height_m: float) -> FloatArray:
 
 
 def _paths_m(source: FloatArray, positions: FloatArray, roof: FloatArray) -> tuple[FloatArray, float]:
-    """Length of the shortest way over the roof's edge to every microphone, and how much longer it is."""
+    """Return the shortest path over the roof's edge to every microphone, and its detour."""
     to_edge = np.linalg.norm(roof - source, axis=1)
     onward = np.linalg.norm(roof[:, None] - positions, axis=2)
     length = (to_edge[:, None] + onward).min(axis=0)
@@ -264,7 +265,7 @@ def _paths_m(source: FloatArray, positions: FloatArray, roof: FloatArray) -> tup
 
 
 def _add_wind(out: Float32Array, speed: FloatArray, rate: float, rng: np.random.Generator) -> None:
-    """Add turbulence at every microphone by itself, its level following the speed."""
+    """Add independent turbulence at every microphone, with a level that follows the speed."""
     shape = wind_density(WIND_AT_10_DB, noise_frequencies(len(speed), rate)) * rate
     gain = (np.maximum(speed, 0.1) / 10.0) ** (WIND_EXPONENT / 20.0)
     for channel in out:

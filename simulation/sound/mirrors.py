@@ -1,9 +1,10 @@
-"""The third renderer: mirror images of a source in smooth walls, and the two corners between the streets.
+"""The third renderer: mirror images of a source in smooth walls, and diffraction at the two corners.
 
-It has no late field and scatters nothing: a hidden vehicle is heard by its specular images, each with its own
-delay at every microphone, and by waves that the corners diffract. Beams from the array are followed through
-the plan; each is the part of it in which a source reaches the array by one sequence of reflections, so that
-every reflection lies on its wall and no wall stands in between. Energy, rays and screens play no part.
+It has no late field and no scattering: the sound of a hidden vehicle consists of its specular images, each
+with its own delay at every microphone, and of waves that the corners diffract. Beams from the array are
+traced through the plan. Each beam is the region from which a source reaches the array by one sequence of
+reflections, so every reflection lies on its wall and no wall is in between. It uses no energies, rays or
+screens.
 
 Sources: J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics", J.
 Acoust. Soc. Am. 65, 943-950, 1979; T. Funkhouser et al., "A beam tracing approach to acoustic modeling for
@@ -28,22 +29,24 @@ from .diffraction import air_gain, corner_gain, ground_gain
 from .receiver import Receiver, add_to_all, passed_places
 from .static_field import PlacedSource, StreetSound
 
-ORDERS = 10  # reflections that are followed
-BENT_ORDERS = 4  # with a corner between them: those beyond are faint beside images that no corner hides
-FADE_M = 1.0  # of a source's way over which an image appears: the first Fresnel zone at 1 kHz, 6 m away
-FAINTEST = 0.03  # of the amplitude of the loudest: an image below it is left out
-NARROWEST_RAD = 1e-5  # of a beam
-BESIDE_M = 0.01  # a corner is reached where a point so far beside it is
-# Along the way of an ego that moves; gains of two places are blended. Against an array that stands between
-# them (60 sources) the level is off by 0.8 dB at most and by 0.34 in one of ten; with places every metre by
-# 0.34 and 0.14, at twice the cost.
+ORDERS = 10  # Reflections traced
+BENT_ORDERS = 4  # Reflections of paths with a corner; beyond, they are faint compared with unscreened images
+# Length of a source's path over which an image appears: the first Fresnel zone at 1 kHz, 6 m away
+FADE_M = 1.0
+FAINTEST = 0.03  # Amplitude relative to the strongest image, below which an image is left out
+NARROWEST_RAD = 1e-5  # Narrowest beam
+BESIDE_M = 0.01  # A corner is reachable if a point at this distance beside it is
+# Spacing of places along the path of a moving ego; gains of two places are blended. Compared with an array
+# between them (60 sources) the level is off by at most 0.8 dB, and by 0.34 dB in one of ten; with places
+# every metre by 0.34 and 0.14 dB, at twice the cost.
 PLACES_M = 2.0
-EVERY = 4  # knots, for gains of corners change slowly
+EVERY = 4  # In knots; gains of corners change slowly
 DIRECTIONS, SKY_SHARE, LOUDER_DB = 36, (0.1, 0.9), (-8.0, 2.0)
-OWN_STREET_M, ARM_M = (10.0, 60.0), (20.0, 90.0)  # how far walls go on behind the ego, and along an arm
-GAP_SHARE, GAP_M = 0.3, (2.5, 6.0)  # of the fronts in the crossing street have an opening so wide
+OWN_STREET_M, ARM_M = (10.0, 60.0), (20.0, 90.0)  # Length of walls behind the ego, and along an arm
+GAP_SHARE, GAP_M = 0.3, (2.5, 6.0)  # Share of fronts in the crossing street with an opening, and its width
 LOSS_PER_OCTAVE = (0.0, 0.01)
-BEYOND_SHARE = 0.5  # of crossings without a wall opposite the own street goes on between houses
+# Share of crossings without a wall opposite at which the ego's street continues between houses
+BEYOND_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,11 +54,11 @@ class Fronts:
     """Smooth walls, seen from above."""
 
     ends_m: FloatArray  # shape (W, 2, 2): Both ends of every wall, x and y
-    kept: FloatArray  # shape (W, 8): Pressure that comes back, per octave
+    kept: FloatArray  # shape (W, 8): Reflected pressure, per octave
 
 
 def drawn_fronts(site: Site) -> Fronts:
-    """Draw how far the walls of a site's plan go, their openings, and what they keep.
+    """Draw the length, the openings and the reflection of the walls of a site's plan.
 
     Examples
     --------
@@ -79,7 +82,8 @@ def drawn_fronts(site: Site) -> Fronts:
     pieces = []
     for start, way, length, kept in walls:
         at: tuple[float, ...] = (0.0, length)
-        # None in the own street: the array would see an arm through it, and the camera's plan has none.
+        # No opening in the ego's street: the array would see an arm through it, but the camera's plan has
+        # none.
         if way[0] == 0.0 and rng.random() < GAP_SHARE:
             gap = rng.uniform(2.0, length - GAP_M[1])
             at = (0.0, gap, gap + rng.uniform(*GAP_M), length)
@@ -95,18 +99,19 @@ def _kept(reflection: float, rng: np.random.Generator) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Images:
-    """Mirror images of a point (a microphone), and the parts of the plan that reach it by each of them."""
+    """Mirror images of a point (a microphone), and the regions of the plan that reach it by each image."""
 
-    mirror: FloatArray  # shape (I, 3, 3): (x, y, 1) of a point to that of its image
+    mirror: FloatArray  # shape (I, 3, 3): Maps (x, y, 1) of a point to its image
     kept: FloatArray  # shape (I, 8): Product of the reflection factors
     order: IndexArray  # shape (I,): Number of reflections
-    number: IndexArray  # shape (B,): The image that each beam belongs to
+    number: IndexArray  # shape (B,): Image of each beam
     apex_m: FloatArray  # shape (B, 2)
-    edges: FloatArray  # shape (B, 2, 2): Unit vectors along both edges, the second on the left of the first
-    bounds: FloatArray  # shape (B, 2, 3): (a, b, c): a x + b y + c > 0 beyond the last wall, before the next
+    edges: FloatArray  # shape (B, 2, 2): Unit vectors along both edges, the second to the left of the first
+    # shape (B, 2, 3): (a, b, c): a x + b y + c > 0 beyond the last wall and before the next
+    bounds: FloatArray
 
     def inside(self, place: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Distance from both edges, positive inside, and whether a place lies between both walls.
+        """Return the distance from both edges, positive inside, and whether a place is between both walls.
 
         Shapes: place (3, T), rows x, y, 1 -> (2, B, T), (B, T).
         """
@@ -116,9 +121,10 @@ class Images:
         return across, np.all(self.bounds @ place > 0.0, axis=1)
 
     def weights(self, place: FloatArray) -> FloatArray:
-        """1 where a source reaches the point by an image, 0 where a wall is in the way, shape (I, T)."""
+        """Return 1 if a source reaches the point by an image and 0 if a wall blocks it, shape (I, T)."""
         across, between = self.inside(place)
-        # Beams that share an edge add up to one across it, and one narrower than the fade is fainter.
+        # The weights of beams with a common edge sum to one across it; a beam narrower than the fade is
+        # weaker.
         each = np.maximum(smooth_step(0.5 + across / FADE_M).sum(axis=0) - 1.0, 0.0) * between
         out = np.zeros((len(self.mirror), each.shape[1]))
         np.add.at(out, self.number, each)
@@ -129,12 +135,12 @@ class Images:
         return np.asarray(self.mirror[image, :2] @ [*point_m[:2], 1.0])
 
     def reached_from(self, place_m: FloatArray) -> IndexArray:
-        """Return the images by which the point is reached from a place (2,)."""
+        """Return the images by which a place (2,) reaches the point."""
         across, between = self.inside(np.array([[*place_m, 1.0]]).T)
         return np.unique(self.number[(between & np.all(across > 0.0, axis=0))[:, 0]])
 
     def opened(self, directions: int) -> FloatArray:
-        """Energy that leaves the walls by each of so many even directions of the point, shape (K,)."""
+        """Return the energy that leaves the walls in each of the equal sectors of the point, shape (K,)."""
         out, free = np.full(directions, 1e-9), ~self.bounds[:, 1, :2].any(axis=1)
         for number, ((ax, ay), (bx, by)) in zip(self.number[free], self.edges[free], strict=True):
             x, y = np.array([ax + bx, ay + by]) @ self.mirror[number, :2, :2]
@@ -157,7 +163,7 @@ class _Beam:
 
 
 def trace(fronts: Fronts, point_m: FloatArray, orders: int = ORDERS) -> Images:
-    """Follow the beams from a point (2,) through up to so many reflections."""
+    """Trace the beams from a point (2,) up to a number of reflections."""
     numbers: dict[tuple[float, ...], int] = {}
     images, found = list[tuple[object, ...]](), list[tuple[object, ...]]()
     whole = np.eye(3), np.ones(len(OCTAVES_HZ)), point_m
@@ -175,7 +181,7 @@ def trace(fronts: Fronts, point_m: FloatArray, orders: int = ORDERS) -> Images:
             found.append((numbers[key], beam.apex_m, edges, (beyond, before)))
             if wall >= 0 and beam.order < orders:
                 mirror = np.eye(3) - 2.0 * np.outer([*before[:2], 0.0], before)
-                # Mirrored, the left edge is the right one.
+                # In the mirror, left and right edges are exchanged.
                 x, y = mirror[:2, :2] @ edges[1]
                 apex, kept = mirror[:2] @ [*beam.apex_m, 1.0], beam.kept * fronts.kept[wall]
                 turned = float(np.arctan2(y, x)), width, wall, beam.order + 1
@@ -184,7 +190,7 @@ def trace(fronts: Fronts, point_m: FloatArray, orders: int = ORDERS) -> Images:
 
 
 def _key(mirror: FloatArray) -> tuple[float, ...]:
-    """Return what images at one place share, whatever walls they met in whatever order."""
+    """Return a key of the image's position, equal for any order of walls."""
     return tuple((np.round(mirror.ravel(), 4) + 0.0).tolist())
 
 
@@ -193,7 +199,7 @@ def _unit(angle_rad: float | FloatArray) -> FloatArray:
 
 
 def _parts(fronts: Fronts, beam: _Beam) -> Iterator[tuple[float, float, int]]:
-    """Cut a beam at the ends of walls: start and width of each part, the wall that it meets (-1: none)."""
+    """Split a beam at the ends of walls: start and width of each part, and its wall (-1: none)."""
     away = fronts.ends_m - beam.apex_m
     turned = np.mod(np.arctan2(away[..., 1], away[..., 0]) - beam.start_rad, 2.0 * np.pi)
     cuts = np.unique(np.r_[0.0, turned[turned < beam.width_rad], beam.width_rad])
@@ -205,7 +211,7 @@ def _parts(fronts: Fronts, beam: _Beam) -> Iterator[tuple[float, float, int]]:
                 across = x * along[1] - y * along[0]
                 way = (first[0] * along[1] - first[1] * along[0]) / across
                 part = (first[0] * y - first[1] * x) / across
-            # Walls before the last one stand between it and its image, where no sound is.
+            # Walls before the last one are between it and its image, and carry no sound.
             hit = (part > 0.0) & (part < 1.0) & (way > (way[beam.last] + 1e-6 if beam.last >= 0 else 0.0))
             nearest = int(np.where(hit, way, np.inf).argmin()) if hit.any() else -1
             yield beam.start_rad + low, high - low, nearest
@@ -222,30 +228,30 @@ def _side(fronts: Fronts, wall: int, apex_m: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def images_at(site: Site, x_m: float, y_m: float) -> Images:
-    """Follow the beams from a place of a site once."""
+    """Return the traced beams of a place of a site, from a cache."""
     return trace(drawn_fronts(site), np.array([x_m, y_m]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Way:
-    """One way from a source to the microphones at the emission knots."""
+    """One path from a source to the microphones at the emission knots."""
 
-    gain: FloatArray  # shape (T, 8): Amplitude beside spherical spreading
-    from_m: FloatArray  # shape (2, T) or (2, 1): Where its last leg begins, at the source or at a corner
-    before_m: FloatArray | float  # shape (T,): Way before that
+    gain: FloatArray  # shape (T, 8): Amplitude without spherical spreading
+    from_m: FloatArray  # shape (2, T) or (2, 1): Start of the last leg, at the source or at a corner
+    before_m: FloatArray | float  # shape (T,): Length before the last leg
     images: Images
-    number: int  # The image of the microphones where it ends
-    height_m: float  # Of the source
+    number: int  # Image of the microphones at its end
+    height_m: float  # Height of the source
 
     def length_m(self, position_m: FloatArray, ego_x_m: float | FloatArray = 0.0) -> FloatArray:
-        """Length to a position (3,) on an ego at `ego_x_m` (T,)."""
+        """Return the length to a position (3,) on an ego at `ego_x_m` (T,)."""
         ahead = self.images.mirror[self.number, :2, :1] * ego_x_m
         last = np.hypot(*(self.from_m - self.images.of(self.number, position_m)[:, None] - ahead))
         return np.asarray(np.hypot(self.before_m + last, position_m[2] - self.height_m))
 
 
 def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
-    """Add a moving or standing source by all its images, and by the waves that both corners diffract."""
+    """Add a source by all its images and by the waves that both corners diffract."""
     receiver = street.receiver
     emission = source.moving(receiver.sample_rate_hz).emission
     _, heard_x = source.straight_m(receiver.centre_m, receiver)
@@ -256,7 +262,7 @@ def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Gener
 def _add_near(
     street: StreetSound, source: PlacedSource, emission: Emission, x_m: float, span: slice, share: FloatArray
 ) -> None:
-    """Add what is heard of a source while the ego is near a place; lengths are those of the ego's way."""
+    """Add the sound of a source while the ego is near a place; lengths follow the ego's motion."""
     receiver, centre = street.receiver, street.receiver.centre_m + np.array([x_m, 0.0, 0.0])
     ways, whole = ways_of(street.site, source, centre), np.zeros((len(emission.knots_s), len(OCTAVES_HZ)))
     lengths = [way.length_m(centre) for way in ways]
@@ -271,16 +277,16 @@ def _add_near(
             out[span] = receiver.arrivals(source.time_s, partial(way.length_m, position))[0]
             return out
 
-        # A standing ego's sound begins as that with which presets were set.
+        # For a standing ego the sound begins as it did when presets were fitted.
         add_to_all(street.static.out, emission, whole, travel, receiver, fades=not receiver.ego.stands)
 
 
 def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]:
-    """Return every image in which a source is seen, and what the corners bend of it."""
+    """Return the paths of all visible images of a source, and of its diffracted waves."""
     images = images_at(site, *centre_m[:2].round(3).tolist())
     place = np.stack([source.x_m, source.y_m, np.ones_like(source.x_m)])
     lit, height = images.weights(place), source.height_m
-    # At the edge of a shadow half of the amplitude is left: a quarter here, a quarter by the corner.
+    # At the edge of a shadow half of the amplitude remains: a quarter here, a quarter by the corner.
     seen = [
         Way(lit[number, :, None] ** 2 * images.kept[number], place[:2], 0.0, images, number, height)
         for number in np.flatnonzero(lit.any(axis=1)).tolist()
@@ -291,7 +297,7 @@ def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]
 def _diffracted(
     site: Site, images: Images, lit: FloatArray, place: FloatArray, centre_m: FloatArray, height_m: float
 ) -> Iterator[Way]:
-    """Yield the ways from images of a source in an arm round its corner to images of the microphones."""
+    """Yield the paths from images of a source in an arm round its corner to images of the microphones."""
     keys = [_key(one) for one in images.mirror]
     knots = np.arange(lit.shape[1])
     some = np.r_[knots[:-1:EVERY], knots[-1]]
@@ -303,7 +309,7 @@ def _diffracted(
         for ear, there in both:
             at, mirror = images.of(ear, centre_m), arm.mirror[there]
             unfolded = (np.linalg.inv(mirror) @ place)[:2]
-            # Images behind a face of the corner are in the coefficient of the wedge.
+            # Images behind a face of the corner are part of the coefficient of the wedge.
             open_to = reached[there] * (unfolded[0, some] > corner[0]) * (side * at[1] < across)
             key = _key(mirror @ images.mirror[ear])
             straight = lit[[one == key for one in keys]].sum(axis=0)
@@ -318,6 +324,6 @@ def _diffracted(
 
 
 def town_by_mirrors(receiver: Receiver, site: Site, here: Ambience) -> Town:
-    """Return a town that is heard by where the walls end, at a level of the site's own."""
+    """Return a background that enters at the ends of the walls, at the site's own level."""
     opened = images_at(site, *receiver.centre_m[:2].round(3).tolist()).opened(DIRECTIONS)
     return Town(here, site_generator(site.name, "town"), opened, SKY_SHARE, LOUDER_DB)

@@ -1,10 +1,10 @@
-"""The ways from a moving source on the crossing street to a receiver in the ego's own street.
+"""Paths from a moving source on the crossing street to a receiver in the ego's street.
 
 Both streets are unfolded: facades of the crossing street mirror the source, side walls of the ego's street
-mirror the receiver. Every pair of images is one straight line through the mouth between the two corners. It
-is either lit, and then it is that line, or it is bent round the nearer corner and pays the screen
-attenuation. The side images decide where a hidden vehicle is heard: the corner's mirror image in the
-opposite side wall lies in much shallower shadow than the corner itself.
+mirror the receiver. Every pair of images is one straight line through the mouth between the two corners. A
+lit line is straight; a shadowed one bends round the nearer corner and has the screen attenuation. The side
+images determine the apparent direction of a hidden vehicle: the corner's mirror image in the opposite side
+wall is in much shallower shadow than the corner itself.
 """
 
 import math
@@ -20,9 +20,9 @@ from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
 
 from .diffraction import EXTERIOR_RAD, edge_gain
 
-LIT_DEPTH_M = 0.25  # a line this far inside the mouth no longer touches the corner
-NEAREST_M = 0.5  # no leg round a corner is shorter
-FACADE_END_M = 0.5  # a reflection fades over this length at the end of a facade
+LIT_DEPTH_M = 0.25  # A line this far inside the mouth is not affected by the corner
+NEAREST_M = 0.5  # Shortest leg round a corner
+FACADE_END_M = 0.5  # Length over which a reflection fades at the end of a facade
 LEFT, RIGHT = 0, 1
 
 
@@ -30,7 +30,7 @@ LEFT, RIGHT = 0, 1
 class SourceImage:
     """Mirror image of the source after `opposite` and `near` reflections in the crossing street."""
 
-    x_m: float | FloatArray  # shape (T,): Where the image stands ahead of the origin, unfolded
+    x_m: float | FloatArray  # shape (T,): Unfolded distance of the image ahead of the origin
     gain: float  # Product of the reflection factors
     # Unfolded positions of the near facade that the line crosses; that facade has a gap at the mouth.
     near_planes_m: tuple[float, ...] = ()
@@ -51,11 +51,11 @@ class ReceiverImage:
     offset_m: float
     gain: float
     order: int = 0
-    # The walls met, LEFT or RIGHT, and where each lies in the unfolded street, the nearest first.
+    # The walls met, LEFT or RIGHT, and their positions in the unfolded street, the nearest first.
     walls: tuple[tuple[int, float], ...] = ()
 
     def mirror(self, y_m: FloatArray) -> FloatArray:
-        """Lateral positions in the unfolded street."""
+        """Return lateral positions in the unfolded street."""
         return self.sign * y_m + self.offset_m
 
 
@@ -64,21 +64,21 @@ DIRECT = ReceiverImage(1, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """One way, at a series of emission times."""
+    """One path at a series of emission times."""
 
-    source: SourceImage  # Image the line starts from
-    receiver: ReceiverImage  # Image it ends at
-    # shape (T,): 1 where the line is straight, 0 where it bends round the corner, smooth in between.
+    source: SourceImage  # Image at its start
+    receiver: ReceiverImage  # Image at its end
+    # shape (T,): 1 if the line is straight, 0 if it bends round the corner, smooth in between.
     lit: FloatArray
-    edge: NDArray[np.int8]  # shape (T,): The corner with the shorter way round, LEFT or RIGHT
+    edge: NDArray[np.int8]  # shape (T,): Corner of the shorter detour, LEFT or RIGHT
     bent_m: FloatArray  # shape (T,): Length round that corner to the array's centre
     gain: FloatArray  # shape (T, 8): Amplitude per octave band without spherical spreading
-    before_m: FloatArray  # shape (T,): Part of the way round that lies before the corner, seen from above
-    edge_y_m: FloatArray  # shape (T,): Where that corner is
+    before_m: FloatArray  # shape (T,): Horizontal length before the corner
+    edge_y_m: FloatArray  # shape (T,): Lateral position of that corner
 
 
 def source_images(site: Site, lane_x_m: float | FloatArray) -> list[SourceImage]:
-    """Images of a lane in the facades of the crossing street; only the lane itself where there is no wall.
+    """Return the images of a lane in the facades of the crossing street; the lane alone without a wall.
 
     Examples
     --------
@@ -100,7 +100,7 @@ def source_images(site: Site, lane_x_m: float | FloatArray) -> list[SourceImage]
 
 
 def receiver_images(site: Site) -> list[ReceiverImage]:
-    """Images of the ego's street in its side walls, up to `side_order` on either side.
+    """Return the images of the ego's street in its side walls, up to `side_order` on either side.
 
     Examples
     --------
@@ -113,7 +113,7 @@ def receiver_images(site: Site) -> list[ReceiverImage]:
     for order in range(1, site.side_order + 1):
         shift = (order // 2) * 2.0 * (left + right)
         for first, sign, near in ((LEFT, 1.0, left), (RIGHT, -1.0, right)):
-            # Unfolded outwards the walls alternate, a street's width apart.
+            # Unfolded outwards, the walls alternate at intervals of the street's width.
             walls = tuple(((first + k) % 2, sign * (near + k * (left + right))) for k in range(order))
             gain = math.prod(site.side_reflection * site.side_shares[wall] for wall, _ in walls)
             offset = sign * (shift + 2.0 * near * (order % 2))
@@ -131,10 +131,10 @@ def trace_paths(
     receiver_x_m: float | FloatArray = 0.0,
     specular: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Path]:
-    """All paths from a source that moves in the crossing street to the array's centre at (receiver_x_m, 0).
+    """Return all paths from a source that moves in the crossing street to the array at (receiver_x_m, 0).
 
-    Shapes: lane_x_m (T,), source_y_m (T,), receiver_x_m (T,), specular two of (8,): what the
-    facades of the crossing street and the side walls mirror.
+    Shapes: lane_x_m (T,), source_y_m (T,), receiver_x_m (T,), specular two of (8,): mirrored shares of the
+    facades of the crossing street and of the side walls.
     """
     facades, sides = (np.ones(len(OCTAVES_HZ)),) * 2 if specular is None else specular
     paths = []
@@ -153,22 +153,22 @@ def trace_paths(
 class Passage:
     """A line from a source in the crossing street through the mouth over time, shape (T,) each."""
 
-    # How far inside the mouth the line crosses it; negative where a corner is in the way.
+    # Distance of the line inside the mouth; negative if a corner blocks it.
     clearance_m: FloatArray
-    edge: NDArray[np.int8]  # The corner with the shorter way round, LEFT or RIGHT
-    straight_m: FloatArray  # Length of the line, and of the way round that corner
+    edge: NDArray[np.int8]  # Corner of the shorter detour, LEFT or RIGHT
+    straight_m: FloatArray  # Length of the line, and of the detour round that corner
     bent_m: FloatArray
-    aim_y_m: FloatArray  # Where the line, or the way round the corner, passes the mouth
-    turn_rad: FloatArray  # Angle between the two legs at that corner, below pi where the line is lit
-    reduced_m: FloatArray  # Product of the two legs over their sum, seen from above
+    aim_y_m: FloatArray  # Lateral position at which the line, or the detour, passes the mouth
+    turn_rad: FloatArray  # Angle between the two legs at that corner, below pi if the line is lit
+    reduced_m: FloatArray  # Product of the two horizontal legs over their sum
 
     @property
     def lit(self) -> FloatArray:
-        """1 where the line is straight, 0 where it bends round the corner, smooth in between."""
+        """Return 1 if the line is straight, 0 if it bends round the corner, smooth in between."""
         return smooth_step(self.clearance_m / LIT_DEPTH_M)
 
     def screen_gain(self, cap_db: float) -> FloatArray:
-        """Amplitude that the corner leaves, shape (T, 8)."""
+        """Return the amplitude after the corner, shape (T, 8)."""
         gain = edge_gain(self.turn_rad, self.reduced_m, self.bent_m - self.straight_m, OCTAVES_HZ)
         return np.asarray(np.maximum(gain, 10.0 ** (-cap_db / 20.0)))
 
@@ -179,7 +179,7 @@ def through_mouth(
     end_m: tuple[float | FloatArray, float],
     height_m: float,
 ) -> Passage:
-    """Follow a line from a source, beyond the mouth or in it, to an end before it.
+    """Follow a line from a source, beyond or in the mouth, to a receiver before it.
 
     Examples
     --------
@@ -191,11 +191,11 @@ def through_mouth(
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     (x, y), (end_x, end_y) = source_m, end_m
     run, depth = x - end_x, mouth - end_x
-    # A source that has turned in stands before the mouth: what counts there is where it is itself.
+    # A source that has turned in is before the mouth; its own position is used there.
     crossing = end_y + (y - end_y) * depth / np.maximum(run, depth)
     clearance = np.minimum(left - crossing, crossing - right)
-    # Over a vertical edge both legs lie in one unfolded plane. The shorter way round counts: both are equal
-    # where the corner changes, so nothing jumps there.
+    # Over a vertical edge both legs are in one unfolded plane. The shorter detour is used; both are equal
+    # when the corner changes, so the gain is continuous.
     legs = []
     for sign, at in ((1.0, left), (-1.0, right)):
         both = np.hypot(x - mouth, y - at), np.hypot(depth, at - end_y)
@@ -216,7 +216,7 @@ def side_walls(
     end_x_m: float | FloatArray,
     aim_m: tuple[float | FloatArray, FloatArray],
 ) -> FloatArray:
-    """1 where every reflection on the way to a place meets wall, 0 where one meets an opening, shape (T,).
+    """Return 1 if every reflection on the path meets wall and 0 if one meets an opening, shape (T,).
 
     Examples
     --------
@@ -236,7 +236,7 @@ def side_walls(
 
 
 def on_wall(openings_m: tuple[tuple[float, float], ...], x_m: FloatArray) -> FloatArray:
-    """1 where a wall stands, 0 in its openings, smooth over the width that a reflection takes.
+    """Return 1 on a wall and 0 in its openings, smooth over the width of a reflection.
 
     Examples
     --------
@@ -251,11 +251,11 @@ def on_wall(openings_m: tuple[tuple[float, float], ...], x_m: FloatArray) -> Flo
 
 
 def near_facade(site: Site, source: SourceImage, source_y: FloatArray, aim_y: FloatArray) -> FloatArray:
-    """1 where every reflection in the near facade meets wall, 0 where it meets the mouth, shape (T,)."""
+    """Return 1 if every reflection in the near facade meets wall and 0 if one meets the mouth, shape (T,)."""
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     weight = np.ones_like(source_y)
     for plane in source.near_planes_m:
-        # A source in the ego's own street would stand behind that facade: it meets nothing but the mouth.
+        # A source in the ego's street would be behind that facade; it meets the mouth only.
         met = aim_y + (source_y - aim_y) * (plane - mouth) / np.maximum(source.x_m - mouth, plane - mouth)
         weight *= smooth_step(np.maximum(met - left, right - met) / FACADE_END_M)
     return weight

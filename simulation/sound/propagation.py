@@ -1,4 +1,4 @@
-"""Moving sources carried along every path to every microphone, which may move as well."""
+"""Propagation of moving sources along all paths to all microphones, which may move as well."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,16 +18,16 @@ from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls
 from .receiver import Receiver, Surroundings, add_along, add_to_all, add_turning, in_own_street
 from .static_field import StaticSources
 
-BLEND_M = 0.02  # detour over which a line that touches a body turns into the way round it
+BLEND_M = 0.02  # Detour over which a line that touches a body becomes the detour round it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenImage:
     """A source in the open, or its mirror image in a wall, and the bodies between it and the array."""
 
-    x_m: FloatArray  # shape (T,): Where it stands
+    x_m: FloatArray  # shape (T,): Its position
     y_m: FloatArray
-    # shape (T, 8): Amplitude that the wall leaves, per octave; 0 where there is no reflection.
+    # shape (T, 8): Amplitude after the wall, per octave; 0 without a reflection.
     gain: FloatArray
     occluders: tuple[OccludingBody, ...]
 
@@ -39,7 +39,8 @@ def open_images(site: Site, x_m: FloatArray, y_m: FloatArray, ego_x_m: FloatArra
         for wall in walls(body):
             weight = wall.reflects(x_m, y_m, (ego_x_m, 0.0))
             if weight.any():
-                # Unfolded, the way before the reflection passes the mirror images of the other bodies.
+                # In the unfolded plan the path before the reflection passes the mirror images of the other
+                # bodies.
                 others = [one for one in site.occluders if one is not body]
                 behind = map(wall.mirrored_body, others)
                 gain = site.side_reflection * weight[:, None]
@@ -49,22 +50,22 @@ def open_images(site: Site, x_m: FloatArray, y_m: FloatArray, ego_x_m: FloatArra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScreenedLeg:
-    """Sound that goes by one point, or straight, at a series of emission times."""
+    """Sound past one point, or straight, at a series of emission times."""
 
-    # shape (T,): Way from the source to that point, seen from above; 0 for the straight line.
+    # shape (T,): Horizontal distance from the source to that point; 0 for the straight line.
     before_m: FloatArray
     via_x_m: FloatArray  # shape (T,): That point, or the source itself
     via_y_m: FloatArray
-    gain: FloatArray  # shape (T, 8): Amplitude per octave; 0 where this is not the way
+    gain: FloatArray  # shape (T, 8): Amplitude per octave; 0 if this path does not apply
 
 
 def screened_legs(
     occluders: Sequence[OccludingBody], x_m: FloatArray, y_m: FloatArray, ego_x_m: FloatArray, cap_db: float
 ) -> list[ScreenedLeg]:
-    """Return the straight way and the way round every corner of the body that is most in the way."""
+    """Return the straight path and the detours round the corners of the body with the largest detour."""
     if not occluders:
         return [ScreenedLeg(np.zeros_like(y_m), x_m, y_m, np.ones((len(y_m), len(OCTAVES_HZ))))]
-    # Only that body counts at any time; behind it the others change little.
+    # At each time one body is used; the bodies behind it change little.
     found = [detours(one, x_m, y_m, (ego_x_m, 0.0)) for one in occluders]
     worst = np.argmax([detour for detour, _ in found], axis=0)
     detour = np.max([one for one, _ in found], axis=0)
@@ -80,9 +81,9 @@ def screened_legs(
     return legs
 
 
-TYPICAL_LEG_M = 8.0  # source to corner; only the tilt of the last leg depends on it
+TYPICAL_LEG_M = 8.0  # Source to corner; affects only the tilt of the last leg
 ANY_ORDER = range(99)
-FAINTEST = 3e-3  # a path below this share of the whole amplitude is left out (features: 4e-4 rms)
+FAINTEST = 3e-3  # Paths below this share of the total amplitude are left out (features change by 4e-4 rms)
 
 
 def add_sources(
@@ -91,7 +92,7 @@ def add_sources(
     around: Surroundings,
     reflections: range = ANY_ORDER,
 ) -> None:
-    """Add moving sources to all microphones, by every path with so many reflections."""
+    """Add moving sources to all microphones by all paths up to a number of reflections."""
     if around.site.is_open:
         for source in sources if 0 in reflections else ():
             _add_open(static.out, source, around)
@@ -130,15 +131,15 @@ def _beside(
     heard_x_m: float | FloatArray,
     around: Surroundings,
 ) -> Path:
-    """Return the path of a source that stands, as far as `share` says, in the ego's own street.
+    """Return the path of a source whose `share` is in the ego's own street.
 
     Shapes: share, heard_x_m (T,), specular (8,).
     """
     image, order = path.receiver, path.source.order
     if order % 2:
-        return path  # by the wall opposite: through the mouth, as from the crossing street
+        return path  # By the wall opposite: through the mouth, as from the crossing street
     if order:
-        # The near facade comes first, and there a source in the own street stands behind it.
+        # The near facade comes first, and a source in the ego's street is behind it.
         return replace(path, gain=path.gain * (1.0 - share)[:, None])
     across = source.y_m - image.offset_m
     above = around.receiver.above(source.height_m)
@@ -154,21 +155,21 @@ def _beside(
 
 
 def _media(length_m: FloatArray, source: MovingSource, around: Surroundings) -> float | FloatArray:
-    """Amplitude that air and road leave per octave, shape (T, 8)."""
+    """Return the amplitude after air and road per octave, shape (T, 8)."""
     if not around.outdoors:
         return 1.0
     return air_gain(length_m) * ground_gain(length_m, source.height_m, float(around.receiver.centre_m[2]))
 
 
 def _audible(paths: list[Path]) -> list[Path]:
-    """Paths that at some moment carry more than `FAINTEST` of the whole amplitude."""
+    """Return the paths that at some time exceed `FAINTEST` of the total amplitude."""
     strength = np.array([path.gain.max(axis=1) / path.bent_m for path in paths])
     share = strength / np.maximum(strength.sum(axis=0), 1e-30)
     return [path for path, peak in zip(paths, share.max(axis=1), strict=True) if peak > FAINTEST]
 
 
 def _add_bent(out: Float32Array, source: MovingSource, path: Path, edge: int, around: Surroundings) -> None:
-    """Add what reaches the array's centre round one corner."""
+    """Add the sound that reaches the array's centre round one corner."""
     made = source.emission.table(path.gain * ((1.0 - path.lit) * (path.edge == edge))[:, None])
     if made is None:
         return
@@ -181,7 +182,7 @@ def _add_bent(out: Float32Array, source: MovingSource, path: Path, edge: int, ar
 
 
 def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Receiver) -> None:
-    """Add what reaches every microphone along the straight line."""
+    """Add the sound that reaches every microphone along the straight line."""
 
     def travel(position: FloatArray) -> FloatArray:
         across = source.y_m - path.receiver.mirror(position[1:2])
@@ -197,7 +198,7 @@ def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray)
 
 
 def _add_open(out: Float32Array, source: MovingSource, around: Surroundings) -> None:
-    """Add what reaches every microphone in the open: straight, by a wall, or round a body."""
+    """Add the sound that reaches every microphone in the open: straight, by a wall, or round a body."""
     receiver, knots, ahead = around.receiver, source.emission.knots_s, source.ahead_m
     flat = source.y_m**2 + receiver.above(source.height_m) ** 2
     _, heard_x = receiver.arrivals(knots, partial(_slant, ahead, flat))
@@ -209,7 +210,7 @@ def _add_open(out: Float32Array, source: MovingSource, around: Surroundings) -> 
 
 
 def _add_leg(out: Float32Array, source: MovingSource, leg: ScreenedLeg, receiver: Receiver) -> None:
-    """Add what reaches every microphone by one point, or straight."""
+    """Add the sound that reaches every microphone past one point, or straight."""
 
     def travel(position: FloatArray) -> FloatArray:
         along, across = leg.via_x_m - position[0], leg.via_y_m - position[1]
@@ -228,7 +229,7 @@ def _round(
 def _add_corners(
     static: StaticSources, bent: Float32Array, images: list[ReceiverImage], around: Surroundings
 ) -> None:
-    """Let every corner, as every side image sees it, sound to all microphones."""
+    """Add the sound of every corner, in every side image, to all microphones."""
     site, receiver = around.site, around.receiver
     places = [(image, y) for image in images for y in (site.corner_left_m, -site.corner_right_m)]
     signals = bent.reshape(-1, bent.shape[2])
@@ -244,7 +245,7 @@ def _add_corners(
 
 
 def _corner_delays(image: ReceiverImage, corner_y: float, mouth: float, receiver: Receiver) -> FloatArray:
-    """Delay of every microphone against the array's centre for sound from a corner, shape (M,)."""
+    """Return the delay of every microphone relative to the centre for sound from a corner, shape (M,)."""
     x, y, z = receiver.positions_m.T
     last_leg = np.hypot(mouth - x, image.mirror(y) - corner_y)
     to_centre = np.hypot(mouth, image.offset_m - corner_y)

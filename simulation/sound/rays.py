@@ -1,11 +1,11 @@
-"""The second renderer: energy carried by rays through houses, and sound made anew from it.
+"""The second renderer: rays through houses carry energy, from which sound is synthesised.
 
-It shares nothing of the first one's propagation: no images, no screens, no late field. Rays leave the array,
-meet houses that stand back, stand apart and end, and are mirrored or scattered; by reciprocity the way of a
-ray is the way of sound to the array. What they deposit in a cell of the plan is how loud a source there is
-from every direction, per octave. Direct sound and the two corners, of which rays know nothing, are added by
-the uniform theory of diffraction. Delays of single echoes are not kept: every direction is a plane wave that
-carries the source's sound through a decaying noise of its own.
+It shares no propagation code with the first renderer: no images, no screens, no late field. Rays leave the
+array, meet houses with setbacks, gaps and ends, and are mirrored or scattered; by reciprocity the path of a
+ray is the path of sound to the array. The energy that they deposit in a cell of the plan is the level of a
+source there from every direction, per octave. Direct sound and the two corners, which rays do not cover, are
+added by the uniform theory of diffraction. Delays of single echoes are not kept: every direction is a plane
+wave with the source's sound, convolved with its own decaying noise.
 
 Sources: H. Kuttruff, "Room Acoustics", 6th ed., 2016, ch. 9 (rays); R. G. Kouyoumjian and P. H. Pathak, "A
 uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62,
@@ -31,14 +31,14 @@ from .receiver import Receiver, add_along, add_to_all, passed_places
 from .static_field import PlacedSource, StreetSound, plane_wave_delays, unit_vectors
 
 RAYS, BOUNCES, STEP_M = 100_000, 40, 1.0
-CELL_M, PLAN_M = 2.0, ((-40.0, 40.0), (-90.0, 90.0))  # x and y of the plan that is kept
-BELOW_M = 2.0  # sources stand below it
-STEEPEST = 0.5  # sine of the elevation of rays; steeper ones leave over the roofs
+CELL_M, PLAN_M = 2.0, ((-40.0, 40.0), (-90.0, 90.0))  # x and y limits of the stored plan
+BELOW_M = 2.0  # Upper limit of the height of sources
+STEEPEST = 0.5  # Sine of the elevation of rays; steeper ones leave over the roofs
 DIRECTIONS, ELEVATION_RAD, LATER_M = 24, 0.1, 3.0
-ABSORBED, SCATTERED, HEIGHT_M = (0.03, 0.3), (0.05, 0.6), (5.0, 14.0)  # of a house
+ABSORBED, SCATTERED, HEIGHT_M = (0.03, 0.3), (0.05, 0.6), (5.0, 14.0)  # Ranges for a house
 FRONT_M, SETBACK_M, GAP_M, GAPS = (6.0, 18.0), 1.0, (2.5, 5.0), 0.2
 EARLY_BOUNCES = 2
-FAINTEST = 1e-3  # of the energy at its loudest: a direction below it is left out
+FAINTEST = 1e-3  # Directions below this share of the maximum energy are left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,12 +47,12 @@ class Houses:
 
     ends_m: FloatArray  # shape (W, 2, 2): Both ends of every front, x and y
     height_m: FloatArray  # shape (W,)
-    kept: FloatArray  # shape (W, 8): Share of the energy that comes back, per octave
-    scattered: FloatArray  # shape (W,): Share of that which is scattered
+    kept: FloatArray  # shape (W, 8): Reflected share of the energy, per octave
+    scattered: FloatArray  # shape (W,): Scattered share of the reflected energy
 
 
 def drawn_houses(site: Site) -> Houses:
-    """Draw the houses of a site; those at its corners stand where its plan says.
+    """Draw the houses of a site; those at its corners follow its plan.
 
     Examples
     --------
@@ -63,7 +63,7 @@ def drawn_houses(site: Site) -> Houses:
     rng = site_generator(site.name, "houses")
     ahead, (left, right) = site.corner_ahead_m, (site.corner_left_m, -site.corner_right_m)
     (back, _), (_, far) = PLAN_M
-    # Rows as their beginning, their direction, how far they go, and the way back from the street.
+    # Each row: start, direction, length, and the direction away from the street.
     rows = [
         ((ahead, left), (0.0, 1.0), far, (-1.0, 0.0)),
         ((ahead, right), (0.0, -1.0), far, (-1.0, 0.0)),
@@ -72,7 +72,7 @@ def drawn_houses(site: Site) -> Houses:
     ]
     if site.opposite_wall_m is not None:
         rows += [((site.opposite_wall_m, 0.0), (0.0, side), far, (1.0, 0.0)) for side in (1.0, -1.0)]
-    elif rng.random() < 0.5:  # the own street goes on beyond a crossing
+    elif rng.random() < 0.5:  # The ego's street continues beyond a crossing
         beyond = site.far_kerb_m + site.verge_m
         rows += [((beyond, side * 4.0), (0.0, side), far, (1.0, 0.0)) for side in (1.0, -1.0)]
     fronts = [front for row in rows for front in _row(*row, rng)]
@@ -88,13 +88,13 @@ Point = tuple[float, float]
 def _row(
     begin_m: Point, along: Point, length_m: float, back: Point, rng: np.random.Generator
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Draw a row of houses; the first one is at the street, the others up to some metres behind it."""
+    """Draw a row of houses; the first one is at the street, the others up to some metres behind."""
     at, fronts, behind = 0.0, [], 0.0
     while at < length_m:
         width = rng.uniform(*FRONT_M)
         start = np.array(begin_m) + at * np.array(along) + behind * np.array(back)
         end = start + width * np.array(along)
-        side = 12.0 * np.array(back)  # a house is so deep: gaps have walls
+        side = 12.0 * np.array(back)  # Depth of a house: gaps have walls
         fronts += [(start, end), (end, end + side), (start, start + side)]
         at += width + (rng.uniform(*GAP_M) if rng.random() < GAPS else 0.0)
         behind = abs(SETBACK_M * rng.standard_normal())
@@ -103,11 +103,12 @@ def _row(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reached:
-    """How loud a source in every cell of the plan is at the array, without the direct sound."""
+    """Level at the array of a source in every cell of the plan, without the direct sound."""
 
-    energy: FloatArray  # shape (X, Y, K, 8): Squared pressure from every direction, that at 1 m in the open 1
+    # shape (X, Y, K, 8): Squared pressure from every direction, relative to 1 m in the open
+    energy: FloatArray
     early: FloatArray  # shape (K,): Share of it after few reflections
-    open: FloatArray  # shape (K,): Share of all that comes in between the houses; they sum to one
+    open: FloatArray  # shape (K,): Share of each direction in the sound from outside; they sum to one
     decay_s: float  # Reverberation time
 
 
@@ -118,7 +119,7 @@ def azimuths_rad() -> FloatArray:
 
 @lru_cache(maxsize=40)  # All places of a drive
 def reached(site: Site, height_m: float, x_m: float = 0.0) -> Reached:
-    """Trace the rays of a site once, from the stop or from another place on the way there."""
+    """Trace the rays of a site once, from the stop or from another place on the path to it."""
     rays = RAYS if x_m == 0.0 else RAYS // 4
     return trace(drawn_houses(site), height_m, site_generator(site.name, "rays"), rays, x_m)
 
@@ -130,12 +131,12 @@ def _reached_by(receiver: Receiver, site: Site, x_m: float = 0.0) -> Reached:
 def trace(
     houses: Houses, height_m: float, rng: np.random.Generator, rays: int = RAYS, x_m: float = 0.0
 ) -> Reached:
-    r"""Send rays from the array at (x, 0), so high, and collect what they leave in the plan.
+    r"""Send rays from the array at (x, 0) and a height, and collect their energy in the plan.
 
     .. math:: p^2(\text{cell}, \text{direction}) = 4 \pi \frac{\sum E\, l}{V}
 
-    of rays that left in this direction, l metres of which lie in the cell of volume V; the road mirrors, and
-    source levels stand over hard ground already.
+    of rays that left in this direction, l metres of which are in the cell of volume V. The road mirrors;
+    source levels already include hard ground.
     """
     going = _launched(height_m, rays, rng, x_m)
     shape = (*(round((high - low) / CELL_M) for low, high in PLAN_M), DIRECTIONS, len(OCTAVES_HZ))
@@ -162,19 +163,19 @@ def trace(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rays:
-    """Rays that are still between the houses; the road is unfolded, so that heights may be negative."""
+    """Rays that are still between the houses; the road is unfolded, so heights may be negative."""
 
-    direction: IndexArray  # shape (n,): The one in which each left the array
+    direction: IndexArray  # shape (n,): Direction in which each left the array
     at_m: FloatArray  # shape (n, 2)
-    flat: FloatArray  # shape (n, 2): Unit vector of its way seen from above
+    flat: FloatArray  # shape (n, 2): Horizontal unit vector of its path
     height_m: FloatArray  # shape (n,)
-    slope: FloatArray  # shape (n,): Rise in a metre seen from above
+    slope: FloatArray  # shape (n,): Rise per horizontal metre
     gone_m: FloatArray  # shape (n,)
     energy: FloatArray  # shape (n, 8)
 
 
 def _launched(height_m: float, count: int, rng: np.random.Generator, x_m: float) -> _Rays:
-    """Send rays from the array into all azimuths, and elevations up to the steepest, alike."""
+    """Send rays from the array uniformly into all azimuths and elevations up to the steepest."""
     azimuth = rng.uniform(-np.pi, np.pi, count)
     sine = rng.uniform(-STEEPEST, STEEPEST, count)
     return _Rays(
@@ -189,7 +190,7 @@ def _launched(height_m: float, count: int, rng: np.random.Generator, x_m: float)
 
 
 def _next_wall(houses: Houses, rays: _Rays) -> tuple[IndexArray, FloatArray]:
-    """Return the front that every ray meets next and how far it is seen from above; infinite for none."""
+    """Return the next front that every ray meets and its horizontal distance; infinite for none."""
     (x, y), (flat_x, flat_y) = rays.at_m.T, rays.flat.T
     nearest, which = np.full(len(x), np.inf), np.zeros(len(x), np.intp)
     for number, (start, end) in enumerate(houses.ends_m):
@@ -204,7 +205,7 @@ def _next_wall(houses: Houses, rays: _Rays) -> tuple[IndexArray, FloatArray]:
 
 
 def _deposit(left: FloatArray, rays: _Rays, way_m: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Leave the energy of every ray in the cells on its way, and return what each direction left."""
+    """Add the energy of every ray to the cells on its path, and return the energy that left per direction."""
     longest = np.minimum(way_m, 120.0)
     count = np.ceil(longest / STEP_M).astype(int)
     ray = np.repeat(np.arange(len(way_m)), count)
@@ -226,14 +227,14 @@ def _deposit(left: FloatArray, rays: _Rays, way_m: FloatArray, rng: np.random.Ge
 def _reflected(
     houses: Houses, rays: _Rays, wall: IndexArray, way_m: FloatArray, met: BoolArray, rng: np.random.Generator
 ) -> _Rays:
-    """Return the rays that met a front below its roof, mirrored there, or sent anywhere by Lambert's law."""
+    """Return the rays that met a front below its roof, mirrored or scattered by Lambert's law."""
     on = met & (np.abs(rays.height_m + rays.slope * way_m) < houses.height_m[wall])
     wall, way, slope, flat = wall[on], way_m[on], rays.slope[on], rays.flat[on]
     at, far = rays.at_m[on] + way[:, None] * flat, way * np.hypot(1.0, slope)
     new_flat, new_slope = _new_ways(houses, wall, flat, slope, rng)
     return _Rays(
         rays.direction[on],
-        at + 1e-6 * new_flat,  # off the front, so that the next one is another
+        at + 1e-6 * new_flat,  # Away from the front, so that the next front is another one
         new_flat,
         rays.height_m[on] + slope * way,
         new_slope,
@@ -245,12 +246,12 @@ def _reflected(
 def _new_ways(
     houses: Houses, wall: IndexArray, flat: FloatArray, slope: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where rays go on from a front, seen from above, and their slopes."""
+    """Return the horizontal directions of rays after a front, and their slopes."""
     along = houses.ends_m[wall, 1] - houses.ends_m[wall, 0]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
     towards = np.einsum("nd,nd->n", flat, normal)
     mirrored = flat - 2.0 * towards[:, None] * normal
-    # Of a cosine lobe: distance from the normal in the plane of the front, drawn evenly over the unit disc.
+    # Cosine lobe: the distance from the normal in the plane of the front, drawn uniformly over the unit disc.
     radius, turn = np.sqrt(rng.random(len(flat))), rng.uniform(0.0, 2.0 * np.pi, len(flat))
     outward = -np.sign(towards)[:, None] * normal
     beside = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
@@ -262,7 +263,7 @@ def _new_ways(
 
 
 def _decay_s(length_m: FloatArray, energy: FloatArray) -> float:
-    """Reverberation time of the energy that has gone 40 to 160 m."""
+    """Return the reverberation time of energy that has travelled 40 to 160 m."""
     edges = np.linspace(40.0, 160.0, 7)
     total, _ = np.histogram(length_m, edges, weights=energy)
     if (total <= 0.0).any():
@@ -271,11 +272,11 @@ def _decay_s(length_m: FloatArray, energy: FloatArray) -> float:
     return float(np.clip(-60.0 / (min(per_m, -1e-3) * SPEED_OF_SOUND_MPS), 0.15, 1.5))
 
 
-LIT_BLEND_M = 0.5  # of a source's way, over which it comes into the straight line
+LIT_BLEND_M = 0.5  # Length of a source's path over which direct sound appears
 
 
 def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
-    """Add a moving or standing source by all that rays found, round both corners, over roofs, straight."""
+    """Add a source by all ray directions, round both corners, over roofs, and straight."""
     static, site, receiver = street.static, street.site, street.receiver
     emission = source.moving(receiver.sample_rate_hz).emission
     length, heard_x = receiver.arrivals(source.time_s, partial(_way_m, site, source))
@@ -298,20 +299,20 @@ def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Way:
-    """A direction from which a source is heard."""
+    """A direction from which the sound of a source arrives."""
 
     azimuth_rad: float
     elevation_rad: float
-    gain: FloatArray  # shape (T, 8): Against the pressure at 1 m
-    early: float = 1.0  # Share of the energy that is an echo; the rest decays
+    gain: FloatArray  # shape (T, 8): Relative to the pressure at 1 m
+    early: float = 1.0  # Share of the energy in an echo; the rest decays
     decay_s: float = 0.0
-    later_m: float = 0.0  # Beyond the way by the mouth
+    later_m: float = 0.0  # Length beyond the path through the mouth
 
 
 def _echoes(
     source: PlacedSource, street: StreetSound, heard_x_m: FloatArray, rng: np.random.Generator
 ) -> list[_Way]:
-    """Return the directions from which rays came; between two places their energy is blended."""
+    """Return the directions of the rays; the energy is blended between two places."""
     energy = np.zeros((len(heard_x_m), DIRECTIONS, len(OCTAVES_HZ)))
     early, decay_s = np.zeros(DIRECTIONS), 0.0
     for x_m, span, share in passed_places(heard_x_m, CELL_M):
@@ -319,7 +320,7 @@ def _echoes(
         energy[span] += share[:, None, None] * _at(here.energy, source.x_m[span], source.y_m[span])
         early, decay_s = early + part * here.early, decay_s + part * here.decay_s
     loud = energy.sum(axis=2).max(axis=0)
-    # Echoes do not come all at once.
+    # Echoes arrive at different times.
     return [
         _Way(
             azimuths_rad()[k],
@@ -334,7 +335,7 @@ def _echoes(
 
 
 def _edges(source: PlacedSource, street: StreetSound, heard_x_m: FloatArray, lit: FloatArray) -> list[_Way]:
-    """Return the ways round both corners and over the nearest roof, of a source that is not seen."""
+    """Return the paths of a hidden source round both corners and over the nearest roof."""
     site, ways, dark = street.site, list[_Way](), 1.0 - lit
     corners = site.corner_left_m, -site.corner_right_m
     for (x_m, span, share), across in product(passed_places(heard_x_m, CELL_M), corners):
@@ -349,7 +350,7 @@ def _edges(source: PlacedSource, street: StreetSound, heard_x_m: FloatArray, lit
 
 
 def _roof_gain(way_m: FloatArray, height_m: float, receiver: Receiver) -> FloatArray:
-    r"""Amplitude over the nearest roof, shape (T, 8): ISO 9613-2, eq. (14), a thin screen, at most 20 dB.
+    r"""Return the amplitude over the nearest roof, (T, 8): ISO 9613-2, eq. (14), thin screen, at most 20 dB.
 
     .. math:: D = 10 \log_{10}(3 + 20 z / \lambda)
     """
@@ -360,18 +361,18 @@ def _roof_gain(way_m: FloatArray, height_m: float, receiver: Receiver) -> FloatA
     return np.asarray(10.0 ** (-np.minimum(loss, 20.0) / 20.0) / away[:, None])
 
 
-ROOF_M, ROOF_RAD = (6.0, 8.0), 0.5  # how far away and how high it is, and how steep sound comes from there
+ROOF_M, ROOF_RAD = (6.0, 8.0), 0.5  # Distance and height of the roof, and elevation of the sound from there
 
 
 def _lit(site: Site, source: PlacedSource, heard_x_m: FloatArray) -> FloatArray:
-    """1 where the array sees a source, 0 where a corner is before it, shape (T,)."""
+    """Return 1 if the array has line of sight to a source and 0 if a corner blocks it, shape (T,)."""
     right, left = site.sights_m(np.maximum(source.x_m, site.corner_ahead_m), (heard_x_m, 0.0))
     inside = np.minimum(left - source.y_m, source.y_m - right)
     return np.clip(0.5 + inside / LIT_BLEND_M, 0.0, 1.0) ** 2
 
 
 def _way_m(site: Site, source: PlacedSource, ego_x_m: FloatArray) -> FloatArray:
-    """Way from above by the middle of the mouth where a source is beside it, shape (T,)."""
+    """Return the horizontal path length, by the middle of the mouth for a source beside it, shape (T,)."""
     wide = min(site.corner_left_m, site.corner_right_m)
     over = np.sign(source.y_m) * np.minimum(np.abs(source.y_m), wide)
     return np.asarray(
@@ -381,7 +382,7 @@ def _way_m(site: Site, source: PlacedSource, ego_x_m: FloatArray) -> FloatArray:
 
 
 def _at(energy: FloatArray, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-    """Energy at places of the plan, between the middles of its cells, shape (T, K, 8)."""
+    """Return the energy at positions in the plan, interpolated between cells, shape (T, K, 8)."""
     out = np.zeros((len(x_m), *energy.shape[2:]))
     low = np.array(PLAN_M)[:, 0]
     at = (np.stack([x_m, y_m], axis=1) - low) / CELL_M - 0.5
@@ -396,7 +397,7 @@ def _at(energy: FloatArray, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
 
 
 def _smeared(table: SampledSignal, early: float, decay_s: float, rng: np.random.Generator) -> SampledSignal:
-    """Pass a signal through an echo and a decaying noise, of unit energy together."""
+    """Convolve a signal with an echo and a decaying noise, of unit energy together."""
     tail = np.arange(max(int(0.7 * decay_s * table.rate_hz), 2))
     noise = rng.standard_normal(len(tail)) * 10.0 ** (-3.0 * tail / (decay_s * table.rate_hz))
     response = np.sqrt(max(1.0 - early, 0.0) / np.square(noise).sum()) * noise
@@ -406,5 +407,5 @@ def _smeared(table: SampledSignal, early: float, decay_s: float, rng: np.random.
 
 
 def town_by_rays(receiver: Receiver, site: Site, here: Ambience) -> Town:
-    """Return a town that is heard by the gaps and ends of the streets where rays got out."""
+    """Return a background that enters through the gaps and ends of the streets."""
     return Town(here, site_generator(site.name, "town"), _reached_by(receiver, site).open)

@@ -1,4 +1,4 @@
-"""Microphones that stand or move, and what sound meets on its way to them."""
+"""Standing or moving microphones, and the media between them and the sources."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -16,18 +16,19 @@ from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, EgoMotion
 from .delay import KNOT_SAMPLES, PHASES, Emission, Phases, SampledSignal, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 
-NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
+NEAREST_M = 0.5  # Shortest distance to a microphone, which limits the level
 ARRIVAL_ROUNDS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """Microphones, how they move, and the times at which they listen."""
+    """Microphones, their motion, and the sample times."""
 
     positions_m: FloatArray  # shape (M, 3): In `base_link`, z above the road
     skew_s: FloatArray  # shape (M,): Phase mismatch of every channel as a delay
-    knots_s: FloatArray  # shape (K + 1,): Receive times of the knots; K * KNOT_SAMPLES samples are heard
-    ego: EgoMotion = field(default_factory=EgoMotion)  # How `base_link` moves along x
+    # shape (K + 1,): Receive times of the knots, between which K * KNOT_SAMPLES samples are rendered
+    knots_s: FloatArray
+    ego: EgoMotion = field(default_factory=EgoMotion)  # Motion of `base_link` along x
 
     @property
     def samples(self) -> int:
@@ -36,7 +37,7 @@ class Receiver:
 
     @property
     def sample_rate_hz(self) -> float:
-        """Rate at which is heard."""
+        """Sample rate."""
         return float(KNOT_SAMPLES / (self.knots_s[1] - self.knots_s[0]))
 
     @property
@@ -46,7 +47,7 @@ class Receiver:
 
     @property
     def reach_knots(self) -> int:
-        """Knots within which all microphones hear what the centre hears now."""
+        """Number of knots within which sound at the centre reaches all microphones."""
         offsets = np.linalg.norm(self.positions_m - self.centre_m, axis=1) / SPEED_OF_SOUND_MPS
         return int(np.ceil((offsets + np.abs(self.skew_s)).max() * self.sample_rate_hz / KNOT_SAMPLES)) + 1
 
@@ -57,13 +58,13 @@ class Receiver:
     def arrivals(
         self, emit_s: FloatArray, length_m: Callable[[FloatArray], FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        r"""Solve a = t + r(x(a)) / c for what is emitted at t and heard at a by an ego at x.
+        r"""Solve a = t + r(x(a)) / c for sound that is emitted at t and received at a by an ego at x.
 
         Shapes: emit_s (T,), length_m (T,).
         """
         x = self.ego.x_m(emit_s)
         length = length_m(x)
-        # The ego is far slower than sound: every round is wrong by v / c < 6 % of what the last one was.
+        # The ego is far slower than sound: each round reduces the error to v / c < 6 % of the last one.
         for _ in range(0 if self.ego.stands else ARRIVAL_ROUNDS):
             x = self.ego.x_m(emit_s + length / SPEED_OF_SOUND_MPS)
             length = length_m(x)
@@ -71,10 +72,11 @@ class Receiver:
 
 
 def passed_places(heard_x_m: FloatArray, step_m: float) -> Iterator[tuple[float, slice, FloatArray]]:
-    """Yield the places, evenly spaced, near which an ego at `heard_x_m` (T,) is when sound arrives.
+    """Yield the evenly spaced places near which an ego at `heard_x_m` (T,) receives the sound.
 
-    Each with the knots at which sound is heard near it, two more at either end, and its share at these: 1 at
-    the place, 0 at the next one. All shares add up to one, so that the gains of places blend without a step.
+    Each place comes with the knots of the sound received near it, two more at either end, and its share at
+    these knots: 1 at the place, 0 at the next one. The shares sum to one, so that the gains of places blend
+    smoothly.
 
     Examples
     --------
@@ -91,7 +93,7 @@ def passed_places(heard_x_m: FloatArray, step_m: float) -> Iterator[tuple[float,
 
 
 def standing_m(array: MicrophoneArray) -> FloatArray:
-    """Positions in `base_link`, z above the road, of an array with its centre at `ARRAY_HEIGHT_M`, (M, 3).
+    """Return the positions in `base_link`, z above the road, of an array centred at `ARRAY_HEIGHT_M`, (M, 3).
 
     Examples
     --------
@@ -107,7 +109,7 @@ def standing_m(array: MicrophoneArray) -> FloatArray:
 
 
 def distance_m(place_m: FloatArray, x_m: FloatArray, offset_m: FloatArray) -> FloatArray:
-    """Distance from a place to a point fixed at `offset_m` on an ego at `x_m` (T,)."""
+    """Return the distance from a place to a point at `offset_m` on an ego at `x_m` (T,)."""
     across = np.hypot(place_m[1] - offset_m[1], place_m[2] - offset_m[2])
     return np.asarray(np.hypot(place_m[0] - offset_m[0] - x_m, across))
 
@@ -115,7 +117,7 @@ def distance_m(place_m: FloatArray, x_m: FloatArray, offset_m: FloatArray) -> Fl
 def add_along(
     out: Float32Array, table: SampledSignal, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
 ) -> None:
-    """Add what was emitted at the knots `emit_s` and has gone `travel_m`, weaker the longer the way."""
+    """Add sound that was emitted at the knots `emit_s` and has travelled `travel_m`, with spreading loss."""
     emit = emission_times(receive_s, emit_s, travel_m)
     length = np.interp(np.nan_to_num(emit), emit_s, travel_m)
     add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
@@ -130,13 +132,13 @@ def add_to_all(
     *,
     fades: bool = False,
 ) -> None:
-    """Add a sound, weighted by gains (T, 8), to all microphones; its way to a position is `travel_m` (T,)."""
+    """Add a sound with gains (T, 8) to all microphones; `travel_m` (T,) is its path to a position."""
     made = emission.table(gain, fades=fades)
     if made is None:
         return
     table, span = made
-    # Rendered once, for the centre: every microphone hears that a little earlier or later, and looking up
-    # every sample for each of them took twice as long.
+    # The sound is rendered once, for the centre; every microphone receives it a little earlier or later. A
+    # look-up of every sample for each microphone took twice as long.
     knots, step, reach = receiver.knots_s, KNOT_SAMPLES / receiver.sample_rate_hz, receiver.reach_knots
     emit_s, way = emission.knots_s[span], travel_m(receiver.centre_m)[span]
     heard_s = emit_s + way / SPEED_OF_SOUND_MPS
@@ -162,7 +164,7 @@ def add_to_all(
 def add_turning(
     out: Float32Array, signal: Float32Array, place_m: FloatArray, gain: FloatArray, receiver: Receiver
 ) -> None:
-    """Spread over the microphones of a moving ego what its centre hears from a place that stands still."""
+    """Spread the sound at the centre of a moving ego over its microphones, for a fixed source position."""
     knots, reach = receiver.knots_s, receiver.reach_knots
     blocks = signal.reshape(-1, KNOT_SAMPLES)
     loud = np.flatnonzero(np.abs(blocks).max(axis=1) * np.maximum(gain[:-1], gain[1:]) > 0.0)
@@ -171,7 +173,7 @@ def add_turning(
     first, last = int(loud[0]), int(loud[-1]) + 1
     ramp = np.arange(KNOT_SAMPLES) / KNOT_SAMPLES
     factor = gain[first:last, None] + np.diff(gain[first : last + 1])[:, None] * ramp
-    # A length that the transform likes: silence at the end costs less.
+    # A length with a fast transform; silence at its end costs less.
     part = np.zeros((next_fast_len(last - first + 2 * reach, real=True), KNOT_SAMPLES), np.float32)
     part[reach : reach + last - first] = blocks[first:last] * factor
     phases = Phases(resample_whole(part.ravel(), PHASES))
@@ -182,34 +184,34 @@ def add_turning(
     step = knots[1] - knots[0]
     for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
         wanted = at_s - skew - distance_m(place_m, here, position) / SPEED_OF_SOUND_MPS
-        # What the centre hears before the beginning and after the end is not known.
+        # The sound at the centre before the beginning and after the end is unknown.
         heard = np.interp(wanted, left, knots, left=np.nan, right=np.nan)
         at = ((heard - knots[0]) / step - (first - reach)) * (KNOT_SAMPLES * PHASES)
         phases.add_to(microphone[rows.start * KNOT_SAMPLES : rows.stop * KNOT_SAMPLES], at, even)
 
 
-# Behind the corners both descriptions of a source between them agree, so the length matters little.
+# Behind the corners both models of a source between them agree, so the length has little effect.
 MOUTH_BLEND_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """Walls and bodies between the sources and the microphones, and what they do to sound."""
+    """Walls and bodies between the sources and the microphones, and their effect on sound."""
 
     site: Site
     receiver: Receiver
     cap_db: float  # Largest screen attenuation
-    # shape (8,): Share of the energy that rough walls scatter instead of mirroring it, per octave.
+    # shape (8,): Share of the energy that rough walls scatter in place of mirroring it, per octave.
     scattering: FloatArray = field(default_factory=lambda: np.zeros(len(OCTAVES_HZ)))
     outdoors: bool = False  # Whether air and road change the sound
 
     def scattered(self, beyond_mouth: bool) -> FloatArray:
-        """Share that the crossing street's facades, or the side walls, scatter, shape (8,)."""
+        """Return the share that the crossing street's facades, or the side walls, scatter, shape (8,)."""
         return np.minimum(self.scattering * self.site.roughness[int(beyond_mouth)], 1.0)
 
 
 def in_own_street(site: Site, x_m: float | FloatArray, y_m: FloatArray) -> FloatArray:
-    """1 where a source stands between the side walls of the ego's street, 0 beyond its mouth, shape (T,).
+    """Return 1 if a source is between the side walls of the ego's street and 0 beyond its mouth, shape (T,).
 
     Examples
     --------

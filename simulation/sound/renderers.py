@@ -1,4 +1,4 @@
-"""What carries the sound of a street, by `Site.renderer`."""
+"""The renderers of a street, by `Site.renderer`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from .static_field import PlacedSource, StreetSound
 
 @dataclass(frozen=True, slots=True)
 class Renderer:
-    """How the sound of a point, and that of a town, reach the microphones of a street of drawn walls."""
+    """Functions that carry a point source and the background to the microphones, for drawn walls."""
 
     add_source: Callable[[StreetSound, PlacedSource, np.random.Generator], None]
     town: Callable[[Receiver, Site, Ambience], Town]
-    over_roofs: bool  # Whether it carries what stands in neither street, too
+    over_roofs: bool  # Whether it carries sources outside both streets, too
 
 
-# All other sites: along the paths of their plan, for which a vehicle has several points and a late field.
+# All other sites use the paths of their plan, for which a vehicle has several points and a late field.
 RENDERERS = {
     "rays": Renderer(add_traced, town_by_rays, over_roofs=True),
     "mirrors": Renderer(add_mirrored, town_by_mirrors, over_roofs=False),
@@ -40,7 +40,7 @@ def add_ambience(
     rng: np.random.Generator,
     here: Ambience | None = None,
 ) -> None:
-    """Add all that a street without a vehicle sounds like; what a recording makes of it, unless given."""
+    """Add the background of a street without a vehicle; the recording's ambience is drawn unless given."""
     here = here or recording_ambience(site_ambience(site, preset), preset, rng)
     if renderer := RENDERERS.get(site.renderer):
         add_town(out, receiver, preset, rng, renderer.town(receiver, site, here))

@@ -1,15 +1,15 @@
-r"""Rough walls: patches of facade that send a vehicle's sound on from where they are.
+r"""Rough walls: patches of facade that scatter a vehicle's sound.
 
-A wall with reveals, doors, pipes and gaps mirrors only a part of what falls on it; the rest leaves every
-patch in all directions (Lambert). Patches stand still, so what they send arrives from fixed azimuths however
-the vehicle moves, and those on the side walls near the mouth are lit long before the array is: this is how
-an empty-looking street is heard to fill up.
+A wall with reveals, doors, pipes and gaps mirrors only a part of the incident sound; the rest leaves every
+patch in all directions (Lambert). Patches do not move, so their sound arrives from fixed azimuths for any
+motion of the vehicle. Patches on the side walls near the mouth are lit long before the array is: they are the
+first sound from a street that looks empty.
 
 .. math:: p_i(t) = \frac{a_i(f)}{d_i\, r_i}\, s\Big(t - \frac{d_i + r_i}{c}\Big), \qquad
           a_i^2 = w_i\, \sigma(f)\, \rho^2\, \frac{A}{\pi} \cos\theta_{in} \cos\theta_{out}
 
 with the patch's area A, the wall's reflection rho, its scattering coefficient sigma(f), and a weight w_i of
-mean one that is drawn once for a site: its face.
+mean one that is drawn once for a site.
 """
 
 from dataclasses import dataclass, replace
@@ -37,29 +37,29 @@ from .paths import (
 from .receiver import NEAREST_M, Receiver, Surroundings, add_turning, distance_m
 from .static_field import StaticSources
 
-PATCH_M = 0.9  # along the wall
-WALL_HEIGHT_M = 3.0  # what of a wall is near enough to matter
+PATCH_M = 0.9  # Length along the wall
+WALL_HEIGHT_M = 3.0  # Height of the part of a wall that is near enough to matter
 HEIGHTS_M = (0.4, 2.8)
-BEHIND_M = 1.5  # side walls scatter from this far behind the array
+BEHIND_M = 1.5  # Side walls scatter from this distance behind the array
 OPPOSITE_PATCH_M = 1.4
-OPPOSITE_REACH = 2.2  # of the part seen through the mouth: the side walls show more of it, from aside
-SCATTER_HZ = 400.0  # relief of a few decimetres: below, a facade is smooth
-IMAGE_ORDERS = 2  # reflections in the crossing street before a patch is met
+OPPOSITE_REACH = 2.2  # Factor on the part seen through the mouth: the side walls see more of it, from aside
+SCATTER_HZ = 400.0  # Relief of a few decimetres: below this frequency a facade is smooth
+IMAGE_ORDERS = 2  # Reflections in the crossing street before a patch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    r"""Pieces of wall, all of one kind."""
+    r"""Patches of wall, all of one kind."""
 
     positions_m: FloatArray  # shape (P, 3): Middles, z above the road
     normals: FloatArray  # shape (P, 2): Towards the street
     # shape (P,): :math:`\sqrt{w A \rho^2 / \pi}`, the length that scatters at grazing angles of 0.
     strengths_m: FloatArray
-    beyond_mouth: bool  # Whether they stand in the crossing street
+    beyond_mouth: bool  # Whether they are in the crossing street
 
 
 def scattering(preset: Preset) -> FloatArray:
-    """Scattering coefficient sigma per octave, shape (8,).
+    """Return the scattering coefficient sigma per octave, shape (8,).
 
     Examples
     --------
@@ -73,7 +73,7 @@ def scattering(preset: Preset) -> FloatArray:
 
 
 def patches(site: Site) -> list[Patches]:
-    """Patches of the ego street's side walls and, where there is one, of the wall opposite.
+    """Return the patches of the ego street's side walls and, if there is one, of the wall opposite.
 
     Examples
     --------
@@ -111,7 +111,7 @@ def _opposite_wall(site: Site, wall_m: float, rng: np.random.Generator) -> Patch
 
 
 def _spread(low: float, high: float, rng: np.random.Generator, patch_m: float = PATCH_M) -> FloatArray:
-    """Places along a wall, one in every patch, not quite in its middle."""
+    """Return positions along a wall, one in every patch, near its middle."""
     count = max(int((high - low) / patch_m), 1)
     return np.asarray(low + (high - low) * (np.arange(count) + rng.uniform(0.2, 0.8, count)) / count)
 
@@ -123,13 +123,13 @@ def _strengths(
     return np.asarray(reflection * np.sqrt(weights * patch_m * WALL_HEIGHT_M / np.pi))
 
 
-# Way to a patch at a series of emission times, shape (T,), and amplitude factor per octave without spherical
-# spreading, shape (T, 8); the last leg's angle is not in it.
+# Length of the path to a patch at a series of emission times, shape (T,), and amplitude factor per octave
+# without spherical spreading, shape (T, 8); the angle of the last leg is not included.
 FirstLeg: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 def first_legs(group: Patches, index: int, source: MovingSource, around: Surroundings) -> list[FirstLeg]:
-    """Ways of one source to one patch: direct and by the facades of the crossing street."""
+    """Return the paths of one source to one patch: direct and by the facades of the crossing street."""
     if not group.beyond_mouth:
         near = [image for image in source_images(around.site, source.x_m) if image.order <= IMAGE_ORDERS]
         return [_mouth_leg(group, index, image, source, around) for image in near]
@@ -154,7 +154,7 @@ def _mouth_leg(
 
 
 def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance of every patch to every microphone and the amplitude factor there, shape (P, M) each."""
+    """Return the distance of every patch to every microphone and the amplitude factor, shape (P, M) each."""
     away = positions_m[None] - group.positions_m[:, None]
     distance = np.maximum(np.linalg.norm(away, axis=2), NEAREST_M)
     cosine = np.abs(np.einsum("pmk,pk->pm", away[:, :, :2], group.normals)) / distance
@@ -162,7 +162,7 @@ def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, Float
 
 
 def mirrored(group: Patches, image: ReceiverImage) -> Patches:
-    """Return the patches as they are seen in the side walls: an array hears them from there, too."""
+    """Return the images of the patches in the side walls."""
     turn = np.array([1.0, image.sign])
     positions = (group.positions_m - np.array([0.0, image.offset_m, 0.0])) * np.array([1.0, image.sign, 1.0])
     return replace(group, positions_m=positions, normals=group.normals * turn)
@@ -171,7 +171,7 @@ def mirrored(group: Patches, image: ReceiverImage) -> Patches:
 def seen_through_mouth(
     site: Site, place_m: FloatArray, ego_x_m: FloatArray, image: ReceiverImage
 ) -> FloatArray:
-    """Share that an ego hears of a place in the crossing street by one image, 0 where a corner hides it.
+    """Return the share of a place in the crossing street that an ego receives by one image, 0 in shadow.
 
     Shapes: ego_x_m (T,).
     """
@@ -180,14 +180,14 @@ def seen_through_mouth(
     return passage.lit * image.gain * side_walls(site, image, ego_x_m, (site.corner_ahead_m, passage.aim_y_m))
 
 
-# Left out where it is 30 dB below all that rough walls send on together: while the ego moves most patches and
-# images are, at any moment. Features change by 1e-4 rms.
+# Patches and images 30 dB below all scattered sound are left out; for a moving ego most of them are, at any
+# time. Features change by 1e-4 rms.
 FAINTEST = 1e-3
-STRETCH_KNOTS = 64  # a sixth of a second, in which it is decided
+STRETCH_KNOTS = 64  # A sixth of a second: interval of that decision
 
 
 def add_scattered(static: StaticSources, source: MovingSource, around: Surroundings) -> None:
-    """Add what rough walls send on of one moving source, from where they stand, to all microphones."""
+    """Add the sound of one moving source that rough walls scatter, to all microphones."""
     if not around.scattering.any() or around.site.is_open:
         return
     every: list[_Shown] = []
@@ -204,7 +204,7 @@ def add_scattered(static: StaticSources, source: MovingSource, around: Surroundi
 def _add_leg(
     out: Float32Array, emission: Emission, leg: FirstLeg, around: Surroundings, patch_m: FloatArray
 ) -> None:
-    """Add what one patch sends on, as late as the array's centre hears it."""
+    """Add the sound of one patch, delayed as at the array's centre."""
     length_m, gain = leg
     made = emission.table(gain)
     if made is None:
@@ -220,22 +220,22 @@ def _add_leg(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shown:
-    """Patches as the array sees them, directly or in a side wall."""
+    """Patches in view of the array, directly or in a side wall."""
 
     group: Patches
     arrived: Float32Array  # shape (P, n)
-    later: IndexArray  # shape (P,): Samples by which the way to the array is longer than the direct one
+    later: IndexArray  # shape (P,): Samples by which the path to the array is longer than the direct one
     gain: FloatArray  # shape (P, K + 1): Amplitude factor of the last leg to the array's centre
-    share: FloatArray  # shape (P, K + 1): What is seen of each
+    share: FloatArray  # shape (P, K + 1): Visible share of each
 
     def signal(self, index: int) -> Float32Array:
-        """Return what one of them sends, as late as the array's centre hears it."""
+        """Return the signal of one patch, delayed as at the array's centre."""
         sent, by = self.arrived[index], int(self.later[index])
         return np.concatenate([np.zeros(by, np.float32), sent[: len(sent) - by]])
 
 
 def _shown(group: Patches, arrived: Float32Array, around: Surroundings) -> list[_Shown]:
-    """Patches themselves and, if they stand opposite, their images in the side walls."""
+    """Return the patches and, for the wall opposite, their images in the side walls."""
     site, receiver = around.site, around.receiver
     x, count = receiver.ego.x_m(receiver.knots_s), len(arrived)
     if not group.beyond_mouth:
@@ -247,9 +247,9 @@ def _shown(group: Patches, arrived: Float32Array, around: Surroundings) -> list[
             continue
         shown = mirrored(group, image)
         seen = np.stack([seen_through_mouth(site, place, x, image) for place in group.positions_m])
-        # The way by a wall is longer: without its delay every image would be in phase with the patch.
+        # The path by a wall is longer: without its delay every image would be in phase with the patch.
         later_s = (np.linalg.norm(shown.positions_m - receiver.centre_m, axis=1) - away) / SPEED_OF_SOUND_MPS
-        # What lies beyond the plane of a wall is not mirrored by it: its image would be the nearer one.
+        # A patch beyond the plane of a wall has no image in it: the image would be nearer than the patch.
         seen *= (later_s >= 0.0)[:, None]
         later = np.round(np.maximum(later_s, 0.0) * receiver.sample_rate_hz).astype(int)
         every.append(_Shown(shown, arrived, later, _last_gain(shown, receiver), seen))
@@ -257,7 +257,7 @@ def _shown(group: Patches, arrived: Float32Array, around: Surroundings) -> list[
 
 
 def _last_gain(group: Patches, receiver: Receiver) -> FloatArray:
-    """Amplitude factor from every patch to the array's centre, shape (P, K + 1)."""
+    """Return the amplitude factor from every patch to the array's centre, shape (P, K + 1)."""
     x = receiver.ego.x_m(receiver.knots_s)
     gains = []
     for place, normal in zip(group.positions_m, group.normals, strict=True):
@@ -268,7 +268,7 @@ def _last_gain(group: Patches, receiver: Receiver) -> FloatArray:
 
 
 def _add_shown(static: StaticSources, every: list[_Shown], receiver: Receiver) -> None:
-    """Let every patch and image sound to all microphones while it is loud enough to matter."""
+    """Add every patch and image to all microphones while it is loud enough to matter."""
     power = [_power(one) for one in every]
     whole = np.sum([own.sum(axis=0) for own in power], axis=0)
     for one, own in zip(every, power, strict=True):
@@ -287,14 +287,14 @@ def _add_shown(static: StaticSources, every: list[_Shown], receiver: Receiver) -
 
 
 def _power(one: _Shown) -> FloatArray:
-    """Power at the array's centre in stretches of time, shape (P, S)."""
+    """Return the power at the array's centre in stretches of time, shape (P, S)."""
     sent = np.stack([np.square(signal).reshape(-1, KNOT_SAMPLES).sum(axis=1) for signal in one.arrived])
     heard = sent * (one.gain * one.share)[:, :-1] ** 2
     return np.add.reduceat(heard, np.arange(0, heard.shape[1], STRETCH_KNOTS), axis=1)
 
 
 def _within(loud: BoolArray, knots: int) -> FloatArray:
-    """1 from a stretch before the first loud one to one after the last, shape (K + 1,)."""
+    """Return 1 from a stretch before the first loud one to one after the last, shape (K + 1,)."""
     first, last = np.flatnonzero(loud)[[0, -1]]
     at = np.arange(knots) // STRETCH_KNOTS
     return np.asarray((at >= first - 1) & (at <= last + 1), np.float64)

@@ -1,8 +1,8 @@
-"""Many sources that do not move, heard by all microphones at once.
+"""Many fixed sources at all microphones at once.
 
 Delays across an array are a few milliseconds at most, so every source is a phase ramp per block of a weighted
-overlap-add; all sources reach all microphones in one batched matrix product. Most of the cost is the way back
-from the spectra, once per microphone however many sources there are: sources are best rendered together.
+overlap-add; one batched matrix product carries all sources to all microphones. Most of the cost is the
+inverse transform, once per microphone for any number of sources, so sources are best rendered together.
 """
 
 from collections.abc import Iterator
@@ -24,11 +24,11 @@ BLOCK = 4096
 HOP = BLOCK // 2
 BINS, FINE_BINS = HOP + 1, 64
 BLOCKS_AT_ONCE = 16
-PENDING = 160  # as many sources wait, with their signals, to be rendered together
+PENDING = 160  # Number of sources that are collected before they are rendered together
 
 
 def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArray:
-    """Delay of plane waves at every microphone against the array's centre, shape (Q, M), s.
+    """Return the delay of plane waves at every microphone relative to the centre, shape (Q, M), s.
 
     Shapes: directions (Q, 3), offsets_m (M, 3).
     """
@@ -36,26 +36,26 @@ def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArr
 
 
 def azimuths_all_round(count: int, rng: np.random.Generator) -> FloatArray:
-    """Draw evenly spaced azimuths, the first of them anywhere within a step."""
+    """Draw evenly spaced azimuths with a random start."""
     return np.asarray(2.0 * np.pi * (np.arange(count) + rng.random()) / count)
 
 
 def unit_vectors(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
-    """Directions in `base_link`, shape (Q, 3)."""
+    """Return unit vectors in `base_link`, shape (Q, 3)."""
     flat = np.cos(elevation_rad)
     return np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StaticSources:
-    """Sources that wait to be rendered together."""
+    """Sources that are collected and rendered together."""
 
-    out: Float32Array  # shape (M, n): What every microphone hears, added to
+    out: Float32Array  # shape (M, n): Signals of the microphones, added to
     sample_rate_hz: float
     _waiting: list[tuple[Float32Array, FloatArray, FloatArray]] = field(default_factory=list)
 
     def add(self, signals: Float32Array, delays_s: FloatArray, gains: FloatArray | None = None) -> None:
-        """Let sources wait whose delayed copies are added to every microphone.
+        """Collect sources whose delayed copies are added to every microphone.
 
         Shapes: signals (Q, n), delays_s (Q, M), gains (Q, M).
         """
@@ -65,7 +65,7 @@ class StaticSources:
             self.render()
 
     def render(self) -> None:
-        """Render what waits."""
+        """Render the collected sources."""
         if not self._waiting:
             return
         delays, gains = (np.concatenate([one[i] for one in self._waiting]) for i in (1, 2))
@@ -82,8 +82,8 @@ class StaticSources:
 
 def _phase_ramps(delays_s: FloatArray, gains: FloatArray, sample_rate_hz: float) -> Complex64Array:
     r"""Return :math:`g\, e^{-2 \pi j f \tau}` at the bins of a block, shapes (Q, M) -> (F, Q, M)."""
-    # Bin k = 64 i + j is a product of two powers of the first: a tenth of the time of an exponential for
-    # each, which takes longer than all the rest of a recording of half a second.
+    # Bin k = 64 i + j is a product of two powers of the first: a tenth of the time of one exponential per
+    # bin, which takes longer than the rest of a recording of half a second.
     first = -2j * np.pi * sample_rate_hz / BLOCK * delays_s
     fine = np.exp(np.arange(FINE_BINS)[:, None, None] * first)
     ramps = np.empty((-(-BINS // FINE_BINS), *fine.shape), np.complex64)
@@ -93,7 +93,7 @@ def _phase_ramps(delays_s: FloatArray, gains: FloatArray, sample_rate_hz: float)
 
 
 def _analyse(signals: list[Float32Array]) -> Iterator[tuple[int, Complex64Array]]:
-    """Spectra (F, blocks, Q) of Hann-windowed blocks, which sum to the signal, a few blocks at a time."""
+    """Yield spectra (F, blocks, Q) of Hann-windowed blocks that sum to the signal, a few at a time."""
     window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(BLOCK) / BLOCK)).astype(np.float32)
     sources, samples = sum(len(one) for one in signals), signals[0].shape[1]
     cut, blocks = np.empty((sources, BLOCK), np.float32), -(-samples // HOP) + 1
@@ -101,12 +101,13 @@ def _analyse(signals: list[Float32Array]) -> Iterator[tuple[int, Complex64Array]
         stop = min(start + BLOCKS_AT_ONCE, blocks)
         spectra = np.empty((BINS, stop - start, sources), np.complex64)
         for i in range(start, stop):
-            at = (i - 1) * HOP  # the first block begins one hop before the signals
+            at = (i - 1) * HOP  # The first block begins one hop before the signals
             first, last = max(at, 0), min(at + BLOCK, samples)
             cut[:, : first - at], cut[:, last - at :] = 0.0, 0.0
             np.concatenate([one[:, first:last] for one in signals], out=cut[:, first - at : last - at])
             cut *= window
-            # Turned while it is in the cache: of all blocks at once that took as long as the transforms.
+            # Transposed while it is in the cache; transposing all blocks at once took as long as the
+            # transforms.
             spectra[:, i - start] = rfft(cut, axis=-1).T
         yield start, spectra
 
@@ -114,13 +115,13 @@ def _analyse(signals: list[Float32Array]) -> Iterator[tuple[int, Complex64Array]
 DIRECTIONS = 48
 LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
 ELEVATION_RAD = 0.3
-LATE_DISTANCE_M = 8.0  # so far from the mouth a source feeds the late field half as much
+LATE_DISTANCE_M = 8.0  # Distance from the mouth at which a source feeds the late field half as much
 WAVES_AT_ONCE = 4
-TAIL_DECAYS = 1.0  # length of a tail in reverberation times (60 dB)
+TAIL_DECAYS = 1.0  # Length of a tail in reverberation times (60 dB)
 
 
 def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]:
-    """Directions from which late sound reaches the array in a street, and their shares of the energy.
+    """Return the directions from which late sound reaches the array in a street, and their energy shares.
 
     Examples
     --------
@@ -129,8 +130,8 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
     >>> directions.shape, round(float(shares.sum()), 6)
     ((48, 3), 1.0)
     """
-    # Between walls and under an open sky late sound is near the horizon; it comes in by the mouth and from
-    # what stands there, so that a site has late directions of its own, ahead.
+    # Between walls and under an open sky late sound arrives near the horizon. It enters by the mouth and from
+    # objects there, so that each site has its own late directions ahead.
     rng = site_generator(site.name, "late")
     azimuth = azimuths_all_round(DIRECTIONS, rng)
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, DIRECTIONS))
@@ -142,7 +143,7 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreetSound:
-    """What the sounds of a street are added to, and what shapes them on their way there."""
+    """Outputs to which the sounds of a street are added, and the properties of the street."""
 
     static: StaticSources
     site: Site
@@ -152,7 +153,7 @@ class StreetSound:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedSource:
-    """A sound of one point and where it comes from at its emission knots."""
+    """The sound of one point and its position at its emission knots."""
 
     signal: Float32Array  # shape (n,)
     time_s: FloatArray  # shape (T,): The knots
@@ -161,16 +162,16 @@ class PlacedSource:
     height_m: float
 
     def straight_m(self, position_m: FloatArray, receiver: Receiver) -> tuple[FloatArray, FloatArray]:
-        """Way to a position (3,) on the ego and where the ego is when sound arrives, shape (T,) each."""
+        """Return the distance to a position (3,) on the ego and the ego's place at arrival, (T,) each."""
         place = np.stack([self.x_m, self.y_m, np.full(len(self.x_m), self.height_m)])
         return receiver.arrivals(self.time_s, partial(distance_m, place, offset_m=position_m))
 
     def during(self, span: slice) -> "PlacedSource":
-        """Return it at some of its knots."""
+        """Return the part of it at some of its knots."""
         return replace(self, time_s=self.time_s[span], x_m=self.x_m[span], y_m=self.y_m[span])
 
     def moving(self, rate_hz: float) -> MovingSource:
-        """Return it as the first renderer carries it."""
+        """Return it in the form of the first renderer."""
         emission = Emission.of(self.signal, float(self.time_s[0]), rate_hz)
         return MovingSource(emission, self.x_m, self.y_m, self.height_m)
 
@@ -178,7 +179,7 @@ class PlacedSource:
 def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Generator) -> None:
     """Add a diffuse tail of a dry signal: its energy without its direction.
 
-    Every direction has a tail of its own. One common tail on all microphones would be a source at broadside.
+    Every direction has its own tail; one common tail on all microphones would be a source at broadside.
 
     Shapes: dry (pre + samples,).
     """
@@ -191,7 +192,7 @@ def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Gener
     envelope = 10.0 ** (-3.0 * np.arange(tail) / tail * TAIL_DECAYS)
     envelope /= np.sqrt((envelope**2).sum())
     waves = np.empty((len(shares), samples), np.float32)
-    # Transforms of a few are done side by side: one by one they take twice as long, all at once as well.
+    # Transforms of a few tails together are fastest: one by one, or all at once, they take twice as long.
     for first in range(0, len(shares), WAVES_AT_ONCE):
         some = slice(first, first + WAVES_AT_ONCE)
         drawn = rng.standard_normal((len(shares[some]), tail))
@@ -209,22 +210,22 @@ def add_late_sound(
     time_s: FloatArray,
     rng: np.random.Generator,
 ) -> None:
-    """Add the late sound of a source; its signal lasts from the first of its emission knots to the last.
+    """Add the late sound of a source; its signal extends from the first of its emission knots to the last.
 
     Shapes: signal (n,), place_m (x (T,), y (T,)), time_s (T,).
     """
-    if not street.site.is_open:  # nothing stands there that could send late sound
+    if not street.site.is_open:  # The open has no objects that return late sound
         fed = signal * _late_gain(street, *place_m, time_s)
         _add_late_field(street, _until_the_end(fed, time_s[0], street.receiver), rng)
 
 
 def late_level_db(site: Site, preset: Preset) -> float:
-    """Late field of a source at the mouth against its pressure at 1 m."""
+    """Return the late field of a source at the mouth relative to its pressure at 1 m."""
     return preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
 
 
 def _late_gain(street: StreetSound, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray) -> Float32Array:
-    """How strongly a source feeds the late field: less the farther it, or the ego, is from the mouth."""
+    """Return the gain of a source into the late field, which falls with its and the ego's distance."""
     away = np.hypot(x_m - street.site.corner_ahead_m, y_m) - street.receiver.ego.x_m(time_s)
     level = 10.0 ** (late_level_db(street.site, street.preset) / 20.0)
     gain = level * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
